@@ -17,8 +17,8 @@ from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.registry import check_models
 from snakesim_sim_backend.sensors.suite import Sensors
@@ -64,7 +64,7 @@ class SimBackend:
         log_warnings()
         self._sim = build(config, settings)
         self._data = mujoco.MjData(self._sim.model)
-        self._physics = Physics(self._sim.model, self._data, self._sim.soles)
+        self._physics = Physics(self._sim, self._data)
         self._motors = Motors(
             self._sim.model, self._data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale
         )
@@ -177,7 +177,7 @@ class SimBackend:
 
     def true_state(self) -> TrueState:
         """The state as it is, without noise, rate or delay."""
-        data, sim = self._data, self._sim
+        data, sim, joints = self._data, self._sim, self._motors.count
         w, x, y, z, ox, oy, oz = *data.qpos[3:FREE_QPOS].tolist(), *data.qvel[3:FREE_DOFS].tolist()
         contacts = [
             TrueContact(t.body - sim.first_link_body, t.obstacle, *map(np.array, (t.position_w, t.normal_w, t.force_w)))
@@ -189,8 +189,8 @@ class SimBackend:
             base_orientation_wxyz=data.qpos[3:FREE_QPOS].copy(),
             base_velocity_w=data.qvel[:3].copy(),
             base_angular_velocity_w=np.array(rotate((w, x, y, z), (ox, oy, oz))),
-            angles_rad=data.qpos[FREE_QPOS:].copy(),
-            velocities_rad_s=data.qvel[FREE_DOFS:].copy(),
+            angles_rad=data.qpos[FREE_QPOS:][:joints].copy(),
+            velocities_rad_s=data.qvel[FREE_DOFS:][:joints].copy(),
             torques_nm=self._motors.applied_nm().copy(),
             contacts=contacts,
         )

@@ -37,7 +37,7 @@ class TouchReader:
         """All contacts, in MuJoCo's order."""
         struck, contact = self._struck, self._contact
         pairs = contact.geom.tolist()
-        found = [i for i, (first, second) in enumerate(pairs) if first in struck or second in struck]
+        found = [i for i, (first, second) in enumerate(pairs) if (first in struck) != (second in struck)]
         if not found:
             return
         # Whole columns at once: a view of each contact would cost more.
@@ -58,7 +58,7 @@ class TouchReader:
         forces = self._data.efc_force
         rows = zip(contact.geom.tolist(), contact.efc_address.tolist(), contact.dim.tolist(), strict=True)
         for (first, second), start, size in rows:
-            if start >= 0 and (first in self._struck or second in self._struck):
+            if start >= 0 and (first in self._struck) != (second in self._struck):
                 push_n = float(forces[start])
                 if size > 1:
                     push_n = math.hypot(push_n, forces[start + 1], forces[start + 2])

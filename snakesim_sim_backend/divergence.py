@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import BackendError
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS
+from snakesim_sim_backend.physics import Physics
 
 _log = logging.getLogger("snakesim.sim")
 
@@ -94,6 +94,7 @@ class DivergenceWatch:
         if not np.all(np.isfinite(shares)):
             return None
         dof = int(np.argmax(shares))
-        who = BASE[dof] if dof < FREE_DOFS else f"joint_{dof - FREE_DOFS + 1}"
-        unit = "m" if dof < 3 else "rad"
+        joint = self._model.joint(self._model.dof_jntid[dof])
+        who = BASE[dof] if dof < FREE_DOFS else joint.name
+        unit = "m" if dof < 3 or joint.type == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
         return f"{who} moves at {self._qvel[dof]:.4g} {unit}/s and accelerates at {self._qacc[dof]:.4g} {unit}/s²"

@@ -13,7 +13,7 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP
-from snakesim_sim_backend.model import FOOT_GROUP, build
+from snakesim_sim_backend.model import FOOT_GROUP, FREE_QPOS, build
 from snakesim_sim_backend.sensors.rendered import opened_context
 from snakesim_sim_backend.settings import SimSettings
 
@@ -43,7 +43,7 @@ class Film:
         view.offwidth, view.offheight, quality.offsamples = width, height, SAMPLES
         self._model.vis.headlight.ambient[:], self._model.vis.headlight.diffuse[:] = AMBIENT, HEADLIGHT
         self._flat = config.scene.ground.uneven is None
-        self._paint()
+        self._paint(config.robot.chain.modules)
         self._gl = opened_context(width, height, "the film")
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -52,7 +52,7 @@ class Film:
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._option.geomgroup[:], self._option.geomgroup[FOOT_GROUP] = 1, 0
         self._option.geomgroup[PLANE_GROUP] = 1
-        first, joints = self._sim.first_link_body, self._model.njnt - 1
+        first, joints = self._sim.first_link_body, config.robot.chain.modules
         length_m = float(self._model.body_pos[first + 1 : first + 1 + joints, 0].sum())  # of all links but the head
         self._camera.azimuth, self._camera.elevation = AZIMUTH_DEG, ELEVATION_DEG
         self._camera.distance = 1.25 * length_m
@@ -66,7 +66,7 @@ class Film:
         """The snake at a pose of its tail end, seen from above and behind. arrows_w: each (2, 3), from and to."""
         joints = len(angles_rad)
         self._data.qpos[:3], self._data.qpos[3:7] = position_w, wxyz
-        self._data.qpos[7 : 7 + joints] = angles_rad
+        self._data.qpos[FREE_QPOS:][:joints] = angles_rad
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._camera.lookat[:] = look_at_w
@@ -84,12 +84,12 @@ class Film:
         picture[self._depth >= 1.0] = BACKGROUND
         return np.flipud(picture)
 
-    def _paint(self) -> None:
+    def _paint(self, joints: int) -> None:
         """Colours of a film: the model's own are those that its colour cameras see."""
         colours, first = self._model.geom_rgba, self._sim.first_link_body
-        colours[self._model.geom_bodyid == 0] = OBSTACLE
-        for body in range(first, self._model.nbody):
-            shade = HEAD if body == self._model.nbody - 1 else (LINK, NEXT_LINK)[(body - first) % 2]
+        colours[:], head = OBSTACLE, first + joints
+        for body in range(first, head + 1):
+            shade = HEAD if body == head else (LINK, NEXT_LINK)[(body - first) % 2]
             colours[self._model.geom_bodyid == body] = shade
         for name in (GROUND,) if self._flat else (GROUND, HILLS):
             self._model.geom(name).rgba[:] = FLOOR

@@ -14,7 +14,6 @@ What it remembers is in MuJoCo's `userdata`, so a saved state is whole.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -26,7 +25,6 @@ from snakesim_hal.arrays import Floats
 SINK_M = 2e-4  # of a foot under its share of the weight
 MAX_PHASE = 0.7  # of that spring's vibration in one physics step; long steps get softer ground
 DAMPING = 0.5  # of critical
-AFTER_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 KEPT = 5  # numbers per foot in `userdata`: two of its slip, three of its position
 
 
@@ -41,10 +39,10 @@ class Soles:
     friction: float
 
 
-def soles_of(model: mujoco.MjModel, first_body: int, radius_m: float, friction: float) -> Soles:
+def soles_of(model: mujoco.MjModel, first_body: int, links: int, radius_m: float, friction: float) -> Soles:
     """Of a compiled model, whose feet are called foot_0 onwards."""
-    masses = model.body_mass[first_body:]
-    geoms = np.array([model.geom(f"foot_{i}").id for i in range(len(masses) + 1)])
+    masses = model.body_mass[first_body : first_body + links]
+    geoms = np.array([model.geom(f"foot_{i}").id for i in range(links + 1)])
     shares = 0.5 * (np.append(masses, 0.0) + np.append(0.0, masses))
     return Soles(geoms, first_body, shares, radius_m, friction)
 
@@ -63,8 +61,9 @@ class FlatGround:
         first, count = soles.first_body, len(soles.geoms)
         self._bodies = np.minimum(np.arange(count) + first, first + count - 2)
         self._positions, self._velocities = data.geom_xpos, data.cvel
-        self._reference, self._axes, self._out = data.subtree_com[first], data.cdof, data.qfrc_passive
-        kept = data.userdata.reshape(KEPT, count)
+        dofs = 6 + count - 2  # of the base and the joints
+        self._reference, self._axes, self._out = data.subtree_com[first], data.cdof[:dofs], data.qfrc_passive[:dofs]
+        kept = data.userdata[: KEPT * count].reshape(KEPT, count)
         self._slip, self._before = kept[:2].reshape(-1).view(np.complex128), kept[2:]
 
     def begin(self) -> None:
@@ -104,52 +103,3 @@ class FlatGround:
         beyond = wrenches[:, ::-1].cumsum(axis=1)[:, ::-1]  # a joint turns all that is nearer to the head
         self._out[:6] += np.einsum("ij,j->i", self._axes[:6], beyond[:, 0])
         self._out[6:] += np.einsum("ij,ji->i", self._axes[6:], beyond[:, 1:-1])
-
-
-class Physics:
-    """Steps of one simulation."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, soles: Soles | None) -> None:
-        """soles: None where MuJoCo has the contacts with the ground."""
-        self._model, self._data = model, data
-        self.after_step: Callable[[], None] | None = None  # of a sensor that misses no step
-        self.ground = None if soles is None else FlatGround(model, data, soles)
-
-    @property
-    def friction(self) -> float:
-        """Of the flat ground; 0 where there is none."""
-        return 0.0 if self.ground is None else self.ground.friction
-
-    @friction.setter
-    def friction(self, friction: float) -> None:
-        if self.ground is not None:
-            self.ground.friction = friction
-
-    def begin(self) -> None:
-        """Compute everything of the present state, in which the robot is taken as standing."""
-        if self.ground is not None:
-            mujoco.mj_kinematics(self._model, self._data)
-            self.ground.begin()
-        self.forward()
-
-    def forward(self) -> None:
-        """Compute everything of the present state."""
-        mujoco.mj_forward(self._model, self._data)
-        if self.ground is not None:
-            self.ground.apply()
-            mujoco.mj_forwardSkip(self._model, self._data, AFTER_VELOCITIES, 0)
-
-    def step(self, count: int) -> None:
-        """That many physics steps under the present inputs."""
-        if self.ground is None and self.after_step is None:
-            mujoco.mj_step(self._model, self._data, count)
-            return
-        for _ in range(count):
-            if self.ground is None:
-                mujoco.mj_step(self._model, self._data)
-            else:
-                mujoco.mj_step1(self._model, self._data)
-                self.ground.apply()
-                mujoco.mj_step2(self._model, self._data)
-            if self.after_step is not None:
-                self.after_step()

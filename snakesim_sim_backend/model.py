@@ -7,6 +7,7 @@ Bodies, hinges and motors are therefore in the order of the robot description.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_hal.model.scene import Placed
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
@@ -26,6 +28,7 @@ from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.surface import PairSurface, link_skin, pair_surface
 from snakesim_sim_backend.tether import add_tether
+from snakesim_sim_backend.yielding import FREEDOMS, check_yielding
 
 FREE_QPOS = 7  # of the base: position and quaternion
 FREE_DOFS = 6
@@ -45,6 +48,7 @@ class SimModel:
     obstacle_of_geom: list[str | None]  # (ngeom,); None: link, ground or step
     soles: Soles | None  # None: MuJoCo has the contacts with the ground, which is not flat
     hung: bool  # its tail link is clamped
+    yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
 
 
 def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> SimModel:
@@ -61,9 +65,18 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         )
     spec = mujoco.MjSpec()
     _set_options(spec, step_s, settings)
-    _add_scene(spec, config, settings)
+    placed = place_all(config)
+    yielding = [item for item in placed if item.yields]
+    check_yielding(yielding, config.scene.name, step_s)
+    _add_ground(spec, config, settings)
+    add = partial(_add_obstacle, spec, config, settings, strike=bool(yielding))
+    for item in placed:
+        if not item.yields:
+            add(item)
     _add_snake(spec, config.robot, settings)
-    spec.nuserdata = KEPT * (config.robot.chain.modules + 2)
+    for item in yielding:
+        add(item)
+    spec.nuserdata = KEPT * (config.robot.chain.modules + 2) + FREEDOMS * len(yielding)
     if motors:
         check_gains(config.robot)
         for joint in config.robot.joint_table:
@@ -79,7 +92,8 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
     first_link_body, ground = model.body("link_0").id, config.scene.ground
     soles = None
     if ground.uneven is None:
-        soles = soles_of(model, first_link_body, config.robot.module.radius_m, ground.friction)
+        links = config.robot.chain.modules + 1
+        soles = soles_of(model, first_link_body, links, config.robot.module.radius_m, ground.friction)
     names = [model.geom(i).name for i in range(model.ngeom)]
     obstacles = [name.removeprefix(OBSTACLE) if name.startswith(OBSTACLE) else None for name in names]
     return SimModel(
@@ -89,6 +103,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         obstacle_of_geom=obstacles,
         soles=soles,
         hung=settings.hung,
+        yielding=yielding,
     )
 
 
@@ -105,26 +120,34 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, settings: SimSettings) -> N
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
-def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings) -> None:
-    """Ground and obstacles, paired with the links that are added later.
+def _add_ground(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings) -> None:
+    """The ground, paired with the links that are added later.
 
     Level ground supports a chain of capsules only at the spheres around joints and ends. Each sphere is there once,
     while capsules would have two of them at every joint. Hills, steps and obstacles have contacts with the capsules.
     Flat ground has no contacts in MuJoCo: see flat_ground.py.
     """
     scene, robot = config.scene, config.robot
-    hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
-    links = [f"link_{i}" for i in range(robot.chain.modules + 1)]
     feet = [f"foot_{i}" for i in range(robot.chain.modules + 2)]
     for name in add_ground(spec, scene.ground):
         if scene.ground.uneven is None:
             continue
         sole = pair_surface(scene.ground.friction, settings, bears_weight=True)
-        _pair(spec, name, feet if name == GROUND else links, sole)
-    for placed in place_all(config):
-        rough = add_obstacle(spec, placed, settings, body_radius_m=robot.module.radius_m, hills_m=hills_m)
-        if rough is not None:
-            _pair(spec, rough, links, pair_surface(placed.friction, settings, bears_weight=placed.walkable))
+        _pair(spec, name, feet if name == GROUND else _links(robot), sole)
+
+
+def _add_obstacle(
+    spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, placed: Placed, *, strike: bool
+) -> None:
+    uneven, radius_m = config.scene.ground.uneven, config.robot.module.radius_m
+    hills_m = uneven.height_m if uneven else 0.0
+    rough = add_obstacle(spec, placed, settings, body_radius_m=radius_m, hills_m=hills_m, strike=strike)
+    if rough is not None:
+        _pair(spec, rough, _links(config.robot), pair_surface(placed.friction, settings, bears_weight=placed.walkable))
+
+
+def _links(robot: RobotFile) -> list[str]:
+    return [f"link_{i}" for i in range(robot.chain.modules + 1)]
 
 
 def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: PairSurface) -> None:

@@ -10,15 +10,15 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.loads import LoadReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PlantSettings, SimSettings
@@ -47,15 +47,16 @@ class MujocoPlant:
         model, data = self._model, self._data
         self.step_s: float = model.opt.timestep
         data.qpos[:] = _rest(config, settings)
-        self._physics = Physics(model, data, self._sim.soles)
+        self._physics = Physics(self._sim, data)
         self._physics.begin()
         if settings.tether is not None:
             Rope(model, data, settings.tether).tighten()
         count = config.robot.chain.modules
-        self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
-        self._torques, self._passive = data.qfrc_applied[FREE_DOFS:], data.qfrc_damper[FREE_DOFS:]
-        self._qacc, self._accelerations = data.qacc, data.qacc[FREE_DOFS:]
-        self._armature = model.dof_armature[FREE_DOFS:]
+        hinges = slice(FREE_DOFS, FREE_DOFS + count)
+        self._angles, self._velocities = data.qpos[FREE_QPOS:][:count], data.qvel[hinges]
+        self._torques, self._passive = data.qfrc_applied[hinges], data.qfrc_damper[hinges]
+        self._qacc, self._accelerations = data.qacc, data.qacc[hinges]
+        self._armature = model.dof_armature[hinges]
         # Of all constraints MuJoCo lists equalities first, of which there are none, then the friction of the joints.
         self._rubbing = [i for i, joint in enumerate(config.robot.joint_table) if joint.motor.friction_nm > 0]
         self._speeds, self._speeds_before = data.qvel, data.qvel.copy()
@@ -168,11 +169,14 @@ class MujocoPlant:
 def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
     """The rest pose of `SimBackend`, (nq,): motors are needed to hold the start angles until then.
 
-    On rough ground it depends on the step by millimetres, so the step is the default one of `SimBackend`.
+    On rough ground it depends on the step by millimetres, so the step is the default one of `SimBackend`, unless
+    obstacles on springs may need a shorter one.
     """
     step_s = min(SimSettings().timestep_s, settings.contact_time_s / 2)
+    if any(item.yields for item in place_all(config)):
+        step_s = min(step_s, settings.timestep_s)
     sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)
     motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9)
-    place_robot(sim, data, Physics(sim.model, data, sim.soles), config, motors, settings.settle_s)
+    place_robot(sim, data, Physics(sim, data), config, motors, settings.settle_s)
     return data.qpos

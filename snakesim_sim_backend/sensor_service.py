@@ -48,7 +48,7 @@ class SensorService:
             return None
         self._data.qpos[:3] = pose.position_w
         self._data.qpos[3:FREE_QPOS] = np.asarray(pose.orientation_wxyz) / np.linalg.norm(pose.orientation_wxyz)
-        self._data.qpos[FREE_QPOS:] = joints.angle_rad
+        self._data.qpos[FREE_QPOS:][: len(joints.angle_rad)] = joints.angle_rad
         mujoco.mj_kinematics(self._sim.model, self._data)
         return [(key, reader.read(clock.tick, joints.stamp_ns)) for key, reader in self._readers]
 

@@ -10,9 +10,9 @@ from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rota
 from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.ground import GROUND_GROUP, PLANE_GROUP
 from snakesim_sim_backend.model import FREE_QPOS, SimModel
+from snakesim_sim_backend.physics import Physics
 
 REST = 1e-3  # m/s and rad/s: slower is at rest
 REST_ROUNDS = 5
@@ -35,7 +35,7 @@ def place_robot(
     pose = start_of(config)
     data.qpos[:2] = pose.position_w
     data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
-    data.qpos[FREE_QPOS:] = pose.angles_rad
+    data.qpos[FREE_QPOS:][: motors.count] = pose.angles_rad
     data.qpos[2] = highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
     if sim.hung:
         data.qpos[2] += config.robot.length_m + CLEAR_M

@@ -10,7 +10,7 @@ import numpy as np
 from snakesim_gnc.control.body_on_path import BodyPose, chain_nodes, heading_of
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import yaw_segments_m
-from snakesim_hal.model.scene import GRAVITY_M_S2
+from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
 
 TICKS_KEPT = 128

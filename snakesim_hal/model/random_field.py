@@ -9,16 +9,17 @@ from msgspec import Meta
 from numpy.random import Generator
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.outlines import Capsule, Clearance, Friction, Outlines, Point, Size, gaps_m
+from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
+from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
 TRIES = 200  # for each obstacle that is wanted
+LEANING = 1  # seeds the draw of it, which leaves the places as they are
 
 
-class RandomField(FileStruct, frozen=True, kw_only=True):
+class RandomField(Solid, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
@@ -31,12 +32,21 @@ class RandomField(FileStruct, frozen=True, kw_only=True):
     clearance_m: Clearance  # least gap between the surfaces of any two
     route_clearance_m: Clearance | None = None  # least gap between the route and a surface
     height_m: Size = 0.2
-    friction: Friction = 0.0
+    # Each leans by up to so much, in a direction of its own.
+    lean_up_to_rad: Annotated[float, Meta(ge=0, le=MOST_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
 
     @property
     def wanted(self) -> int:
         """Number of obstacles."""
         return round(self.density_per_m2 * math.prod(np.subtract(self.high_m, self.low_m).tolist()))
+
+
+def solids_of(field: RandomField, index: int, count: int) -> list[Upright]:
+    """What the obstacles of a field are made of, and how each leans. index: of the field in the scene."""
+    random = np.random.default_rng([field.seed, index, LEANING])
+    drawn = random.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
+    made = {name: getattr(field, name) for name in Solid.__struct_fields__}
+    return [Upright(**made, lean_rad=lean, lean_towards_rad=towards) for lean, towards in drawn.tolist()]
 
 
 def random_obstacles(

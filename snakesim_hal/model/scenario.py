@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.injection import CONTROL
 from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
+from snakesim_hal.model.fitting import fitted
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
 from snakesim_hal.model.robot import RobotFile, describe
@@ -280,7 +281,18 @@ def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
         table.put(key, override.value, override.flag)
         if key == "controller":
             _split_policy(table, override.value, override.flag)
+    scene = table.values.get("scene")
+    if isinstance(scene, dict) and "made_for" in scene:
+        _fit(table, {override.flag for override in overrides if override not in picks})
     return table
+
+
+def _fit(table: Table, flags: set[str]) -> None:
+    """Change a scene that was made for another robot; see fitting.py."""
+    config = decode(table, RunConfig)
+    changed = fitted(config.scene, config.robot, lambda key: table.origin_of(f"scene.{key}") in flags)
+    for key, value in changed.items():
+        table.put(f"scene.{key}", value, f"fitted to robot {config.robot.name!r}")
 
 
 def _split_policy(table: Table, controller: Any, origin: str) -> None:

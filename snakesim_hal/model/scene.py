@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from typing import Annotated
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -23,12 +24,11 @@ from snakesim_hal.model.outlines import (
     Size,
     metres,
 )
-from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles
+from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles, solids_of
 from snakesim_hal.model.route import Route, sine_points
+from snakesim_hal.model.solids import Solid, Upright
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
-
-GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless configured otherwise
 
 
 class Uneven(FileStruct, frozen=True, kw_only=True):
@@ -61,44 +61,40 @@ class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_
     points_m: Annotated[list[Point], Meta(min_length=2, max_length=20000)]
 
 
-class Cylinder(FileStruct, frozen=True, kw_only=True):
-    """An upright peg."""
+class Cylinder(Upright, frozen=True, kw_only=True):
+    """A peg."""
 
     position_m: Point
     radius_m: Size
     height_m: Size = 0.2
-    friction: Friction = 0.0
     name: Name | None = None
 
 
-class Box(FileStruct, frozen=True, kw_only=True):
-    """An upright block."""
+class Box(Upright, frozen=True, kw_only=True):
+    """A block."""
 
     position_m: Point
     size_m: tuple[Size, Size, Size]
     yaw_rad: Heading = 0.0
-    friction: Friction = 0.0
     name: Name | None = None
 
 
-class Sphere(FileStruct, frozen=True, kw_only=True):
-    """A ball fixed at its centre."""
+class Sphere(Solid, frozen=True, kw_only=True):
+    """A ball; one that slides does not roll."""
 
     position_m: Point
     radius_m: Size
     centre_height_m: Coordinate = 0.0
-    friction: Friction = 0.0
     name: Name | None = None
 
 
-class Wall(FileStruct, frozen=True, kw_only=True):
+class Wall(Upright, frozen=True, kw_only=True):
     """A straight wall from point to point."""
 
     from_m: Point
     to_m: Point
     thickness_m: Size = 0.05
     height_m: Size = 0.3
-    friction: Friction = 0.0
     name: Name | None = None
 
 
@@ -113,7 +109,7 @@ class Step(FileStruct, frozen=True, kw_only=True):
     name: Name | None = None
 
 
-class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
+class PegsAlongRoute(Upright, frozen=True, kw_only=True):
     """Pegs beside the route where a snake can push off: at its inflections, on alternating sides.
 
     `corridor_m` is the distance from the route to a peg's surface, so a body of radius r has `corridor_m - r` of
@@ -125,12 +121,18 @@ class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
     count: Annotated[int, Meta(ge=1, le=2000)]
     first: Annotated[int, Meta(ge=0, le=2000)] = 0  # inflections to skip at the start
     height_m: Size = 0.2
-    friction: Friction = 0.0
 
 
 SAMPLES = 24  # of a link's axis, of which the nearest to a box counts
 OVERLAP_M = 1e-4  # of an obstacle and a link, that is let pass
 MAX_OBSTACLES = 4096  # bound of the message World
+
+
+class Body(FileStruct, frozen=True, kw_only=True):
+    """The body that a scene was laid out for: another robot gets the scene in proportion, see fitting.py."""
+
+    spacing_m: Size  # between neighbouring yaw joints
+    radius_m: Size
 
 
 class SceneFile(FileStruct, frozen=True, kw_only=True):
@@ -139,6 +141,7 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     about: str = ""
     ground: Ground
+    made_for: Body | None = None
     route: SineRoute | WaypointRoute | None = None
     cylinder: list[Cylinder] = []
     box: list[Box] = []
@@ -163,12 +166,16 @@ def route_of(scene: SceneFile) -> Route | None:
                 raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}") from None
 
 
-class Placed(FileStruct, frozen=True, kw_only=True):
+class Placed(Upright, frozen=True, kw_only=True):
     """A placed obstacle, with parameters that only the simulator needs."""
 
     obstacle: Obstacle
-    friction: float
     walkable: bool = False  # a step is part of the ground: contacts with it are not for pushing off
+
+
+def _placed(obstacle: Obstacle, solid: Solid) -> Placed:
+    made = Upright if isinstance(solid, Upright) else Solid
+    return Placed(obstacle=obstacle, **{name: getattr(solid, name) for name in made.__struct_fields__})
 
 
 def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:
@@ -179,9 +186,9 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
     _check_count(scene)
     placed: list[Placed] = []
     for i, c in enumerate(scene.cylinder):
-        placed.append(_peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m, c.friction))
+        placed.append(_placed(_peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m), c))
     for i, b in enumerate(scene.box):
-        placed.append(_block(b.name or f"box_{i}", b.position_m, b.size_m, b.yaw_rad, b.friction))
+        placed.append(_placed(_block(b.name or f"box_{i}", b.position_m, b.size_m, b.yaw_rad), b))
     for i, s in enumerate(scene.sphere):
         ball = Obstacle(
             name=s.name or f"sphere_{i}",
@@ -190,7 +197,7 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
             radius_m=s.radius_m,
             height_m=2 * s.radius_m,
         )
-        placed.append(Placed(obstacle=ball, friction=s.friction))
+        placed.append(_placed(ball, s))
     for i, w in enumerate(scene.wall):
         run = (w.to_m[0] - w.from_m[0], w.to_m[1] - w.from_m[1])
         length = math.hypot(*run)
@@ -198,10 +205,11 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
             raise ConfigError(f"scene {scene.name!r}: `wall.{i}`: `from_m` and `to_m` are the same point")
         middle = ((w.from_m[0] + w.to_m[0]) / 2, (w.from_m[1] + w.to_m[1]) / 2)
         size = (length, w.thickness_m, w.height_m)
-        placed.append(_block(w.name or f"wall_{i}", middle, size, math.atan2(run[1], run[0]), w.friction))
+        placed.append(_placed(_block(w.name or f"wall_{i}", middle, size, math.atan2(run[1], run[0])), w))
     for i, p in enumerate(scene.step):
         size = (*p.size_m, p.height_m)
-        placed.append(_block(p.name or f"step_{i}", p.position_m, size, p.yaw_rad, p.friction, walkable=True))
+        platform = _block(p.name or f"step_{i}", p.position_m, size, p.yaw_rad)
+        placed.append(Placed(obstacle=platform, friction=p.friction, walkable=True))
     route = route_of(scene)
     for i, row in enumerate(scene.pegs_along_route):
         placed.extend(_pegs_along(scene, i, row, route))
@@ -210,7 +218,7 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
         found = random_obstacles(
             field, f"scene {scene.name!r}: `random_field.{i}`", i, route, standing, keep_clear or []
         )
-        placed.extend(Placed(obstacle=obstacle, friction=field.friction) for obstacle in found)
+        placed.extend(map(_placed, found, solids_of(field, i, len(found))))
     names = Counter(p.obstacle.name for p in placed)
     twice = sorted(name for name, count in names.items() if count > 1)
     if twice:
@@ -226,21 +234,13 @@ def _check_count(scene: SceneFile) -> None:
         raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
 
 
-def _peg(name: str, position: Point, radius: float, height: float, friction: float) -> Placed:
+def _peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
     centre = (float(position[0]), float(position[1]), height / 2)
-    peg = Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius, height_m=height)
-    return Placed(obstacle=peg, friction=friction)
+    return Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius, height_m=height)
 
 
-def _block(
-    name: str,
-    position: Point,
-    size: tuple[float, float, float],
-    yaw: float,
-    friction: float,
-    walkable: bool = False,
-) -> Placed:
-    block = Obstacle(
+def _block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:
+    return Obstacle(
         name=name,
         shape="box",
         position_w=(*position, size[2] / 2),
@@ -248,7 +248,6 @@ def _block(
         half_size_m=(size[0] / 2, size[1] / 2, size[2] / 2),
         height_m=size[2],
     )
-    return Placed(obstacle=block, friction=friction, walkable=walkable)
 
 
 def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:
@@ -271,13 +270,14 @@ def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route 
         push = left if left @ forward > 0 else -left  # from the peg into the body
         centre = route.position_w(s) - push * (row.corridor_m + row.radius_m)
         name = f"peg_{index}_{row.first + k}"
-        pegs.append(_peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m, row.friction))
+        pegs.append(_placed(_peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m), row))
     return pegs
 
 
 def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) -> None:
     """Raise ConfigError when an obstacle overlaps the snake's start."""
-    solid = [item.obstacle for item in placed if not item.walkable]
+    height_m = max(link.radius_m for link in snake)
+    solid = [_where_it_lies(item, height_m) for item in placed if not item.walkable]
     obstacles = Outlines.of(solid)
     rear, front = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
     along = rear[:, None] + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (front - rear)[:, None]  # (links, SAMPLES, 2)
@@ -290,3 +290,11 @@ def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) ->
             f"{overlaps[i, k] * 1000:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or change [start] in "
             f"the scenario"
         )
+
+
+def _where_it_lies(item: Placed, height_m: float) -> Obstacle:
+    """An obstacle where its axis passes this height above the ground."""
+    x, y, z = item.obstacle.position_w
+    aside_m = height_m * math.tan(item.lean_rad)
+    x, y = x + aside_m * math.cos(item.lean_towards_rad), y + aside_m * math.sin(item.lean_towards_rad)
+    return msgspec.structs.replace(item.obstacle, position_w=(x, y, z))

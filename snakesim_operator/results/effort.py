@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.model.scene import GRAVITY_M_S2
+from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_operator.results.advance import MIN_DISTANCE_M, Advance, energy_j_per_m
 from snakesim_operator.results.record import RunRecord
 

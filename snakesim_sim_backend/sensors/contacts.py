@@ -10,8 +10,8 @@ from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.contacts import Touch, TouchReader
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.frames import into
 from snakesim_sim_backend.sensors.scope import Normal
 

@@ -24,7 +24,7 @@ class JointReader:
         count = motors.count
         self._unfelt = [2 * count + i for i in motors.without_torque]
         self._count = count
-        self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
+        self._angles, self._velocities = data.qpos[FREE_QPOS:][:count], data.qvel[FREE_DOFS:][:count]
         self._torques = motors.applied_nm()
         sigma = [sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm]
         self._sigma = np.repeat(sigma, count)

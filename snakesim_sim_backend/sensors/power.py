@@ -16,7 +16,7 @@ class PowerReader:
     """Supply, current and temperatures of the joints' modules. No noise, and never a leak."""
 
     def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, joints: Sequence[Joint]) -> None:
-        self._velocities, self._torques = data.qvel[FREE_DOFS:], motors.applied_nm()
+        self._velocities, self._torques = data.qvel[FREE_DOFS:][: motors.count], motors.applied_nm()
         self._windings, self._count = windings, len(joints)
         self._supply_v = np.array([joint.supply.voltage_v for joint in joints])
         self._idle_a = np.array([joint.supply.idle_a for joint in joints])

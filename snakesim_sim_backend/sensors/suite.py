@@ -15,8 +15,8 @@ from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.joints import JointReader
 from snakesim_sim_backend.sensors.registry import SYNCHRONOUS, mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope

@@ -90,7 +90,9 @@ def test_it_is_that_of_every_computer(tmp_path: Path, computer: str) -> None:
 @pytest.mark.parametrize("computer", ["SkylakeX", pytest.param("plain NumPy", marks=pytest.mark.slow)])
 def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
     ended = run(tmp_path, "triplet", "--endpoint", free_endpoint(), computer=COMPUTERS[computer])
-    assert digest_in(ended) == GOLDEN["triplet"]
+    if " is gone: " in ended.out:  # a computer that stands for seconds loses a process, and the run is no whole one
+        ended = run(tmp_path, "triplet", "--endpoint", free_endpoint(), computer=COMPUTERS[computer])
+    assert digest_in(ended) == GOLDEN["triplet"], ended.out + ended.err
 
 
 @common

@@ -196,7 +196,8 @@ def test_what_contacts_carry_is_told_and_not_what_is_asked_for():
 
 def test_a_body_that_is_clear_of_every_peg_is_not_called_jammed():
     thin = ("robot.chain.modules=10", "robot.module.length_m=0.09", "robot.module.radius_m=0.025")
-    whole = run(configure("peg_row", *thin), duration_s=4.0)
+    row = "scene.made_for={spacing_m = 0.09, radius_m = 0.025}"  # as it is, not in proportion
+    whole = run(configure("peg_row", *thin, row), duration_s=4.0)
     assert not any(report.jammed for report in whole.reports)
     assert whole.states[-1] == "NotLocomoting"
     assert "no obstacle touches the body" in whole.reasons[-1] and "has swung out" in whole.reasons[-1]

@@ -78,8 +78,8 @@ def make_bench(seed: int) -> Bench | None:
     if not solved.feasible or solved.forces_n.min() < 0.05 * PROPULSION_N:
         return None
     pegs = [
-        Cylinder(position_m=tuple((o - n * (robot.module.radius_m + PEG_RADIUS_M)).tolist()), radius_m=PEG_RADIUS_M)
-        for o, n in zip(touched, normals, strict=True)
+        Cylinder(position_m=(float(x), float(y)), radius_m=PEG_RADIUS_M, friction=0.0)
+        for x, y in np.array(touched) - (robot.module.radius_m + PEG_RADIUS_M) * np.array(normals)
     ]
     pushes = loads(solved.forces_n, normals, -PROPULSION_N * tangents[0])
     return Bench(

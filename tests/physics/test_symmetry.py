@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.arrays import Floats
-from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, build
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from tests.unit.sim_backend.rig import G, make_config
 
@@ -93,7 +93,7 @@ def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0, cone: mujoc
     data.qpos[2] = config.robot.module.radius_m
     data.qpos[3], data.qpos[6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
     data.qpos[FREE_QPOS:] = wave.at(0.0, count)
-    physics = Physics(model, data, sim.soles)
+    physics = Physics(sim, data)
     physics.begin()
     step_s, period_s = model.opt.timestep, 2 * np.pi / wave.rate
     tail, head = sim.soles.geoms[[0, -1]]

@@ -65,16 +65,27 @@ def _route(record: RunRecord, view: View) -> str:
 def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     obstacle: Obstacle = item.obstacle
     x, y = view.at(obstacle.position_w)
-    class_ = "step" if item.walkable else "peg"
+    class_ = "step" if item.walkable else "peg yields" if item.yields else "peg"
     reach = reach_m(obstacle) * view.scale
     if not view.shows(obstacle):
         return ""
     labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
-    tooltip = title(obstacle.name)
+    tooltip = title(_about(item))
     if obstacle.shape != "box":
         return element("circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
     corners = [view.at(corner) for corner in outline_w(obstacle)]
     return element("polygon", tooltip, points=points_text(corners), class_=class_)
+
+
+def _about(item: Placed) -> str:
+    said = [item.obstacle.name]
+    if item.lean_rad:
+        said.append(f"leans by {item.lean_rad:.2g} rad")
+    if item.stiffness_n_per_m is not None:
+        said.append(f"springs back with {item.stiffness_n_per_m:g} N/m")
+    if item.slides_at_n is not None:
+        said.append(f"slides from {item.slides_at_n:.3g} N on, and is drawn where it stood at the start")
+    return ", ".join(said)
 
 
 def outline_w(obstacle: Obstacle) -> Floats:

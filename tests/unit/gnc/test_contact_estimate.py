@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
 from snakesim_hal.model.kinematics import link_frames
-from snakesim_hal.model.scene import GRAVITY_M_S2
+from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
 from tests.unit.gnc.stage import make_robot
 

@@ -12,7 +12,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, start_of
 from snakesim_hal.physics.plant import LinkLoad, Plant
 from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.flat_ground import Physics
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.plant import MujocoPlant
 from snakesim_sim_backend.settings import PlantSettings, Tether
 from snakesim_sim_backend.tether import WINCH_N_S_PER_M
@@ -72,7 +72,7 @@ def through_joints_nm(plant, torques):
     model, data = plant.sim.model, mujoco.MjData(plant.sim.model)
     mujoco.mj_copyData(data, model, plant.data)
     data.qfrc_applied[6:] = torques
-    Physics(model, data, plant.sim.soles).forward()
+    Physics(plant.sim, data).forward()
     mujoco.mj_rnePostConstraint(model, data)
     through = [data.cdof[6 + i] @ data.cfrc_int[model.jnt_bodyid[1 + i]] for i in range(len(plant.angle_rad))]
     of_the_ground = data.qfrc_passive - data.qfrc_damper
@@ -307,7 +307,7 @@ def test_imus_feel_what_they_would_if_they_were_computed_in_every_step():
             mujoco.mj_copyData(other, model, plant.data)
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
             other.qfrc_applied[6:] = torques
-            Physics(model, other, plant.sim.soles).step(1)
+            Physics(plant.sim, other).step(1)
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         plant.advance(torques)
     imu = plant.imu()

@@ -68,6 +68,33 @@ def test_every_kind_of_obstacle_is_placed_as_described() -> None:
     assert step.walkable and not any(item.walkable for item in placed[:4])
 
 
+def test_what_obstacles_are_made_of_holds_for_all_of_a_row_or_field_and_leaves_their_places() -> None:
+    made = {"friction": 0.1, "mass_kg": 2.0, "base_friction": 0.5}
+    row = {"corridor_m": 0.06, "radius_m": 0.05, "count": 3}
+    plain = place(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
+    leaning = {**FIELD, **made, "lean_up_to_rad": 0.2}
+    loose = place(scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning]))
+    assert [item.obstacle for item in loose] == [item.obstacle for item in plain]
+    assert {(item.friction, item.slides_at_n) for item in plain} == {(0.2, None)}
+    assert {(item.friction, item.slides_at_n) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
+    assert not any(item.yields for item in plain) and all(item.yields for item in loose)
+    assert [item.lean_rad for item in loose[:3]] == [0.3] * 3
+    leans = np.array([(item.lean_rad, item.lean_towards_rad) for item in loose[3:]])
+    assert len(set(leans[:, 0])) == len(leans) and leans[:, 0].min() >= 0.0 and leans[:, 0].max() <= 0.2
+    assert leans[:, 1].min() < -1.0 and leans[:, 1].max() > 1.0
+
+
+def test_a_peg_that_leans_into_the_snake_at_its_start_is_refused() -> None:
+    beside = {"position_m": [0.3, 0.095], "radius_m": 0.05}
+    for towards_rad, overlaps in ((-math.pi / 2, True), (math.pi / 2, False)):
+        made = scene(cylinder=[{**beside, "lean_rad": 0.4, "lean_towards_rad": towards_rad}])
+        if overlaps:
+            with pytest.raises(ConfigError, match=r"'cylinder_0' overlaps link_1 of the snake at its start by 11.9 mm"):
+                check_clear(made, place(made), SNAKE)
+        else:
+            check_clear(made, place(made), SNAKE)
+
+
 # --- pegs along the route --------------------------------------------------------------------------------------
 
 

@@ -235,3 +235,18 @@ def test_the_plotting_library_is_the_one_that_its_note_names() -> None:
     digest = hashlib.sha256(LIBRARY.read_bytes()).hexdigest()
     assert f"`{LIBRARY.name}`" in (note := (LIBRARY.parent / "README.md").read_text()) and digest in note
     assert (LIBRARY.parent / "LICENSE-plotly.txt").is_file()
+
+
+def test_an_obstacle_that_yields_is_drawn_dashed_and_says_what_it_does(record: RunRecord) -> None:
+    row = record.config.scene.pegs_along_route[0]
+    made = msgspec.structs.replace(row, lean_rad=0.2, stiffness_n_per_m=800.0, mass_kg=2.0, base_friction=0.5)
+    scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])
+    loose = dataclasses.replace(record, config=msgspec.structs.replace(record.config, scene=scene))
+    html = report_page(loose, summarise(loose, "complete"))
+    assert 'class="peg yields"' in html and 'class="peg yields"' not in report_page(
+        record, summarise(record, "complete")
+    )
+    said = (
+        "leans by 0.2 rad, springs back with 800 N/m, slides from 9.81 N on, and is drawn where it stood at the start"
+    )
+    assert f"<title>peg_0_1, {said}</title>" in html

@@ -1,0 +1,58 @@
+"""A scene that was laid out for one robot suits another one as well, and what a user sets stays as it is."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.model.fitting import spacing_m
+from snakesim_hal.model.scenario import RunConfig, load, parse_set, place_all, write
+from snakesim_hal.model.scene import SineRoute
+
+
+def clutter(*sets: str) -> RunConfig:
+    return load("surveyed_clutter", [parse_set(text) for text in sets]).config
+
+
+def sine(config: RunConfig) -> SineRoute:
+    assert isinstance(config.scene.route, SineRoute)
+    return config.scene.route
+
+
+def test_the_robot_that_it_was_made_for_and_longer_ones_get_it_as_it_is() -> None:
+    as_it_is = clutter().scene
+    for joints in (8, 13, 30):
+        scene = clutter(f"robot.chain.modules={joints}").scene
+        assert (scene.route, scene.pegs_along_route, scene.made_for) == (
+            as_it_is.route,
+            as_it_is.pegs_along_route,
+            as_it_is.made_for,
+        )
+
+
+def test_a_robot_of_other_joints_and_another_radius_gets_it_in_proportion() -> None:
+    before, config = clutter(), clutter("robot=mamba")
+    share = 0.2 / 0.11  # its yaw joints are every second one
+    assert spacing_m(config.robot) == pytest.approx(0.2)
+    for name in ("amplitude_m", "wavelength_m", "length_m"):
+        assert getattr(sine(config), name) == pytest.approx(share * getattr(sine(before), name))
+    (row,), (field,) = config.scene.pegs_along_route, config.scene.random_field
+    assert row.corridor_m == pytest.approx(0.035 + share * 0.005)
+    beyond_m = before.scene.random_field[0].low_m[0] - sine(before).length_m
+    assert field.low_m == pytest.approx((sine(config).length_m + beyond_m, -1.0))
+    assert field.high_m[0] - field.low_m[0] == pytest.approx(4.6) and field.clearance_m == pytest.approx(0.11)
+    assert len(place_all(config)) > 40  # and it lies clear of them
+
+
+def test_what_a_flag_sets_is_not_fitted_and_the_rest_is_marked() -> None:
+    loaded = load("surveyed_clutter", [parse_set("robot=mamba"), parse_set("scene.route.wavelength_m=0.7")])
+    assert sine(loaded.config).wavelength_m == 0.7
+    origin = {key: source for key, _, source in loaded.explain()}
+    assert origin["scene.route.wavelength_m"] == "--set scene.route.wavelength_m=0.7"
+    assert origin["scene.route.amplitude_m"] == "fitted to robot 'mamba'"
+    assert "clutter.toml" in origin["scene.ground.friction"]
+
+
+def test_a_fitted_scene_that_is_run_again_is_not_fitted_again(tmp_path: Path) -> None:
+    config = clutter("robot=mamba")
+    write(config, tmp_path / "run.json")
+    assert load(str(tmp_path / "run.json")).config == config
