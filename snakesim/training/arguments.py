@@ -27,6 +27,14 @@ def add_commands(commands: Any) -> None:
         ("--seed", 0, 1, "of the search"),
     ):
         train.add_argument(flag, type=number(least, 100_000), default=default, metavar="N", help=f"{about} ({default})")
+    train.add_argument("--from", dest="begin", metavar="POLICY", help="begin at its numbers: shipped, or policy.onnx")
+    train.add_argument(
+        "--spread",
+        type=number(0.01, 10.0),
+        default=1.0,
+        metavar="X",
+        help="times how far the first generation looks (1)",
+    )
     train.add_argument("--duration", type=number(0.1, 3600.0, "s"), metavar="S", help="of an episode (the scenario's)")
     train.add_argument(
         "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002; may be repeated"
@@ -50,6 +58,8 @@ def _train(arguments: argparse.Namespace) -> int:
     chosen = ["--form", arguments.form, *(["--duration", f"{arguments.duration:g}"] if arguments.duration else [])]
     for flag in ("generations", "population", "fields", "check_fields", "seed"):
         chosen += [f"--{flag.replace('_', '-')}", str(getattr(arguments, flag))]
+    chosen += ["--from", arguments.begin] if arguments.begin else []
+    chosen += ["--spread", f"{arguments.spread:g}"] if arguments.spread != 1.0 else []
     chosen += [word for value in arguments.reward for word in ("--reward", value)]
     chosen += [word for value in arguments.set for word in ("--set", value)]
     return train(
@@ -59,8 +69,14 @@ def _train(arguments: argparse.Namespace) -> int:
             reward={one.key: one.value for one in map(parse_set, arguments.reward)},
             set={one.key: one.value for one in map(parse_set, arguments.set)},
             form=arguments.form,
+            begin=arguments.begin,
             effort=Effort(
-                arguments.generations, arguments.population, arguments.fields, arguments.check_fields, arguments.seed
+                arguments.generations,
+                arguments.population,
+                arguments.fields,
+                arguments.check_fields,
+                arguments.seed,
+                arguments.spread,
             ),
             workers=arguments.workers,
             cluster=arguments.cluster,

@@ -4,13 +4,16 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from snakesim.training.form import FELT_RAD, OBSERVE, RAMP_PER_S, Policy
-from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS
+from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, opened
+from snakesim_hal.errors import ConfigError
 
+LEARNED = "snakesim.learned"
 OPSET, IR = 17, 10  # that onnxruntime 1.20 reads
 NODES = (  # as `Policy.targets`
     ("MatMul", ("seen", "time"), "time_s"),
@@ -32,6 +35,17 @@ NODES = (  # as `Policy.targets`
 )
 
 
+def learned_by(policy: str) -> dict[str, float]:
+    """The numbers of a policy that was trained here, shipped or a file. Raises ConfigError."""
+    _, told = opened(policy)
+    try:
+        return msgspec.json.decode(told.get(LEARNED, ""), type=dict[str, float])
+    except msgspec.MsgspecError:
+        raise ConfigError(
+            f"--from {policy}: does not tell what `snakesim train` has learned; give a policy.onnx that it has written"
+        ) from None
+
+
 def export(file: Path, policy: Policy, values: Mapping[str, float], frame_skip: int, again: Sequence[str]) -> None:
     """Write it. values: the learned numbers, and again: the command that finds them, are told in the metadata."""
     width, joints = policy.time.shape
@@ -51,7 +65,7 @@ def export(file: Path, policy: Policy, values: Mapping[str, float], frame_skip: 
         JOINTS: str(joints),
         FRAME_SKIP: str(frame_skip),
         "snakesim.trained_by": " ".join(again),
-        "snakesim.learned": json.dumps({name: round(value, 6) for name, value in values.items()}),
+        LEARNED: json.dumps({name: round(value, 6) for name, value in values.items()}),
     }
     helper.set_model_props(model, properties)
     onnx.checker.check_model(model)

@@ -1,6 +1,6 @@
 """The search for a policy: CMA-ES over the parameters of a form, on fields that are drawn anew each generation."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cmaes
@@ -35,17 +35,24 @@ class Effort:
     fields: int  # for each policy
     check_fields: int
     seed: int
+    spread: float = 1.0  # of the first generation, times that of the form
 
 
 def search(
-    episodes: Episodes, form: str, effort: Effort, tell: Callable[[Generation, dict[str, float]], None]
+    episodes: Episodes,
+    form: str,
+    effort: Effort,
+    begin: Mapping[str, float],
+    tell: Callable[[Generation, dict[str, float]], None],
 ) -> tuple[dict[str, float], float]:
     """The best of all checked policies, and its mean reward there.
 
-    tell: gets each generation as it is done, and the best until then.
+    begin: parameters where it begins, if not where the form does. tell: gets each generation as it is done, and the
+    best until then.
     """
     parameters = FORMS[form]
-    starts, sigmas = (np.array([getattr(one, what) for one in parameters.values()]) for what in ("start", "sigma"))
+    starts = np.array([begin.get(name, one.start) for name, one in parameters.items()])
+    sigmas = effort.spread * np.array([one.sigma for one in parameters.values()])
     optimizer = cmaes.CMA(np.zeros(len(starts)), 1.0, seed=effort.seed, population_size=effort.population)
     best: tuple[float, dict[str, float]] = (-np.inf, {})
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from snakesim.training.curve import write_curve
 from snakesim.training.episodes import Episodes
-from snakesim.training.exported import export
+from snakesim.training.exported import export, learned_by
 from snakesim.training.form import Policy
 from snakesim.training.search import Effort, Generation, search
 from snakesim_hal.terminal import say
@@ -26,6 +26,7 @@ class Request:
     reward: Mapping[str, Any]
     set: Mapping[str, Any]
     form: str
+    begin: str | None  # a policy, shipped or a file, with whose numbers it begins
     effort: Effort
     workers: int | None
     cluster: str | None
@@ -44,6 +45,7 @@ def train(request: Request) -> int:
         "frame_skip": FRAME_SKIP,
     }
     curve: list[Generation] = []
+    begin = {} if request.begin is None else learned_by(request.begin)
 
     def tell(row: Generation, best: Mapping[str, float]) -> None:
         curve.append(row)
@@ -54,7 +56,7 @@ def train(request: Request) -> int:
 
     with Episodes(arguments, request.workers, request.cluster) as episodes:
         request.out.mkdir(parents=True, exist_ok=True)
-        _, reward = search(episodes, request.form, request.effort, tell)
+        _, reward = search(episodes, request.form, request.effort, begin, tell)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     say(
         f"{request.out / 'policy.onnx'}: reward {reward:.2f} on fields that it was checked on; {curve[-1].episodes} "

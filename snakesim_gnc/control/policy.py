@@ -40,7 +40,7 @@ class Model:
 
     def __init__(self, robot: Description, file: str) -> None:
         """Raises ConfigError that names the file, the field, its value and what is expected."""
-        self._session, given = _opened(file)
+        self._session, given = opened(file)
         fields = _Metadata(file, given)
         self.parts = fields.parts(robot)
         self.action = fields.one_of(ACTION, MODES)
@@ -162,7 +162,7 @@ def _path_of(name: str) -> Path:
     return POLICIES / f"{name}{SUFFIX}"
 
 
-def _opened(file: str) -> tuple[Any, Mapping[str, str]]:
+def opened(file: str) -> tuple[Any, Mapping[str, str]]:
     """A session with the model of a file, and its metadata."""
     data = read_bytes(_path_of(file))
     if RUNTIME is None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import snakesim
 from snakesim.environments import SnakeEnv
-from snakesim.training.exported import export
+from snakesim.training.exported import export, learned_by
 from snakesim.training.form import FORMS, OBSERVE, Policy
 from snakesim_gnc.control.policy import POLICIES, Model
 from snakesim_operator.cli import main, parser
@@ -35,6 +36,20 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     told = {one.key: one.value for one in onnx.load(trained / "policy.onnx").metadata_props}
     assert told["snakesim.trained_by"].startswith("snakesim train surveyed_clutter --form feeling --duration 0.5 ")
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
+
+
+def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) -> None:
+    began = learned_by(str(trained / "policy.onnx"))
+    nothing = ("--generations", "1", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.1")
+    typed = ["train", "surveyed_clutter", *nothing, "--from", str(trained / "policy.onnx"), "--spread", "0.01"]
+    assert main([*typed, "--workers", "1", "--out", str(tmp_path / "on")]) == 0
+    ended = learned_by(str(tmp_path / "on" / "policy.onnx"))
+    assert ended.keys() == began.keys()
+    for name, one in FORMS["feeling"].items():
+        assert abs(ended[name] - began[name]) < 0.1 * one.sigma
+    (tmp_path / "other.onnx").write_bytes(b"no model")
+    for wrong in (str(tmp_path / "other.onnx"), str(tmp_path / "absent.onnx")):
+        assert main([*typed[:-3], wrong, "--out", str(tmp_path / "on")]) == 2
 
 
 @pytest.mark.slow
@@ -64,15 +79,18 @@ def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, b
     assert run.complete and np.ptp(run["target.joint_5"]) > 0.05
 
 
-def test_the_shipped_policy_names_the_command_that_the_documentation_gives_for_it() -> None:
-    told = {one.key: one.value for one in onnx.load(POLICIES / "clutter.onnx").metadata_props}
-    given = ["train", "surveyed_clutter", "--duration", "8", "--reward", "energy=-0.002"]
+@pytest.mark.parametrize(("name", "out"), [("clutter", "trained"), ("free", "free")])
+def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(name: str, out: str) -> None:
+    told = {one.key: one.value for one in onnx.load(POLICIES / f"{name}.onnx").metadata_props}
+    page = (REPOSITORY / "docs" / "environments.md").read_text().replace("\\\n", " ")
+    (given,) = [
+        line for line in page.splitlines() if line.startswith("snakesim train") and line.endswith(f"--out {out}")
+    ]
     ours, documented = (
-        vars(parser().parse_args([*words, "--out", "trained"]))
-        for words in (told["snakesim.trained_by"].split()[1:], given)
+        vars(parser().parse_args(words))
+        for words in ([*told["snakesim.trained_by"].split()[1:], "--out", out], shlex.split(given)[1:])
     )
     assert ours == documented
-    assert f"snakesim {' '.join(given)} --out trained" in (REPOSITORY / "docs" / "environments.md").read_text()
 
 
 def test_the_shipped_policy_crosses_a_field_that_it_was_not_trained_on() -> None:
