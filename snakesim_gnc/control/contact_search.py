@@ -2,7 +2,8 @@
 
 That it stands is told from the way that its middle has come, not from a speed: with 5 mm of noise in a pose, a speed
 along the path is hardly ever below 1 cm/s for a whole second. Whether contacts would allow a push does not matter: a
-body that they hold does not come on either. Navigation plans a new path from wherever the wave leads.
+body that they hold does not come on either, and one that could push where it lies mostly stands again a moment later.
+Navigation plans a new path from wherever the wave leads.
 
 Among obstacles it is the wave that feels its way (`felt_wave.py`), which pushes off whatever it meets. Where none are
 near, that one goes backward: on ground whose friction is the same in every direction, a body moves the way that its
@@ -10,7 +11,6 @@ wave travels. There the wave travels from tail to head until there are; by itsel
 """
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,25 +21,17 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
 MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
+LEAST_S = 2.0
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
 TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
-
-
-@dataclass(frozen=True)
-class Patience:
-    """When to search, and for how long."""
-
-    after_s: float  # of standing; 0: never
-    least_s: float
-    most_s: float
-    enough_n: float  # of force along the body that contacts allow: there is something to push off
 
 
 class ContactSearch:
     """Decides whether to search, and makes the wave."""
 
-    def __init__(self, robot: Description, patience: Patience) -> None:
-        self._patience = patience
+    def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
+        """after_s: of standing; 0: never."""
+        self._after_s, self._for_s = after_s, for_s
         self._felt, self._to_head = FeltWave(robot), HeadSteeredUndulation(robot, TO_HEAD)
         self._wave: HeadSteeredUndulation = self._felt
         self._middle_w: Floats | None = None
@@ -52,27 +44,23 @@ class ContactSearch:
         """Whether the body moves by the wave."""
         return self._since_s is not None
 
-    def decide(self, view: View, middle_w: Floats, *, wanted_m_s: float, near: bool, max_force_n: float) -> bool:
-        """Whether to search at this tick.
-
-        middle_w: (2,), of the body. near: obstacles are. max_force_n: force along the body that its contacts allow.
-        """
-        before, patience = self.active, self._patience
+    def decide(self, view: View, middle_w: Floats, *, wanted_m_s: float, near: bool) -> bool:
+        """Whether to search at this tick. middle_w: (2,), of the body. near: obstacles are."""
+        before = self.active
         if self._since_s is None:
             if self._stands(view, middle_w, abs(wanted_m_s)):
                 self._since_s = view.time_s
                 self._wave = self._felt if near else self._to_head
                 self._wave.start_from(np.array(view.joints.angle_rad))
         else:
-            for_s = view.time_s - self._since_s
-            done = near if self._wave is self._to_head else max_force_n >= patience.enough_n
-            if for_s >= patience.most_s or (for_s >= patience.least_s and done):
+            found = near and self._wave is self._to_head
+            if view.time_s - self._since_s >= (min(LEAST_S, self._for_s) if found else self._for_s):
                 self.stop()
         self.changed = self.active != before
         return self.active
 
     def _stands(self, view: View, middle_w: Floats, wanted_m_s: float) -> bool:
-        after_s = self._patience.after_s
+        after_s = self._after_s
         if after_s == 0.0:
             return False
         if self._middle_w is None:

@@ -1,10 +1,11 @@
 """A wave whose joints yield to, and join in with, what they and their neighbours measure. Needs no map and no contacts.
 
-    target = (amplitude + growth share) sin(phase - lag turns) + bend + FELT_RAD tanh(sum of gains x measured)
+    target = (amplitude + growth share + gains x contact forces) sin(phase - lag turns) + bend
+             + FELT_RAD tanh(sum of gains x measured)
 
 turns counts the joints that bend from the head on, share goes from 0 at the head to 1 at the tail. It is the law of the
-shipped policy `clutter` (`snakesim train`, `docs/environments.md`) with its numbers, but for the gains on contact
-forces, and with the bend of `HeadSteeredUndulation`.
+shipped policy `free` (`snakesim train`, `docs/environments.md`) with its numbers, with the bend of
+`HeadSteeredUndulation`, and with the contacts that guidance tells, measured or estimated.
 """
 
 import math
@@ -16,12 +17,14 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.undulation import HeadSteeredUndulation
 from snakesim_hal.wire.messages import Description
 
-AMPLITUDE_RAD, GROWTH_RAD, PERIOD_S, LAG_RAD = 0.565567, -0.54787, math.tau / 5.541805, 0.40975
+AMPLITUDE_RAD, GROWTH_RAD, PERIOD_S, LAG_RAD = 0.655033, -0.650954, math.tau / 5.209156, 0.376296
+STEERING_RAD = 0.14708 * 13  # of all joints together, towards a goal abeam
 FELT_RAD = 0.4
 # Of the joint behind, of the joint itself and of the one ahead.
-ANGLE_GAINS = np.array([-0.887897, 0.100268, 0.126671]) / 0.5  # 1/rad
-VELOCITY_GAINS = np.array([-0.064773, 0.086698, 0.383481]) / 2.0  # s/rad
-TORQUE_GAINS = np.array([0.673059, -0.464064, -0.666265]) / 5.0  # 1/(N m)
+ANGLE_GAINS = np.array([-0.670569, -0.084816, 0.239528]) / 0.5  # 1/rad
+VELOCITY_GAINS = np.array([0.097894, 0.143753, 0.410768]) / 2.0  # s/rad
+TORQUE_GAINS = np.array([0.626002, -0.320414, -0.755809]) / 5.0  # 1/(N m)
+CONTACT_GAINS = np.array([0.337442, 0.064817]) / 50.0  # rad/N, of the links behind and ahead of a joint
 
 
 class FeltWave(HeadSteeredUndulation):
@@ -47,5 +50,18 @@ class FeltWave(HeadSteeredUndulation):
         reference[bends] += FELT_RAD * np.tanh(felt)
         return reference
 
-    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> NDArray[np.float64]:
-        return self._swing_rad
+    def _bend_rad(self, view: View) -> float:
+        """Towards the goal, not along a path: where obstacles push the body, it does not follow one."""
+        if view.world is None or view.trajectory is None:
+            return 0.0
+        nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
+        to_goal = (view.trajectory.goal_w or view.trajectory.path_w[-1]) - nodes[-1]
+        along = nodes[-1] - nodes[0]
+        return STEERING_RAD / len(self._body.bends) * math.sin(math.atan2(*to_goal[::-1]) - math.atan2(*along[::-1]))
+
+    def _amplitude_rad(self, view: View, _waves: NDArray[np.float64], _passed_s: float) -> NDArray[np.float64]:
+        forces_n = np.zeros(len(self._robot.links))
+        for contact in view.world.contacts if view.world is not None else ():
+            forces_n[contact.link] += math.hypot(*contact.force_w)
+        behind, ahead = forces_n[:-1][self._body.bends], forces_n[1:][self._body.bends]
+        return self._swing_rad + CONTACT_GAINS[0] * behind + CONTACT_GAINS[1] * ahead

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.carried import FeltContacts
-from snakesim_gnc.control.contact_search import ContactSearch, Patience
+from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
@@ -38,7 +38,6 @@ LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little,
 AS_WANTED = 0.5  # share of the wanted speed from which on a body moves as it is to
 STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where on its path it is
 LARGEST_SLIDE_M = 0.02
-SEVERAL = 2  # obstacles within reach: what there is to push off is among them
 FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
 DRAG_S = 0.3  # time constant of what all contacts are felt to do along the body
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
@@ -128,21 +127,11 @@ class ObstacleAided:
             Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
             about("in which the body comes no 2 cm on, until it moves by a wave in search of contacts; 0: never"),
         ] = 1.2
-        search_least_s: Annotated[
-            float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
-            about("how long it does so at least"),
-        ] = 2.0
         search_s: Annotated[
             float,
             Meta(gt=0, le=1000, extra_json_schema={"unit": "s"}),
-            about("how long it does so at most"),
+            about("how long it does so; on free ground only until there are obstacles"),
         ] = 8.0
-        search_until_n: Annotated[
-            float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "N"}),
-            about("from the least on it ends when contacts allow such a push"),
-        ] = 20.0
         blend_s: Annotated[
             float,
             Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
@@ -197,10 +186,7 @@ class ObstacleAided:
         self._moved_at_s = 0.0
         self._felt_n = self._drag_n = 0.0  # what contacts are felt to do along the body, and what they mostly do
         self._waits = False
-        self._search = ContactSearch(
-            robot,
-            Patience(settings.search_after_s, settings.search_least_s, settings.search_s, settings.search_until_n),
-        )
+        self._search = ContactSearch(robot, after_s=settings.search_after_s, for_s=settings.search_s)
 
     def update(self, view: View) -> Action:
         """Angles of the body further along the path, as far as the wanted speed needs it."""
@@ -214,8 +200,8 @@ class ObstacleAided:
         if self._search.active:
             self._look(located, np.zeros(len(self._robot.joints)))
         middle_w, wanted_m_s = located.nodes_w.mean(axis=1), located.trajectory.speed_m_s
-        near = self._last_push is not None and len(self._last_push.touches) >= SEVERAL
-        if self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near, max_force_n=self._max_force_n):
+        near = self._last_push is not None and len(self._last_push.touches) > 0
+        if self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near):
             return self._undulate(view)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)

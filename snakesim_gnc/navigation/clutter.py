@@ -98,7 +98,7 @@ class ClutterPlanner:
         self._back_by_m = 0.0
         self._back_until_ns = 0
         self._trail: list[Floats] = []
-        self._aim = np.zeros(2)
+        self._aim, self._goal_w = np.zeros(2), np.zeros(2)
         self._finished = False
         self._next_point = 0
         self._headed_rad: float | None = None  # for which the present path was planned; None: for no direction
@@ -123,6 +123,7 @@ class ClutterPlanner:
             self._aim = self._towards(body)
         else:
             self._aim = np.array([np.cos(desired.heading_w_rad), np.sin(desired.heading_w_rad)])
+            self._goal_w = body[-1] + self._search.body_length_m * self._aim
             self._finished = False
         if tick != self._tick or not self.ready:  # a tick that is shown again is the same turn
             self._turn(body, world, desired)
@@ -147,6 +148,7 @@ class ClutterPlanner:
             searching=self._why,
             searched_nodes=self.searched_nodes,
             peg_friction=self._search.peg_friction,
+            goal_w=(float(self._goal_w[0]), float(self._goal_w[1])),
         )
 
     def _turn(self, body: Floats, world: World, desired: DesiredMotion) -> None:
@@ -215,13 +217,14 @@ class ClutterPlanner:
         return float(np.hypot(*(middle - recent[0][1])))
 
     def _towards(self, body: Floats) -> Floats:
-        """Unit vector of the goal's direction; notes when it is reached."""
+        """Unit vector of the goal's direction; notes where it is, and when it is reached."""
         if isinstance(self._goal, HeadingGoal):
             heading = self._goal.heading_rad
             goal = np.array([np.cos(heading), np.sin(heading)])
             middle = body.mean(axis=0)
             if self._start is None:
                 self._start = middle
+                self._goal_w = middle + (self._goal.distance_m + self._search.body_length_m) * goal
             left_m = self._goal.distance_m - float((middle - self._start) @ goal)
             self._finished = left_m <= (SHORT_M if self._finished else 0.0)
             return goal
@@ -231,7 +234,8 @@ class ClutterPlanner:
                 self._finished = True
                 break
             self._next_point += 1
-        ahead = points[self._next_point] - body[-1]
+        self._goal_w = points[self._next_point]
+        ahead = self._goal_w - body[-1]
         return ahead / max(float(np.hypot(*ahead)), 1e-9)
 
     def _why_again(self, body: Floats, world: World, moved_m: float | None, committed_m: float) -> str:

@@ -736,6 +736,9 @@ class Trajectory(Message, frozen=True, kw_only=True):
     peg_friction: Annotated[
         float, q.from_zero(2, "1 (Coulomb coefficient)"), about("of the obstacles, as the path is planned with it")
     ] = 0.0
+    goal_w: Annotated[
+        tuple[q.Length, q.Length] | None, about("x and y to which the mission leads the head; null: along the path")
+    ] = None
 
 
 class ControlState(Message, frozen=True, kw_only=True):

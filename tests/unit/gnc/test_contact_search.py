@@ -11,9 +11,10 @@ from snakesim.training.form import Policy
 from snakesim_gnc.control.controller import Action
 from snakesim_gnc.control.felt_wave import FeltWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.policy import POLICIES
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import Obstacle, WorldContact
 from tests.unit.gnc.stage import Stage, make_stage
 
 TAIL_S_M = 0.3
@@ -53,12 +54,12 @@ def test_it_searches_only_for_a_while_and_then_tries_its_path_again() -> None:
     assert searches[150] and not searches[350] and searches[450]
 
 
-def test_contacts_that_allow_a_push_end_a_search_but_not_at_once() -> None:
+def test_among_obstacles_a_search_takes_its_time_whatever_could_push_meanwhile() -> None:
     """A body that they hold while it pushes is moved elsewhere."""
     stage = make_stage()
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, search_least_s=2.0))
-    searches = [SEARCHES in action.report.why for action in stands(controller, stage, range(420))]
-    assert not any(searches[:95]) and all(searches[105:295]) and not any(searches[305:395])
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, search_s=3.0))
+    searches = [SEARCHES in action.report.why for action in stands(controller, stage, range(480))]
+    assert not any(searches[:95]) and all(searches[105:395]) and not any(searches[405:475])
 
 
 def test_noise_of_the_pose_does_not_hide_that_a_body_stands() -> None:
@@ -76,17 +77,43 @@ def test_nobody_searches_when_told_not_to() -> None:
     assert not any(SEARCHES in action.report.why for action in stands(never, stage, range(500)))
 
 
-def test_the_wave_is_that_of_the_shipped_policy_without_its_gains_on_contact_forces() -> None:
+def test_the_wave_is_that_of_the_shipped_policy() -> None:
     stage, passed_s, draw = make_stage(), 2.3, np.random.default_rng(3)
-    view = stage.view(0, TAIL_S_M, without="world")
+    view = stage.view(0, TAIL_S_M)
+    assert view.world is not None and view.trajectory is not None
+    contacts = [
+        WorldContact(
+            link=link,
+            obstacle="peg",
+            body_s_m=0.0,
+            position_w=(0.0, 0.0, 0.0),
+            normal_w=(0.0, 1.0, 0.0),
+            tangent_w=(1.0, 0.0, 0.0),
+            force_w=(3.0, force_n, 4.0),
+        )
+        for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
+    ]
+    forces_n = np.zeros(14)
+    for contact in contacts:
+        forces_n[contact.link] += np.linalg.norm(contact.force_w)
     velocity, torque = draw.normal(0.0, 1.0, 13).tolist(), draw.normal(0.0, 3.0, 13).tolist()
     joints = msgspec.structs.replace(view.joints, velocity_rad_s=velocity, torque_nm=torque)
-    session = onnxruntime.InferenceSession(POLICIES / "clutter.onnx")
+    nodes = PlanarBody(stage.robot).nodes_w(view.world, joints.angle_rad)
+    goal_w = nodes[:, -1] + np.array([0.5, 2.0])
+    bearing_rad = np.arctan2(2.0, 0.5) - np.arctan2(*(nodes[:, -1] - nodes[:, 0])[::-1])
+    session = onnxruntime.InferenceSession(POLICIES / "free.onnx")
     learned = msgspec.json.decode(session.get_modelmeta().custom_metadata_map["snakesim.learned"])
     sizes = {"time_s": 1, "goal_bearing": 2, "angle_rad": 13, "velocity_rad_s": 13, "torque_nm": 13, "contact_n": 14}
-    policy = Policy.of({**learned, "contact_behind": 0.0, "contact_ahead": 0.0}, ["yaw"] * 13, sizes)
-    seen = [passed_s, 1.0, 0.0, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *[0.0] * 14]
-    wave = FeltWave(stage.robot).reference_rad(replace(view, joints=joints), passed_s)
+    policy = Policy.of({**learned, "head_steering": 0.0}, ["yaw"] * 13, sizes)
+    goal = [np.cos(bearing_rad), np.sin(bearing_rad)]
+    seen = [passed_s, *goal, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *forces_n]
+    felt = replace(
+        view,
+        joints=joints,
+        world=msgspec.structs.replace(view.world, contacts=contacts),
+        trajectory=msgspec.structs.replace(view.trajectory, goal_w=tuple(goal_w.tolist())),
+    )
+    wave = FeltWave(stage.robot).reference_rad(felt, passed_s)
     assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
 
 
