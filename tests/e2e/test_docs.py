@@ -23,6 +23,7 @@ HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if sectio
 EVALUATION = [section for section in sections(REPOSITORY / "docs" / "evaluation.md") if section.has_commands]
 CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controllers.md") if section.has_commands]
 ROBOTS = [section for section in sections(REPOSITORY / "docs" / "robots.md") if section.has_commands]
+SCENES = [section for section in sections(REPOSITORY / "docs" / "scenes.md") if section.has_commands]
 LESSONS = [
     section
     for page in ("first-controller", "train", "your-robot", "your-sensor", "lab-tutorial")
@@ -74,7 +75,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *LESSONS], ids=named)
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *LESSONS], ids=named)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
@@ -98,7 +99,13 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 def test_the_documents_ask_for_something() -> None:
-    assert len(TUTORIAL) >= 5 and len(EVALUATION) >= 6 and len(README) >= 1 and len(HIL) == 1 and len(CONTROLLERS) == 1
+    assert (
+        len(TUTORIAL) >= 5
+        and len(EVALUATION) >= 6
+        and len(README) >= 1
+        and len(HIL) == 1
+        and len(CONTROLLERS) == len(SCENES) == 1
+    )
     every = [info for section in [*TUTORIAL, *EVALUATION, *README] for info, _ in section.blocks]
     assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
     commands = "\n".join(content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh"))
