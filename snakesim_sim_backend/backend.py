@@ -17,7 +17,7 @@ from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build, of_joints
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.registry import check_models
@@ -177,7 +177,8 @@ class SimBackend:
 
     def true_state(self) -> TrueState:
         """The state as it is, without noise, rate or delay."""
-        data, sim, joints = self._data, self._sim, self._motors.count
+        data, sim = self._data, self._sim
+        angles_rad, velocities_rad_s = of_joints(data, self._motors.count)
         w, x, y, z, ox, oy, oz = *data.qpos[3:FREE_QPOS].tolist(), *data.qvel[3:FREE_DOFS].tolist()
         contacts = [
             TrueContact(t.body - sim.first_link_body, t.obstacle, *map(np.array, (t.position_w, t.normal_w, t.force_w)))
@@ -189,8 +190,8 @@ class SimBackend:
             base_orientation_wxyz=data.qpos[3:FREE_QPOS].copy(),
             base_velocity_w=data.qvel[:3].copy(),
             base_angular_velocity_w=np.array(rotate((w, x, y, z), (ox, oy, oz))),
-            angles_rad=data.qpos[FREE_QPOS:][:joints].copy(),
-            velocities_rad_s=data.qvel[FREE_DOFS:][:joints].copy(),
+            angles_rad=angles_rad.copy(),
+            velocities_rad_s=velocities_rad_s.copy(),
             torques_nm=self._motors.applied_nm().copy(),
             contacts=contacts,
         )

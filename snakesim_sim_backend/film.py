@@ -13,7 +13,7 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP
-from snakesim_sim_backend.model import FOOT_GROUP, FREE_QPOS, build
+from snakesim_sim_backend.model import FOOT_GROUP, build, of_joints
 from snakesim_sim_backend.sensors.rendered import opened_context
 from snakesim_sim_backend.settings import SimSettings
 
@@ -64,9 +64,8 @@ class Film:
         self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: Sequence[Floats] = ()
     ) -> Picture:
         """The snake at a pose of its tail end, seen from above and behind. arrows_w: each (2, 3), from and to."""
-        joints = len(angles_rad)
         self._data.qpos[:3], self._data.qpos[3:7] = position_w, wxyz
-        self._data.qpos[FREE_QPOS:][:joints] = angles_rad
+        of_joints(self._data, len(angles_rad))[0][:] = angles_rad
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._camera.lookat[:] = look_at_w

@@ -12,6 +12,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
@@ -49,6 +50,11 @@ class SimModel:
     soles: Soles | None  # None: MuJoCo has the contacts with the ground, which is not flat
     hung: bool  # its tail link is clamped
     yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
+
+
+def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
+    """Angles and velocities of a robot's joints, (count,) each, tail to head; views."""
+    return data.qpos[FREE_QPOS : FREE_QPOS + count], data.qvel[FREE_DOFS : FREE_DOFS + count]
 
 
 def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> SimModel:

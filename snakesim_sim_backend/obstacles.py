@@ -11,14 +11,13 @@ from snakesim_hal.model.scene import Placed
 from snakesim_sim_backend.ground import GROUND_GROUP, SAND
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.surface import frictionless_skin
-from snakesim_sim_backend.yielding import mass_kg
+from snakesim_sim_backend.yielding import AXES, mass_kg
 
 OBSTACLE = "obstacle:"
 STEP = "step:"
 OBSTACLE_GROUP = 2
 BLUE = [0.24, 0.42, 0.60, 1.0]  # colour
 LINKS, OBSTACLES = 1, 2  # bits of what a geom has contacts with
-FREEDOMS = {"x": mujoco.mjtJoint.mjJNT_SLIDE, "y": mujoco.mjtJoint.mjJNT_SLIDE, "z": mujoco.mjtJoint.mjJNT_HINGE}
 
 
 class Shape(TypedDict):
@@ -52,8 +51,8 @@ def add_obstacle(
     else:
         foot = np.array([*placed.obstacle.position_w[:2], 0.0])
         body = spec.worldbody.add_body(name=name, pos=foot)
-        for axis, kind in FREEDOMS.items():
-            body.add_joint(name=f"{name}:{axis}", type=kind, axis=[float(axis == other) for other in FREEDOMS])
+        for axis, kind in AXES.items():
+            body.add_joint(name=f"{name}:{axis}", type=kind, axis=[float(axis == other) for other in AXES])
         shape["pos"] = (shape["pos"] - foot).tolist()
     body.add_geom(
         name=name,

@@ -10,14 +10,14 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
 from snakesim_sim_backend.loads import LoadReader
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.model import FREE_DOFS, SimModel, build, of_joints
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
@@ -46,14 +46,14 @@ class MujocoPlant:
         self._model, self._data = self._sim.model, mujoco.MjData(self._sim.model)
         model, data = self._model, self._data
         self.step_s: float = model.opt.timestep
-        data.qpos[:] = _rest(config, settings)
+        data.qpos[:] = _rest(config, settings, yields=bool(self._sim.yielding))
         self._physics = Physics(self._sim, data)
         self._physics.begin()
         if settings.tether is not None:
             Rope(model, data, settings.tether).tighten()
         count = config.robot.chain.modules
         hinges = slice(FREE_DOFS, FREE_DOFS + count)
-        self._angles, self._velocities = data.qpos[FREE_QPOS:][:count], data.qvel[hinges]
+        self._angles, self._velocities = of_joints(data, count)
         self._torques, self._passive = data.qfrc_applied[hinges], data.qfrc_damper[hinges]
         self._qacc, self._accelerations = data.qacc, data.qacc[hinges]
         self._armature = model.dof_armature[hinges]
@@ -166,14 +166,14 @@ class MujocoPlant:
         return self._data
 
 
-def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
+def _rest(config: RunConfig, settings: PlantSettings, *, yields: bool) -> Floats:
     """The rest pose of `SimBackend`, (nq,): motors are needed to hold the start angles until then.
 
     On rough ground it depends on the step by millimetres, so the step is the default one of `SimBackend`, unless
-    obstacles on springs may need a shorter one.
+    obstacles that yield may need a shorter one.
     """
     step_s = min(SimSettings().timestep_s, settings.contact_time_s / 2)
-    if any(item.yields for item in place_all(config)):
+    if yields:
         step_s = min(step_s, settings.timestep_s)
     sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)

@@ -12,7 +12,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, JointState, Message, Pose
-from snakesim_sim_backend.model import FREE_QPOS, build
+from snakesim_sim_backend.model import FREE_QPOS, build, of_joints
 from snakesim_sim_backend.sensors.registry import mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import Reader, Scope
 from snakesim_sim_backend.settings import SimSettings
@@ -48,7 +48,7 @@ class SensorService:
             return None
         self._data.qpos[:3] = pose.position_w
         self._data.qpos[3:FREE_QPOS] = np.asarray(pose.orientation_wxyz) / np.linalg.norm(pose.orientation_wxyz)
-        self._data.qpos[FREE_QPOS:][: len(joints.angle_rad)] = joints.angle_rad
+        of_joints(self._data, len(joints.angle_rad))[0][:] = joints.angle_rad
         mujoco.mj_kinematics(self._sim.model, self._data)
         return [(key, reader.read(clock.tick, joints.stamp_ns)) for key, reader in self._readers]
 

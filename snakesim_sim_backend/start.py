@@ -11,7 +11,7 @@ from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.ground import GROUND_GROUP, PLANE_GROUP
-from snakesim_sim_backend.model import FREE_QPOS, SimModel
+from snakesim_sim_backend.model import FREE_QPOS, SimModel, of_joints
 from snakesim_sim_backend.physics import Physics
 
 REST = 1e-3  # m/s and rad/s: slower is at rest
@@ -35,7 +35,7 @@ def place_robot(
     pose = start_of(config)
     data.qpos[:2] = pose.position_w
     data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
-    data.qpos[FREE_QPOS:][: motors.count] = pose.angles_rad
+    of_joints(data, motors.count)[0][:] = pose.angles_rad
     data.qpos[2] = highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
     if sim.hung:
         data.qpos[2] += config.robot.length_m + CLEAR_M

@@ -18,11 +18,11 @@ import numpy as np
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle
+from snakesim_sim_backend.flat_ground import DAMPING, MAX_PHASE
 
-FREEDOMS = 3  # of each, and numbers of each in `userdata`
+AXES = {"x": mujoco.mjtJoint.mjJNT_SLIDE, "y": mujoco.mjtJoint.mjJNT_SLIDE, "z": mujoco.mjtJoint.mjJNT_HINGE}
+FREEDOMS = len(AXES)  # of each, and numbers of each in `userdata`
 HOLD_M = 1e-4  # of a rigid one under as much force as friction holds
-MAX_PHASE = 0.7  # of a spring's vibration in one physics step
-DAMPING = 0.5  # of critical
 WOOD_KG_M3 = 500.0  # of a post whose mass is not given
 MOST = 128  # in a scene: the solver works on all their freedoms together with the snake's
 NEVER_N = 1e9  # friction of one that is fixed
@@ -44,6 +44,11 @@ def mass_kg(placed: Placed) -> float:
     return placed.mass_kg if placed.mass_kg is not None else WOOD_KG_M3 * area_m2 * placed.obstacle.height_m
 
 
+def hardest_n_per_m(placed: Placed, step_s: float) -> float:
+    """The stiffest spring that physics steps of this length can follow."""
+    return mass_kg(placed) * (MAX_PHASE / step_s) ** 2
+
+
 def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
     """Whether their springs can be computed. Raises ConfigError."""
     if len(placed) > MOST:
@@ -52,7 +57,7 @@ def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
             f"leave some of them rigid and fixed"
         )
     for item in placed:
-        most = mass_kg(item) * (MAX_PHASE / step_s) ** 2
+        most = hardest_n_per_m(item, step_s)
         if item.stiffness_n_per_m is not None and item.stiffness_n_per_m > most:
             raise ConfigError(
                 f"scene {scene!r}: obstacle {item.obstacle.name!r}: `stiffness_n_per_m` = {item.stiffness_n_per_m:g} "
@@ -71,12 +76,12 @@ class Yielding:
         arms = np.array([foot_of(item.obstacle)[1] for item in placed])
         slides_at_n = [item.slides_at_n for item in placed]
         self._most = np.array([NEVER_N if slides is None else slides for slides in slides_at_n])
-        hardest = masses * (MAX_PHASE / step_s) ** 2
+        hardest = np.array([hardest_n_per_m(item, step_s) for item in placed])
         held = np.minimum(hardest, self._most / HOLD_M)
         given = [item.stiffness_n_per_m for item in placed]
-        self._stiffness = np.array([k if k is not None else stiff for k, stiff in zip(given, held, strict=True)])
-        self._damping = (2.0 * DAMPING * np.sqrt(self._stiffness * masses))[:, None]
-        self._stiffness = self._stiffness[:, None]
+        stiffness = np.array([k if k is not None else stiff for k, stiff in zip(given, held, strict=True)])
+        self._stiffness = stiffness[:, None]
+        self._damping = (2.0 * DAMPING * np.sqrt(stiffness * masses))[:, None]
         self._scale = np.column_stack([np.ones((count, 2)), arms])
         self._moved = data.qpos[-FREEDOMS * count :].reshape(count, FREEDOMS)
         self._speeds = data.qvel[first_dof:].reshape(count, FREEDOMS)

@@ -16,12 +16,12 @@ import numpy as np
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.felt_wave import FeltWave
-from snakesim_gnc.control.undulation import HeadSteeredUndulation
+from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
 MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
-LEAST_S = 2.0
+LEAST_S = 2.0  # of the wave to the head, however soon there are obstacles
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
 TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
 
@@ -33,7 +33,7 @@ class ContactSearch:
         """after_s: of standing; 0: never."""
         self._after_s, self._for_s = after_s, for_s
         self._felt, self._to_head = FeltWave(robot), HeadSteeredUndulation(robot, TO_HEAD)
-        self._wave: HeadSteeredUndulation = self._felt
+        self._wave: LateralUndulation = self._felt
         self._middle_w: Floats | None = None
         self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
         self._since_s: float | None = None

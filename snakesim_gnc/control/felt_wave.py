@@ -1,11 +1,11 @@
-"""A wave whose joints yield to, and join in with, what they and their neighbours measure. Needs no map and no contacts.
+"""A wave whose joints yield to, and join in with, what they and their neighbours measure. Needs no map.
 
     target = (amplitude + growth share + gains x contact forces) sin(phase - lag turns) + bend
              + FELT_RAD tanh(sum of gains x measured)
 
 turns counts the joints that bend from the head on, share goes from 0 at the head to 1 at the tail. It is the law of the
-shipped policy `free` (`snakesim train`, `docs/environments.md`) with its numbers, with the bend of
-`HeadSteeredUndulation`, and with the contacts that guidance tells, measured or estimated.
+shipped policy `free` (`snakesim train`, `docs/environments.md`) with its numbers, and with the contacts that guidance
+tells, measured or estimated.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.undulation import HeadSteeredUndulation
+from snakesim_gnc.control.undulation import LateralUndulation, aside_rad
 from snakesim_hal.wire.messages import Description
 
 AMPLITUDE_RAD, GROWTH_RAD, PERIOD_S, LAG_RAD = 0.655033, -0.650954, math.tau / 5.209156, 0.376296
@@ -27,11 +27,11 @@ TORQUE_GAINS = np.array([0.626002, -0.320414, -0.755809]) / 5.0  # 1/(N m)
 CONTACT_GAINS = np.array([0.337442, 0.064817]) / 50.0  # rad/N, of the links behind and ahead of a joint
 
 
-class FeltWave(HeadSteeredUndulation):
-    """A wave bent towards where the path leads, largest at the head, that feels its way."""
+class FeltWave(LateralUndulation):
+    """A wave bent towards the goal, largest at the head, that feels its way."""
 
     def __init__(self, robot: Description) -> None:
-        wave = HeadSteeredUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=PERIOD_S, lag_rad=LAG_RAD)
+        wave = LateralUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=PERIOD_S, lag_rad=LAG_RAD)
         super().__init__(robot, wave)
         count = len(self._body.bends)
         self._swing_rad = AMPLITUDE_RAD + GROWTH_RAD * np.arange(count)[::-1] / max(count - 1, 1)
@@ -56,8 +56,7 @@ class FeltWave(HeadSteeredUndulation):
             return 0.0
         nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
         to_goal = (view.trajectory.goal_w or view.trajectory.path_w[-1]) - nodes[-1]
-        along = nodes[-1] - nodes[0]
-        return STEERING_RAD / len(self._body.bends) * math.sin(math.atan2(*to_goal[::-1]) - math.atan2(*along[::-1]))
+        return STEERING_RAD / len(self._body.bends) * math.sin(aside_rad(nodes, to_goal))
 
     def _amplitude_rad(self, view: View, _waves: NDArray[np.float64], _passed_s: float) -> NDArray[np.float64]:
         forces_n = np.zeros(len(self._robot.links))

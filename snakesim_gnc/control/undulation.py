@@ -22,6 +22,12 @@ from snakesim_hal.wire.quantities import about
 AIM_M = 1.0  # how far ahead on the path the head steers for
 
 
+def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float:
+    """Direction of `aim_w`, (2,), from that of a body, (n, 2) tail to head; whole turns are left in."""
+    along = nodes_w[-1] - nodes_w[0]
+    return math.atan2(aim_w[1], aim_w[0]) - math.atan2(along[1], along[0])
+
+
 class LateralUndulation:
     """A wave of the yaw joints from head to tail."""
 
@@ -86,8 +92,7 @@ class LateralUndulation:
         path = np.array(view.trajectory.path_w)
         ahead = path[np.argmin(np.hypot(*(path - nodes[-1]).T)) :]
         aim = ahead[min(np.searchsorted(np.hypot(*(ahead - nodes[-1]).T), AIM_M), len(ahead) - 1)] - nodes[-1]
-        along = nodes[-1] - nodes[0]
-        off = math.remainder(math.atan2(aim[1], aim[0]) - math.atan2(along[1], along[0]), math.tau)
+        off = math.remainder(aside_rad(nodes, aim), math.tau)
         return math.copysign(self._set.steering, self._set.lag_rad) * off / len(self._body.bends)
 
 

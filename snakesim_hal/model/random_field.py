@@ -11,7 +11,7 @@ from numpy.random import Generator
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright
+from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright, made_of
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
@@ -45,8 +45,7 @@ def solids_of(field: RandomField, index: int, count: int) -> list[Upright]:
     """What the obstacles of a field are made of, and how each leans. index: of the field in the scene."""
     random = np.random.default_rng([field.seed, index, LEANING])
     drawn = random.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
-    made = {name: getattr(field, name) for name in Solid.__struct_fields__}
-    return [Upright(**made, lean_rad=lean, lean_towards_rad=towards) for lean, towards in drawn.tolist()]
+    return [Upright(**made_of(field), lean_rad=lean, lean_towards_rad=towards) for lean, towards in drawn.tolist()]
 
 
 def random_obstacles(

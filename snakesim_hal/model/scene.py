@@ -26,7 +26,7 @@ from snakesim_hal.model.outlines import (
 )
 from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles, solids_of
 from snakesim_hal.model.route import Route, sine_points
-from snakesim_hal.model.solids import Solid, Upright
+from snakesim_hal.model.solids import Solid, Upright, made_of
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
 
@@ -174,8 +174,7 @@ class Placed(Upright, frozen=True, kw_only=True):
 
 
 def _placed(obstacle: Obstacle, solid: Solid) -> Placed:
-    made = Upright if isinstance(solid, Upright) else Solid
-    return Placed(obstacle=obstacle, **{name: getattr(solid, name) for name in made.__struct_fields__})
+    return Placed(obstacle=obstacle, **made_of(solid))
 
 
 def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:

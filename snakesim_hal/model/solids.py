@@ -1,6 +1,6 @@
 """What obstacles of every shape may be made of, and whether they lean, spring back or slide when they are pushed."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -38,3 +38,9 @@ class Upright(Solid, frozen=True, kw_only=True):
 
     lean_rad: Annotated[float, Meta(ge=0, le=MOST_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
     lean_towards_rad: Heading = 0.0  # to where its top leans, seen from above; 0: along x
+
+
+def made_of(solid: Solid) -> dict[str, Any]:
+    """The fields that any obstacle has, of one with more: of an upright one also how it leans."""
+    kind = Upright if isinstance(solid, Upright) else Solid
+    return {name: getattr(solid, name) for name in kind.__struct_fields__}

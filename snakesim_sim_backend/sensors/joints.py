@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_hal.model.sensors import JointSensor
 from snakesim_hal.wire.messages import JointState
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.model import of_joints
 from snakesim_sim_backend.sensors.scope import Normal
 from snakesim_sim_backend.sensors.timing import ticks_of
 
@@ -24,7 +24,7 @@ class JointReader:
         count = motors.count
         self._unfelt = [2 * count + i for i in motors.without_torque]
         self._count = count
-        self._angles, self._velocities = data.qpos[FREE_QPOS:][:count], data.qvel[FREE_DOFS:][:count]
+        self._angles, self._velocities = of_joints(data, count)
         self._torques = motors.applied_nm()
         sigma = [sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm]
         self._sigma = np.repeat(sigma, count)

@@ -9,14 +9,14 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Power
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model import FREE_DOFS
+from snakesim_sim_backend.model import of_joints
 
 
 class PowerReader:
     """Supply, current and temperatures of the joints' modules. No noise, and never a leak."""
 
     def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, joints: Sequence[Joint]) -> None:
-        self._velocities, self._torques = data.qvel[FREE_DOFS:][: motors.count], motors.applied_nm()
+        (_, self._velocities), self._torques = of_joints(data, motors.count), motors.applied_nm()
         self._windings, self._count = windings, len(joints)
         self._supply_v = np.array([joint.supply.voltage_v for joint in joints])
         self._idle_a = np.array([joint.supply.idle_a for joint in joints])
