@@ -19,6 +19,7 @@ from snakesim.environments.stepped import Robot, SteppedRobot
 from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.observations import Observer, chosen
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.drawn import draws_of
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.scenario import Override, RunConfig, check, description_of
 from snakesim_hal.wire.messages import JointState
@@ -44,6 +45,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         frame_skip: int = 5,
         duration: float | None = None,
         set: Mapping[str, Any] | None = None,
+        draw: Mapping[str, Sequence[float]] | None = None,
         new_field: bool = True,
         safe: bool = True,
         residual_rad: float = 0.2,
@@ -55,8 +57,9 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
         observe: parts of the observation, by name; flat: one vector of them, rather than a dict. reward: weights of
         terms. frame_skip: ticks of the robot in a step. duration: s of robot time until truncation. set: values by
-        their dotted keys, as of `snakesim.run`. new_field: each reset draws the scene's random fields anew. safe: the
-        gate limits every command. residual_rad: bound of a correction. width, height: of pictures, in pixels.
+        their dotted keys, as of `snakesim.run`. draw: keys whose number each seed has of its own, between two bounds.
+        new_field: each reset draws the scene's random fields anew. safe: the gate limits every command. residual_rad:
+        bound of a correction. width, height: of pictures, in pixels.
 
         Raises ConfigError for wrong input, in the words of the command.
         """
@@ -74,7 +77,8 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             if not safe:
                 raise ConfigError(f"action={action!r}: a controller commands through the gate; leave safe=False out")
             overrides.insert(0, Override("controller", controller, f"action={action}"))
-        self._scenario_config = checked(os.fspath(scenario), overrides, processes=False)
+        self._scenario, self._overrides, self._draws = os.fspath(scenario), overrides, draws_of(draw)
+        self._scenario_config = self._drawn(0)
         self._assisted, self._safe, self._new_field = controller is not None, safe, new_field
         self._frame_skip, self._size, self.render_mode = frame_skip, (width, height), render_mode
         self._weights = weights_of(reward)
@@ -195,8 +199,13 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
                 if given is not None or not tries_left or not self._new_field:
                     raise
 
+    def _drawn(self, seed: int) -> RunConfig:
+        """The scenario with what a seed has of its own. Raises ConfigError."""
+        drawn = [override for draw in self._draws for override in draw.on_field(seed, "draw")]
+        return checked(self._scenario, [*self._overrides, *drawn], processes=False)
+
     def _of_seed(self, seed: int) -> RunConfig:
-        config = msgspec.structs.replace(self._scenario_config, seed=seed)
+        config = msgspec.structs.replace(self._drawn(seed) if self._draws else self._scenario_config, seed=seed)
         if self._new_field and config.scene.random_field:
             fields = [msgspec.structs.replace(field, seed=seed) for field in config.scene.random_field]
             config = msgspec.structs.replace(config, scene=msgspec.structs.replace(config.scene, random_field=fields))

@@ -40,6 +40,9 @@ def add_commands(commands: Any) -> None:
         "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002; may be repeated"
     )
     train.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="may be repeated")
+    train.add_argument(
+        "--draw", action="append", default=[], metavar="KEY=LOW:HIGH", help="a number for each field; may be repeated"
+    )
     train.add_argument("--workers", type=number(1, 1000), metavar="N", help="processes (one a core)")
     train.add_argument("--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster, instead")
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of what comes of it")
@@ -53,6 +56,7 @@ def _train(arguments: argparse.Namespace) -> int:
         extras.check(extra, "`snakesim train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import Request, train
+    from snakesim_hal.model.drawn import parse_draw
     from snakesim_hal.model.scenario import parse_set
 
     chosen = ["--form", arguments.form, *(["--duration", f"{arguments.duration:g}"] if arguments.duration else [])]
@@ -62,12 +66,14 @@ def _train(arguments: argparse.Namespace) -> int:
     chosen += ["--spread", f"{arguments.spread:g}"] if arguments.spread != 1.0 else []
     chosen += [word for value in arguments.reward for word in ("--reward", value)]
     chosen += [word for value in arguments.set for word in ("--set", value)]
+    chosen += [word for value in arguments.draw for word in ("--draw", value)]
     return train(
         Request(
             scenario=arguments.scenario,
             duration_s=arguments.duration,
             reward={one.key: one.value for one in map(parse_set, arguments.reward)},
             set={one.key: one.value for one in map(parse_set, arguments.set)},
+            draw=dict(map(parse_draw, arguments.draw)),
             form=arguments.form,
             begin=arguments.begin,
             effort=Effort(

@@ -25,6 +25,7 @@ class Request:
     duration_s: float | None
     reward: Mapping[str, Any]
     set: Mapping[str, Any]
+    draw: Mapping[str, Sequence[Any]]  # keys of a number that each field has of its own: lowest, highest
     form: str
     begin: str | None  # a policy, shipped or a file, with whose numbers it begins
     effort: Effort
@@ -42,6 +43,7 @@ def train(request: Request) -> int:
         "duration": request.duration_s,
         "reward": dict(request.reward),
         "set": dict(request.set),
+        "draw": dict(request.draw),
         "frame_skip": FRAME_SKIP,
     }
     curve: list[Generation] = []

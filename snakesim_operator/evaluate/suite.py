@@ -34,10 +34,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.model.drawn import Draw
 from snakesim_hal.model.files import FileStruct, Table, decode, find, read_table
 from snakesim_hal.model.scenario import Override, RunConfig, check, compose, written
 from snakesim_hal.model.textfiles import parse_toml
@@ -55,19 +55,6 @@ class Row(FileStruct, frozen=True, kw_only=True):
     set: dict[str, Any] = {}
     unset: list[str] = []
     without: list[str] = []
-
-
-class Draw(FileStruct, frozen=True, kw_only=True):
-    """A number that each field has of its own, whatever row and controller: what a lab does not choose."""
-
-    set: Annotated[list[str], Meta(min_length=1)]
-    low: float
-    high: float
-
-    def on_field(self, field: int) -> list[Override]:
-        """Evenly distributed; by the field's number and the first key, so that a draw more changes no other."""
-        number = np.random.default_rng([field, *self.set[0].encode()]).uniform(self.low, self.high)
-        return [Override(key, round(float(number), 6), "[[draw]]") for key in self.set]
 
 
 class Suite(FileStruct, frozen=True, kw_only=True):

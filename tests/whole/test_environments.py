@@ -15,6 +15,7 @@ import snakesim
 import snakesim.environments
 from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
 from snakesim.environments.rewards import TERMS
+from snakesim_hal.model.drawn import Draw
 from snakesim_hal.model.scenario import write
 from snakesim_operator.extras import BRINGS
 from tests.e2e.documents import REPOSITORY, sections
@@ -117,6 +118,22 @@ def test_one_seed_and_the_same_actions_give_one_digest_and_another_seed_another_
     for env in fields:
         env.reset(seed=5)
     assert [env.config.scene.random_field[0].seed for env in fields] == [5, 1]
+
+
+def test_what_a_lab_does_not_choose_is_drawn_for_each_seed_as_in_an_evaluation() -> None:
+    env = made("surveyed_clutter", draw={"scene.ground.friction": (0.1, 0.4)}, duration=0.1)
+    found = [env.reset(seed=seed) and env.config.scene.ground.friction for seed in (7, 8, 7)]
+    assert found[0] == found[2] != found[1] and all(0.1 <= one <= 0.4 for one in found)
+    of_suite = Draw(set=["scene.ground.friction"], low=0.1, high=0.4)
+    assert found[0] == of_suite.on_field(7)[0].value
+    for wrong, why in (
+        ({"scene.ground.frictoin": (0.1, 0.4)}, "did you mean `friction`"),
+        ({"scene.ground.friction": (0.4, 0.1)}, "lowest and the highest"),
+        ({"scene.ground.friction": "0.1"}, "lowest and the highest"),
+        ({"scene.ground.friction": (0.1, 400.0)}, "not allowed"),
+    ):
+        with pytest.raises(snakesim.ConfigError, match=why):
+            made("surveyed_clutter", draw=wrong)
 
 
 def test_the_gate_is_inside_and_says_so() -> None:

@@ -17,7 +17,8 @@ from snakesim_gnc.control.policy import POLICIES, Model
 from snakesim_operator.cli import main, parser
 from tests.e2e.documents import REPOSITORY
 
-SMALL = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5")
+DRAW = ("--draw", "scene.ground.friction=0.1:0.4")
+SMALL = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5", *DRAW)
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,7 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert (trained / "curve.png").read_bytes().startswith(b"\x89PNG")
     told = {one.key: one.value for one in onnx.load(trained / "policy.onnx").metadata_props}
     assert told["snakesim.trained_by"].startswith("snakesim train surveyed_clutter --form feeling --duration 0.5 ")
+    assert " ".join(DRAW) in told["snakesim.trained_by"]
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
 
