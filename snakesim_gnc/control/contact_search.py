@@ -5,11 +5,13 @@ along the path is hardly ever below 1 cm/s for a whole second. Whether contacts 
 body that they hold does not come on either, and one that could push where it lies mostly stands again a moment later.
 Navigation plans a new path from wherever the wave leads.
 
-Among obstacles it is the wave that feels its way (`felt_wave.py`), which pushes off whatever it meets. Where none are
-near, that one goes backward: on ground whose friction is the same in every direction, a body moves the way that its
-wave travels. There the wave travels from tail to head until there are; by itself it comes on at 8 cm/s.
+There are two waves. One feels its way (`felt_wave.py`) and pushes off whatever it meets; where it meets nothing it goes
+backward, because on ground whose friction is the same in every direction a body moves the way that its wave travels.
+The other one travels from tail to head; by itself it comes on at 8 cm/s, and obstacles hold it. A search begins with
+the first if obstacles are near, and changes to the other one whenever the goal has come no nearer for a while.
 """
 
+import math
 from collections import deque
 
 import numpy as np
@@ -21,13 +23,13 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
 MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
-LEAST_S = 2.0  # of the wave to the head, however soon there are obstacles
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
+LEADS_M, LEADS_S = 0.05, 3.0  # nearer to the goal within this time; a wave that does less leads nowhere
 TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
 
 
 class ContactSearch:
-    """Decides whether to search, and makes the wave."""
+    """Decides whether to search and by which wave, and makes it."""
 
     def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
         """after_s: of standing; 0: never."""
@@ -37,7 +39,8 @@ class ContactSearch:
         self._middle_w: Floats | None = None
         self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
         self._since_s: float | None = None
-        self.changed = False  # it has begun or ended at this tick
+        self._led_s, self._left_m = 0.0, math.inf  # when the wave last led nearer to the goal, and how near that was
+        self.changed = False  # a wave has begun or ended at this tick
 
     @property
     def active(self) -> bool:
@@ -46,18 +49,34 @@ class ContactSearch:
 
     def decide(self, view: View, middle_w: Floats, *, wanted_m_s: float, near: bool) -> bool:
         """Whether to search at this tick. middle_w: (2,), of the body. near: obstacles are."""
-        before = self.active
+        before = self._moves_by
         if self._since_s is None:
             if self._stands(view, middle_w, abs(wanted_m_s)):
                 self._since_s = view.time_s
-                self._wave = self._felt if near else self._to_head
-                self._wave.start_from(np.array(view.joints.angle_rad))
-        else:
-            found = near and self._wave is self._to_head
-            if view.time_s - self._since_s >= (min(LEAST_S, self._for_s) if found else self._for_s):
-                self.stop()
-        self.changed = self.active != before
+                self._begin(self._felt if near else self._to_head, view)
+        elif view.time_s - self._since_s >= self._for_s:
+            self.stop()
+        elif not self._leads(view, middle_w):
+            self._begin(self._to_head if self._wave is self._felt else self._felt, view)
+        self.changed = self._moves_by is not before
         return self.active
+
+    @property
+    def _moves_by(self) -> LateralUndulation | None:
+        return self._wave if self.active else None
+
+    def _begin(self, wave: LateralUndulation, view: View) -> None:
+        self._wave, self._led_s, self._left_m = wave, view.time_s, math.inf
+        wave.start_from(np.array(view.joints.angle_rad))
+
+    def _leads(self, view: View, middle_w: Floats) -> bool:
+        """Whether the wave has led nearer to the goal of late."""
+        if (trajectory := view.trajectory) is None:
+            return True
+        left_m = math.dist(middle_w, trajectory.goal_w or trajectory.path_w[-1])
+        if left_m < self._left_m - LEADS_M:
+            self._led_s, self._left_m = view.time_s, left_m
+        return view.time_s - self._led_s < LEADS_S
 
     def _stands(self, view: View, middle_w: Floats, wanted_m_s: float) -> bool:
         after_s = self._after_s

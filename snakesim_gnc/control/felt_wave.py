@@ -4,7 +4,7 @@
              + FELT_RAD tanh(sum of gains x measured)
 
 turns counts the joints that bend from the head on, share goes from 0 at the head to 1 at the tail. It is the law of the
-shipped policy `free` (`snakesim train`, `docs/environments.md`) with its numbers, and with the contacts that guidance
+shipped policy `lab` (`snakesim train`, `docs/environments.md`) with its numbers, and with the contacts that guidance
 tells, measured or estimated.
 """
 
@@ -17,14 +17,15 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.undulation import LateralUndulation, aside_rad
 from snakesim_hal.wire.messages import Description
 
-AMPLITUDE_RAD, GROWTH_RAD, PERIOD_S, LAG_RAD = 0.655033, -0.650954, math.tau / 5.209156, 0.376296
-STEERING_RAD = 0.14708 * 13  # of all joints together, towards a goal abeam
+AMPLITUDE_RAD, GROWTH_RAD, PERIOD_S, LAG_RAD = 0.637896, -0.616543, math.tau / 5.391202, 0.391127
+# Towards a goal abeam, 13 times a joint at the tail, and how much more at the head.
+STEERING_RAD, HEAD_STEERING_RAD = 0.158285 * 13, 0.039155 * 13
 FELT_RAD = 0.4
 # Of the joint behind, of the joint itself and of the one ahead.
-ANGLE_GAINS = np.array([-0.670569, -0.084816, 0.239528]) / 0.5  # 1/rad
-VELOCITY_GAINS = np.array([0.097894, 0.143753, 0.410768]) / 2.0  # s/rad
-TORQUE_GAINS = np.array([0.626002, -0.320414, -0.755809]) / 5.0  # 1/(N m)
-CONTACT_GAINS = np.array([0.337442, 0.064817]) / 50.0  # rad/N, of the links behind and ahead of a joint
+ANGLE_GAINS = np.array([-0.646916, -0.096146, 0.21155]) / 0.5  # 1/rad
+VELOCITY_GAINS = np.array([0.172301, 0.047595, 0.425563]) / 2.0  # s/rad
+TORQUE_GAINS = np.array([0.556468, -0.344171, -0.676491]) / 5.0  # 1/(N m)
+CONTACT_GAINS = np.array([0.335405, 0.117568]) / 50.0  # rad/N, of the links behind and ahead of a joint
 
 
 class FeltWave(LateralUndulation):
@@ -34,7 +35,9 @@ class FeltWave(LateralUndulation):
         wave = LateralUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=PERIOD_S, lag_rad=LAG_RAD)
         super().__init__(robot, wave)
         count = len(self._body.bends)
-        self._swing_rad = AMPLITUDE_RAD + GROWTH_RAD * np.arange(count)[::-1] / max(count - 1, 1)
+        share = np.arange(count)[::-1] / max(count - 1, 1)
+        self._swing_rad = AMPLITUDE_RAD + GROWTH_RAD * share
+        self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - share)) / count
 
     def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
         """Angles of all joints, a time later than before."""
@@ -50,13 +53,13 @@ class FeltWave(LateralUndulation):
         reference[bends] += FELT_RAD * np.tanh(felt)
         return reference
 
-    def _bend_rad(self, view: View) -> float:
+    def _bend_rad(self, view: View) -> float | NDArray[np.float64]:
         """Towards the goal, not along a path: where obstacles push the body, it does not follow one."""
         if view.world is None or view.trajectory is None:
             return 0.0
         nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
         to_goal = (view.trajectory.goal_w or view.trajectory.path_w[-1]) - nodes[-1]
-        return STEERING_RAD / len(self._body.bends) * math.sin(aside_rad(nodes, to_goal))
+        return self._steering_rad * math.sin(aside_rad(nodes, to_goal))
 
     def _amplitude_rad(self, view: View, _waves: NDArray[np.float64], _passed_s: float) -> NDArray[np.float64]:
         forces_n = np.zeros(len(self._robot.links))

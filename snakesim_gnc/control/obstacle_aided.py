@@ -130,8 +130,8 @@ class ObstacleAided:
         search_s: Annotated[
             float,
             Meta(gt=0, le=1000, extra_json_schema={"unit": "s"}),
-            about("how long it does so; on free ground only until there are obstacles"),
-        ] = 8.0
+            about("how long it does so, and then tries its path again"),
+        ] = 30.0
         blend_s: Annotated[
             float,
             Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
@@ -197,8 +197,6 @@ class ObstacleAided:
         self._felt.take(located.world)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
-        if self._search.active:
-            self._look(located, np.zeros(len(self._robot.joints)))
         middle_w, wanted_m_s = located.nodes_w.mean(axis=1), located.trajectory.speed_m_s
         near = self._last_push is not None and len(self._last_push.touches) > 0
         if self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near):

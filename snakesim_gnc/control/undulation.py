@@ -81,7 +81,7 @@ class LateralUndulation:
     def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> float | NDArray[np.float64]:
         return self._set.amplitude_rad
 
-    def _bend_rad(self, view: View) -> float:
+    def _bend_rad(self, view: View) -> float | NDArray[np.float64]:
         """Bend of every joint that turns the body towards the path ahead.
 
         A body that moves by a wave to the head turns against its bend.
