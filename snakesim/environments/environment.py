@@ -199,16 +199,21 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
                 if given is not None or not tries_left or not self._new_field:
                     raise
 
-    def _drawn(self, seed: int) -> RunConfig:
-        """The scenario with what a seed has of its own. Raises ConfigError."""
-        drawn = [override for draw in self._draws for override in draw.on_field(seed, "draw")]
-        return checked(self._scenario, [*self._overrides, *drawn], processes=False)
+    def _drawn(self, seed: int, seeds: Sequence[str] = ()) -> RunConfig:
+        """The scenario with what is drawn for a seed, and with that seed at these keys. Raises ConfigError."""
+        own = [Override(key, seed, "seed") for key in seeds]
+        own += [override for draw in self._draws for override in draw.on_field(seed, "draw")]
+        return checked(self._scenario, [*self._overrides, *own], processes=False)
 
     def _of_seed(self, seed: int) -> RunConfig:
-        config = msgspec.structs.replace(self._drawn(seed) if self._draws else self._scenario_config, seed=seed)
-        if self._new_field and config.scene.random_field:
-            fields = [msgspec.structs.replace(field, seed=seed) for field in config.scene.random_field]
-            config = msgspec.structs.replace(config, scene=msgspec.structs.replace(config.scene, random_field=fields))
+        scene = self._scenario_config.scene
+        new_fields = scene.random_field if self._new_field else []
+        if self._draws:
+            return self._drawn(seed, ["seed", *(f"scene.random_field.{i}.seed" for i in range(len(new_fields)))])
+        config = msgspec.structs.replace(self._scenario_config, seed=seed)
+        if new_fields:
+            fields = [msgspec.structs.replace(field, seed=seed) for field in new_fields]
+            config = msgspec.structs.replace(config, scene=msgspec.structs.replace(scene, random_field=fields))
             check(config)
         return config
 

@@ -1,4 +1,4 @@
-"""Search for contacts: a body that does not come on moves by a wave, until it lies where it can push.
+"""Search for contacts: a body that does not come on moves by waves for a while, to where it may push again.
 
 That it stands is told from the way that its middle has come, not from a speed: with 5 mm of noise in a pose, a speed
 along the path is hardly ever below 1 cm/s for a whole second. Whether contacts would allow a push does not matter: a
@@ -29,41 +29,32 @@ TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_ra
 
 
 class ContactSearch:
-    """Decides whether to search and by which wave, and makes it."""
+    """Decides whether to search, and by which wave."""
 
     def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
         """after_s: of standing; 0: never."""
         self._after_s, self._for_s = after_s, for_s
         self._felt, self._to_head = FeltWave(robot), HeadSteeredUndulation(robot, TO_HEAD)
-        self._wave: LateralUndulation = self._felt
+        self._wave: LateralUndulation | None = None  # by which the body moves
         self._middle_w: Floats | None = None
         self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
-        self._since_s: float | None = None
+        self._since_s = 0.0  # when the search began
         self._led_s, self._left_m = 0.0, math.inf  # when the wave last led nearer to the goal, and how near that was
         self.changed = False  # a wave has begun or ended at this tick
 
-    @property
-    def active(self) -> bool:
-        """Whether the body moves by the wave."""
-        return self._since_s is not None
-
-    def decide(self, view: View, middle_w: Floats, *, wanted_m_s: float, near: bool) -> bool:
-        """Whether to search at this tick. middle_w: (2,), of the body. near: obstacles are."""
-        before = self._moves_by
-        if self._since_s is None:
+    def decide(self, view: View, middle_w: Floats, *, wanted_m_s: float, near: bool) -> LateralUndulation | None:
+        """The wave by which to move at this tick, if any. middle_w: (2,), of the body. near: obstacles are."""
+        before = self._wave
+        if before is None:
             if self._stands(view, middle_w, abs(wanted_m_s)):
                 self._since_s = view.time_s
                 self._begin(self._felt if near else self._to_head, view)
         elif view.time_s - self._since_s >= self._for_s:
             self.stop()
         elif not self._leads(view, middle_w):
-            self._begin(self._to_head if self._wave is self._felt else self._felt, view)
-        self.changed = self._moves_by is not before
-        return self.active
-
-    @property
-    def _moves_by(self) -> LateralUndulation | None:
-        return self._wave if self.active else None
+            self._begin(self._to_head if before is self._felt else self._felt, view)
+        self.changed = self._wave is not before
+        return self._wave
 
     def _begin(self, wave: LateralUndulation, view: View) -> None:
         self._wave, self._led_s, self._left_m = wave, view.time_s, math.inf
@@ -92,11 +83,7 @@ class ContactSearch:
         stands_m = min(STANDS_M, 0.5 * wanted_m_s * after_s)
         return view.time_s - then_s >= after_s and float(np.hypot(*(self._middle_w - then_w))) < stands_m
 
-    def reference_rad(self, view: View) -> Floats:
-        """Angles of all joints."""
-        return self._wave.reference_rad(view, view.period_s)
-
     def stop(self) -> None:
         """Not before the body has stood for a while again."""
-        self._since_s = self._middle_w = None
+        self._wave = self._middle_w = None
         self._way.clear()

@@ -25,6 +25,7 @@ from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
+from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
@@ -199,8 +200,8 @@ class ObstacleAided:
             return self._rest(view)
         middle_w, wanted_m_s = located.nodes_w.mean(axis=1), located.trajectory.speed_m_s
         near = self._last_push is not None and len(self._last_push.touches) > 0
-        if self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near):
-            return self._undulate(view)
+        if (wave := self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near)) is not None:
+            return self._undulate(view, wave)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
         ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
@@ -218,10 +219,10 @@ class ObstacleAided:
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         return Action(set_points, self._report(view, located, force_n, reference))
 
-    def _undulate(self, view: View) -> Action:
+    def _undulate(self, view: View, wave: LateralUndulation) -> Action:
         """In search of something to push off."""
         self._torques_nm[:] = self._push_n = self._force_n = 0.0
-        reference = self._search.reference_rad(view)
+        reference = wave.reference_rad(view, view.period_s)
         set_points = self._bumpless.to(view, reference, restarted=self._search.changed)
         why = "it does not come on: it moves by a wave, in search of contacts"
         return Action(set_points, Report(why=why, reference_rad=reference.tolist()))
