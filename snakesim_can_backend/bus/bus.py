@@ -13,6 +13,7 @@ import select
 import socket
 import struct
 import time
+import uuid
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -208,6 +209,11 @@ class VirtualPeer(Protocol):
     def close(self) -> None:
         """Leave the bus."""
         ...
+
+
+def virtual_channel() -> str:
+    """A name that no other virtual bus has. Its last digits are a channel: log files take them for one, as of can0."""
+    return f"virtual-{uuid.uuid4().hex[:8]}-0"
 
 
 class VirtualWire:

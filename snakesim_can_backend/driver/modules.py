@@ -6,11 +6,10 @@ in the period before. So a command acts exactly one period after the state that 
 
 import logging
 import time
-import uuid
 from dataclasses import dataclass, field
 
 from snakesim_can_backend.bus.adapter import open_wire
-from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, wait
+from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, virtual_channel, wait
 from snakesim_can_backend.bus.load import reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import logged
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
@@ -231,7 +230,7 @@ class Modules:
         settings = self._settings
         if settings.twins_run == "process":
             self._twins = TwinProcess(self._config, settings, pose, stepped=self._lockstep)
-        for name in settings.channels or [f"virtual-{uuid.uuid4().hex[:8]}"]:
+        for name in settings.channels or [virtual_channel()]:
             if settings.channels:
                 self.wires.append(open_wire(name, bit_rate=settings.bit_rate))
             else:

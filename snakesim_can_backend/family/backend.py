@@ -1,6 +1,5 @@
 """A backend over a family of drives on CAN: settings, checks, and the buses that it opens."""
 
-import uuid
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -8,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 from msgspec import Meta
 
 from snakesim_can_backend.bus.adapter import check_channel, is_emulated, open_wire
-from snakesim_can_backend.bus.bus import VirtualWire, Wire
+from snakesim_can_backend.bus.bus import VirtualWire, Wire, virtual_channel
 from snakesim_can_backend.bus.load import mbit, worst_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.family.drives import CanDrives
@@ -144,5 +143,5 @@ class CanDriveBackend(FamilyBackend):
                 clock_ns=clock.ns,
             )
 
-        channels = [f"virtual-{uuid.uuid4().hex[:8]}"] if body is not None else settings.channels
+        channels = [virtual_channel()] if body is not None else settings.channels
         return buses_of(joints, settings, channels, open_drives)

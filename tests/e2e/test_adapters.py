@@ -1,4 +1,7 @@
-"""A bus through python-can: two processes over UDP multicast, on the loopback of a machine of its own."""
+"""A bus through python-can: two processes over UDP multicast, on the loopback of a machine of its own.
+
+Emulated drives come before other processes: real ones do not wait for a computer's tests.
+"""
 
 import json
 import os
@@ -37,7 +40,7 @@ def run(machine: Machine, folder: Path, *arguments: str) -> str:
 
 def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: Machine, tmp_path: Path) -> None:
     log = tmp_path / "modules.log"
-    modules = machine.start(SNAKESIM, "modules", "triplet", "--channel", CHANNEL, log=log)
+    modules = machine.start(SNAKESIM, "modules", "triplet", "--channel", CHANNEL, log=log, hurried=True)
     try:
         wait_until(lambda: "modules ready: 13" in log.read_text(), "the modules")
         found = machine.run(SNAKESIM, "can", "scan", CHANNEL)
@@ -65,7 +68,7 @@ def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_say
     sets = [word for text in (*built, *gains) for word in ("--set", text)]
     log = tmp_path / "drives.log"
     started = (command, "triplet", "--channel", CHANNEL, "--pose", "127.0.0.1:7450", *sets)
-    drives = machine.start(SNAKESIM, *started, log=log)
+    drives = machine.start(SNAKESIM, *started, log=log, hurried=True)
     try:
         wait_until(lambda: f"{of} ready: 13" in log.read_text(), "the drives")
         where = ("--set", f'backend.channels=["{CHANNEL}"]', "--set", 'backend.pose_listen="127.0.0.1:7450"')
@@ -88,7 +91,7 @@ def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpre
     """Beside the driver compiled code without end stops the host: what is left is the modules' own watchdog."""
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
     log = tmp_path / "modules.log"
-    modules = machine.start(SNAKESIM, "modules", "triplet", "--channel", CHANNEL, log=log)
+    modules = machine.start(SNAKESIM, "modules", "triplet", "--channel", CHANNEL, log=log, hurried=True)
     try:
         wait_until(lambda: "modules ready: 13" in log.read_text(), "the modules")
         beside = ("--set", "services.control.place=host", "--set", 'backend.pose_listen="127.0.0.1:7450"')

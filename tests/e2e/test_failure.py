@@ -35,8 +35,9 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
         assert run.end() == 1
     nothing_left(tmp_path / "run")
     summary = msgspec.json.decode((tmp_path / "run" / SUMMARY).read_bytes(), type=RunSummary)
-    assert [fault.what for fault in summary.faults] == ["service_lost", "lease_expired"]
-    lost, expired = summary.faults
+    faults = {fault.what: fault for fault in summary.faults}  # which is seen first depends on how busy the computer is
+    assert set(faults) == {"service_lost", "lease_expired"}
+    lost, expired = faults["service_lost"], faults["lease_expired"]
     record = RunRecord.load(tmp_path / "run")
     lease_ticks = round(record.description.lease_ns / record.config.period_ns)
     assert expired.tick - lost.tick <= lease_ticks + 2
