@@ -9,7 +9,8 @@ import contextlib
 import importlib.util
 import sys
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,14 @@ def anything_offered() -> bool:
 
 def installed(group: str) -> list[str]:
     """Names of all installed plugins of a group."""
-    return sorted({entry.name for entry in entry_points(group=group)})
+    return sorted({entry.name for entry in _installed(*sys.path).select(group=group)})
+
+
+@cache
+def _installed(*_path: str) -> EntryPoints:
+    """Every entry point on a path: reading them anew takes 7 ms, and a run looks up a dozen."""
+    found: Any = entry_points()  # before Python 3.12 of another class, which has the same `select`
+    return found
 
 
 def find_plugin(group: str, name: str) -> Any:
@@ -58,7 +66,7 @@ def find_plugin(group: str, name: str) -> Any:
         return _offered[group, name]
     if in_file(name):
         return _from_file(name, kind)
-    found = list(entry_points(group=group, name=name))
+    found = list(_installed(*sys.path).select(group=group, name=name))
     if not found:
         raise ConfigError(
             f"no {kind} called {short(name)!r} is installed; {did_you_mean(name, installed(group))}installed are "
