@@ -24,6 +24,7 @@ COMMON: Mapping[str, str] = {
     "C library": "e4139a39",
 }
 """What `measured` finds in the common arithmetic; `make golden` prints it."""
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 NEEDED = {"avx2", "fma"}  # flags of the processor
 # The code in NumPy for wider processors, as NumPy 2.4 and earlier versions call it; each ignores the other's names.
 WIDER = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_KNL AVX512_KNM"
@@ -31,7 +32,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 
 @cache
-def environment() -> Mapping[str, str]:
+def environment() -> dict[str, str]:
     """Variables that make a process compute in the common arithmetic; none for a processor that cannot."""
     if os.uname().machine != "x86_64" or not (flags := _processor_flags()) >= NEEDED:
         return {}
@@ -40,10 +41,13 @@ def environment() -> Mapping[str, str]:
     return {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": wider, "NPY_ENABLE_CPU_FEATURES": ""}
 
 
-def pin() -> None:
-    """Compute in the common arithmetic, here and in child processes. Too late, and without effect, after NumPy."""
+def pin(*, one_thread: bool = False) -> None:
+    """Compute in the common arithmetic, here and in child processes. Too late, and without effect, after NumPy.
+
+    one_thread: nor have linear algebra start threads, which matrices of a robot's size only wait for.
+    """
     if "numpy" not in sys.modules:
-        os.environ.update(environment())
+        os.environ.update(environment() | ONE_THREAD if one_thread else environment())
 
 
 def is_pinned() -> bool:

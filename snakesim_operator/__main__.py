@@ -21,7 +21,7 @@ def main() -> int:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    pin()  # before NumPy is imported
+    pin(one_thread=True)  # before NumPy is imported
     try:
         from snakesim_operator.cli import main as command
 

@@ -7,7 +7,7 @@ import tempfile
 from snakesim_hal.arithmetic import pin
 
 if "SNAKESIM_UNPINNED" not in os.environ:  # set by tests/e2e/test_computers.py
-    pin()  # so that what is computed in this process is what `snakesim` computes
+    pin(one_thread=True)  # so that what is computed in this process is what `snakesim` computes
 
 # What runs leave behind for this user (a latched stop, the list of live robots) must not meet that of other tests.
 _state = tempfile.mkdtemp(prefix="snakesim-tests-")

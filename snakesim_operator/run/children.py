@@ -17,7 +17,6 @@ from snakesim_hal import arithmetic
 STOP_LIMIT_S = 5.0
 LINES_SHOWN, LAST_BYTES = 15, 16384
 PIPE_BYTES = 2**20  # of output, while this process is frozen
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class ProcessOutput:
@@ -86,7 +85,7 @@ def start(
     environment = {
         **os.environ,
         **arithmetic.environment(),
-        **ONE_THREAD,
+        **arithmetic.ONE_THREAD,
         "PYTHONUNBUFFERED": "1",
         "PYTHONHASHSEED": "0",
         **more,
