@@ -27,19 +27,19 @@ def host_record(out: Path) -> HostRecord:
         ("can", "leak:joint_3@1", "module_leak"),
         ("can", "cut:bus_1@1-1.3", "interface_down"),
         ("odrive", "mute:joint_3@1", "drive_silent"),
-        ("odrive", "reboot:joint_3@1", "drive_silent"),
+        pytest.param("odrive", "reboot:joint_3@1", "drive_silent", marks=pytest.mark.slow),  # as dynamixel
         ("odrive", "overheat:joint_3@1", "drive_fault"),
-        ("odrive", "cut:bus_1@1-1.3", "interface_down"),
+        pytest.param("odrive", "cut:bus_1@1-1.3", "interface_down", marks=pytest.mark.slow),  # as can
         pytest.param(*("moteus", "mute:joint_3@1", "drive_silent"), marks=pytest.mark.slow),  # as odrive
         pytest.param(*("moteus", "reboot:joint_3@1", "drive_silent"), marks=pytest.mark.slow),  # as odrive
         pytest.param(*("moteus", "overheat:joint_3@1", "drive_fault"), marks=pytest.mark.slow),  # as odrive
         pytest.param(*("moteus", "cut:bus_1@1-1.3", "interface_down"), marks=pytest.mark.slow),  # as odrive
-        ("dynamixel", "mute:joint_3@1", "drive_silent"),
+        pytest.param("dynamixel", "mute:joint_3@1", "drive_silent", marks=pytest.mark.slow),  # as odrive
         ("dynamixel", "reboot:joint_3@1", "drive_silent"),
-        ("dynamixel", "overheat:joint_3@1", "drive_fault"),
+        pytest.param("dynamixel", "overheat:joint_3@1", "drive_fault", marks=pytest.mark.slow),  # as odrive
         ("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
         ("dynamixel", "cut:bus_1@1-1.3", "interface_down"),
-        ("mixed", "reboot:joint_12@1", "drive_silent"),
+        pytest.param("mixed", "reboot:joint_12@1", "drive_silent", marks=pytest.mark.slow),  # as dynamixel
         ("mixed", "cut:bus_2@1-1.3", "interface_down"),
     ],
 )

@@ -1,5 +1,7 @@
 """Modules that are mounted the other way round, off zero, or behind a gear: declared, and not. On emulated modules."""
 
+from functools import partial
+
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
@@ -10,8 +12,8 @@ EVERY_SECOND = [f"joint_{i}" for i in range(2, 14, 2)]
 MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5.zero_rad=-0.2"]
 
 
-def ran(*sets: str, backend: str = "can") -> RunSummary:
-    fixed = (f"backend={backend}", "duration_s=2")
+def ran(*sets: str, backend: str = "can", duration_s: float = 2.0) -> RunSummary:
+    fixed = (f"backend={backend}", f"duration_s={duration_s}")
     return simulate(load("peg_row", [parse_set(text) for text in (*fixed, *sets)]).config).summary
 
 
@@ -31,11 +33,12 @@ def plain() -> RunSummary:
 def test_drives_of_a_family_reversed_and_off_zero_move_as_others_where_the_file_says_so_and_only_there(
     backend: str, others: list[str]
 ) -> None:
-    nominal = ran(backend=backend)
+    run = partial(ran, backend=backend, duration_s=1.0)
+    nominal = run()
     built = (*(f"{joint}.sign=-1" for joint in EVERY_SECOND), "joint_5.zero_rad=0.4", *others)
     in_truth = [f"backend.mounted.{text}" for text in built]
-    declared = ran(*in_truth, *(f"robot.joints.{text}" for text in built), backend=backend)
-    undeclared = ran(*in_truth, backend=backend)
+    declared = run(*in_truth, *(f"robot.joints.{text}" for text in built))
+    undeclared = run(*in_truth)
     assert nominal.path_distance_m and nominal.peak_joint_torque_nm and undeclared.peak_joint_torque_nm
     assert declared.path_distance_m == pytest.approx(nominal.path_distance_m, rel=0.05)
     assert undeclared.peak_joint_torque_nm > 1.5 * nominal.peak_joint_torque_nm, "it shows at once"
