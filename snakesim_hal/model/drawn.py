@@ -19,6 +19,11 @@ class Draw(FileStruct, frozen=True, kw_only=True):
     low: float
     high: float
 
+    def __post_init__(self) -> None:
+        """Raises ValueError, for the file reader."""
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= self.high):
+            raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
+
     def on_field(self, field: int, origin: str = "[[draw]]") -> list[Override]:
         """By the field's number and the first key, so that a draw more changes no other."""
         number = np.random.default_rng([field, *self.set[0].encode()]).uniform(self.low, self.high)
@@ -31,11 +36,10 @@ def draws_of(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
     for keys, bounds in (given or {}).items():
         try:
             low, high = (float(bound) for bound in bounds)
+            found.append(Draw(set=[key.strip() for key in keys.split(",")], low=low, high=high))
         except (TypeError, ValueError):
-            low = high = math.nan
-        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-            raise ConfigError(f"draw {keys}: {short(str(bounds))}: give the lowest and the highest number, both finite")
-        found.append(Draw(set=[key.strip() for key in keys.split(",")], low=low, high=high))
+            wrong = f"draw {keys}: {short(str(bounds))}: give the lowest and the highest number, both finite"
+            raise ConfigError(wrong) from None
     return found
 
 

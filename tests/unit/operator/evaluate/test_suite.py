@@ -180,3 +180,5 @@ def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
     wrong, source = read(tmp_path, LAB.replace('without = ["scene.pegs', 'without = ["pegs'))
     with pytest.raises(ConfigError, match=r"no \[\[draw\]\] sets"):
         settings_of(wrong, source)
+    with pytest.raises(ConfigError, match=r"`low` = 0.1 must be at most `high` = 0.03"):
+        read(tmp_path, LAB.replace("high = 0.3", "high = 0.03"))
