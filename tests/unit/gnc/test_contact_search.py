@@ -132,6 +132,17 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
 
 
+def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
+    stage = make_stage()
+    view = stage.view(0, TAIL_S_M)
+    knocked = replace(view, joints=msgspec.structs.replace(view.joints, velocity_rad_s=[20.0] * 13))
+    calm, struck = FeltWave(stage.robot), FeltWave(stage.robot)
+    for wave in (calm, struck):
+        wave.reference_rad(view, 0.01)
+    apart = [np.ptp([calm.reference_rad(view, 0.01), struck.reference_rad(knocked, 0.01)], axis=0) for _ in range(20)]
+    assert np.max(np.diff(apart, axis=0)) < 0.11 and np.max(apart[0]) < 0.11 and np.max(apart[-1]) > 0.3  # rad
+
+
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
 def test_a_body_that_moves_as_it_is_to_does_not_search_whatever_carries_it(speed_m_s: float) -> None:
     stage = make_stage()
