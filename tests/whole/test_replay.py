@@ -7,6 +7,7 @@ import pytest
 
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.playback.control import Replay
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -41,6 +42,14 @@ def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) 
     before, again = RunRecord.load(recorded), RunRecord.load(tmp_path / "again" / RECORDING)
     assert again.host.command_digest == before.host.command_digest
     assert (again.control, again.worlds) == (before.control, before.worlds)
+
+
+def test_an_answer_to_the_last_tick_which_no_run_waits_for_may_be_lacking_and_no_other(recorded: Path) -> None:
+    comparison = Replay(recorded / RECORDING, []).run()
+    last = max(comparison.recorded)
+    del comparison.recorded[last], comparison.recorded[last - 5]
+    comparison.forgive(last)
+    assert comparison.different == [last - 5]
 
 
 def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None:
