@@ -24,7 +24,7 @@ COMMON: Mapping[str, str] = {
     "C library": "e4139a39",
 }
 """What `measured` finds in the common arithmetic; `make golden` prints it."""
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 NEEDED = {"avx2", "fma"}  # flags of the processor
 # The code in NumPy for wider processors, as NumPy 2.4 and earlier versions call it; each ignores the other's names.
 WIDER = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_KNL AVX512_KNM"

@@ -12,11 +12,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from snakesim_hal.arithmetic import ONE_THREAD
 from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent
 
 NET = "10.78.0"
 HURRIED = ("chrt", "--fifo", str(SERVICE_PRIORITY))
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 class Machine:
