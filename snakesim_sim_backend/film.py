@@ -34,10 +34,12 @@ SAMPLES = 4  # a pixel
 class Film:
     """A camera that follows the snake. It must be made and used in one thread."""
 
+    Settings = SimSettings  # of the backend, which the scene is built with
+
     def __init__(self, config: RunConfig, width: int, height: int) -> None:
         """Raises ConfigError when there is no OpenGL."""
         own = config.backends.get("sim", {})
-        self._sim = build(config, plugin_settings(_Sim, own, f"run {config.name!r}", "backends.sim"))
+        self._sim = build(config, plugin_settings(Film, own, f"run {config.name!r}", "backends.sim"))
         self._model, self._data = self._sim.model, mujoco.MjData(self._sim.model)
         view, quality = self._model.vis.global_, self._model.vis.quality
         view.offwidth, view.offheight, quality.offsamples = width, height, SAMPLES
@@ -127,9 +129,3 @@ class Film:
         """Free the renderer."""
         self._context.free()
         self._gl.free()
-
-
-class _Sim:
-    """Whose settings the scene is built with."""
-
-    Settings = SimSettings

@@ -10,6 +10,7 @@ import numpy as np
 
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
+from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, JointState, Message, Pose
 from snakesim_sim_backend.model import FREE_QPOS, build, of_joints
@@ -18,11 +19,10 @@ from snakesim_sim_backend.sensors.scope import Reader, Scope
 from snakesim_sim_backend.settings import SimSettings
 
 
-class SensorService:
-    """A `snakesim_hal.service.Service`."""
+class SensorService(Service):
+    """What looks around."""
 
     name = "sensor"
-    urgent = False
 
     def __init__(self, client: Client, config: RunConfig) -> None:
         """Raises ConfigError for a sensor that cannot be made."""
@@ -51,10 +51,3 @@ class SensorService:
         of_joints(self._data, len(joints.angle_rad))[0][:] = joints.angle_rad
         mujoco.mj_kinematics(self._sim.model, self._data)
         return [(key, reader.read(clock.tick, joints.stamp_ns)) for key, reader in self._readers]
-
-    def pause(self, clock: Clock) -> None:
-        """Nothing is asked of it."""
-
-    def silence(self) -> list[tuple[str, Message]]:
-        """Nothing to say without a robot."""
-        return []

@@ -5,7 +5,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.quantities import MAX_JOINTS
+from snakesim_hal.wire.quantities import MAX_JOINTS, bounded, from_zero
 
 
 class Tether(FileStruct, frozen=True, kw_only=True):
@@ -16,29 +16,29 @@ class Tether(FileStruct, frozen=True, kw_only=True):
     """
 
     link: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0
-    point_m: Annotated[float, Meta(ge=-10, le=10, extra_json_schema={"unit": "m"})] = 0.0  # from the link's rear joint
+    point_m: Annotated[float, bounded(-10, 10, "m")] = 0.0  # from the link's rear joint
     direction_w: tuple[float, float]  # x and y; any length but 0
-    reel_in_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.0
+    reel_in_m_s: Annotated[float, from_zero(10, "m/s")] = 0.0
 
 
 class SimSettings(FileStruct, frozen=True, kw_only=True):
     """Parameters of the physics. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
 
     # The longest physics step; it is shortened so that a control period is a multiple of it.
-    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.002
+    timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.002
     # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
-    contact_time_s: Annotated[float, Meta(ge=1e-4, le=0.1, extra_json_schema={"unit": "s"})] = 0.005
+    contact_time_s: Annotated[float, bounded(1e-4, 0.1, "s")] = 0.005
     # How fast friction of obstacles, hills and steps brings slip to rest. Short: sliding bodies hop, see surface.py.
-    slip_time_s: Annotated[float, Meta(ge=1e-4, le=1, extra_json_schema={"unit": "s"})] = 0.03
+    slip_time_s: Annotated[float, bounded(1e-4, 1, "s")] = 0.03
     # How much stiffer friction holds than normals push: higher values slide less at rest, and cost time.
-    friction_hold: Annotated[float, Meta(ge=1, le=1000, extra_json_schema={"unit": "1"})] = 100.0
+    friction_hold: Annotated[float, bounded(1, 1000, "1")] = 100.0
     # Between links of the snake itself.
-    self_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.3
+    self_friction: Annotated[float, from_zero(5, "1 (Coulomb coefficient)")] = 0.3
     # What the simulated body has, over what the robot file says, which everybody else goes by.
-    mass_scale: Annotated[float, Meta(ge=0.1, le=10, extra_json_schema={"unit": "1"})] = 1.0  # of every link
-    motor_gain_scale: Annotated[float, Meta(ge=0.1, le=10, extra_json_schema={"unit": "1"})] = 1.0
+    mass_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0  # of every link
+    motor_gain_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0
     # Longest time that the snake may take to come to rest before the run begins.
-    settle_s: Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})] = 3.0
+    settle_s: Annotated[float, from_zero(60, "s")] = 3.0
     hung: bool = False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim identify`
     tether: Tether | None = None
 
@@ -46,7 +46,7 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
 class PlantSettings(SimSettings, frozen=True, kw_only=True):
     """The same for the physics under emulated joint modules, whose firmware sets the pace: one step at a time."""
 
-    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
+    timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.001
 
     def __post_init__(self) -> None:
         """The motors are the firmware's."""

@@ -5,12 +5,17 @@ A released joint starts from the position target with which its servo gives the 
 present torque, and the propulsion torque fades in. Both fades move by `fade` a tick.
 """
 
+from typing import Annotated
+
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.wire.quantities import about, above
+
+Blend = Annotated[float, above(10, "s"), about("over which the command changes smoothly to a new reference")]
 
 
 class HandOver:

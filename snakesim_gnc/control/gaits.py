@@ -9,18 +9,17 @@ import math
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta
 
 from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import about, above, bounded, from_zero
 
-Swing = Annotated[float, Meta(ge=-2, le=2, extra_json_schema={"unit": "rad"})]
-Lag = Annotated[float, Meta(ge=-3.2, le=3.2, extra_json_schema={"unit": "rad"})]
-Seconds = Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"})]
+Swing = Annotated[float, bounded(-2, 2, "rad")]
+Lag = Annotated[float, bounded(-3.2, 3.2, "rad")]
+Seconds = Annotated[float, above(100, "s")]
 
 
 class _Gait:
@@ -103,11 +102,7 @@ class RaisedHead(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """How high, and how far to each side."""
 
-        lift_rad: Annotated[
-            float,
-            Meta(ge=0, le=1.5, extra_json_schema={"unit": "rad"}),
-            about("angle of the joint that lifts the head"),
-        ] = 0.6
+        lift_rad: Annotated[float, from_zero(1.5, "rad"), about("angle of the joint that lifts the head")] = 0.6
         look_rad: Annotated[Swing, about("how far the foremost yaw joint looks to each side")] = 0.4
         stance_rad: Annotated[Swing, about("amplitude of the wave in which the body behind lies")] = 0.5
         lag_rad: Annotated[Lag, about("phase of that wave from joint to joint")] = 0.6

@@ -17,12 +17,12 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from snakesim_gnc.control.bumpless import BumplessReference
+from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_gnc.control.progress import Located, Progress
+from snakesim_gnc.control.progress import Located, Progress, SpeedFilter
 from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_gnc.control.undulation import LateralUndulation
@@ -30,7 +30,7 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, World
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import about, above, from_zero
 
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
@@ -60,89 +60,53 @@ class ObstacleAided:
         """Look-ahead l = lead_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
 
         lead_s: Annotated[
-            float,
-            Meta(ge=0, le=5, extra_json_schema={"unit": "s"}),
-            about("look-ahead of the shape for each m/s that the speed is too low"),
+            float, from_zero(5, "s"), about("look-ahead of the shape for each m/s that the speed is too low")
         ] = 0.2
         integral_per_s: Annotated[
-            float,
-            Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"}),
-            about("how fast the look-ahead grows while the speed stays too low"),
+            float, from_zero(50, "1/s"), about("how fast the look-ahead grows while the speed stays too low")
         ] = 0.4
         largest_look_ahead_m: Annotated[
-            float,
-            Meta(ge=0, le=1, extra_json_schema={"unit": "m"}),
-            about("bound of the look-ahead: how far ahead on its path the shape is at most"),
+            float, from_zero(1, "m"), about("bound of the look-ahead: how far ahead on its path the shape is at most")
         ] = 0.05
         fresh_look_ahead_m: Annotated[
-            float,
-            Meta(ge=0, le=1, extra_json_schema={"unit": "m"}),
-            about("look-ahead with which it begins on a new path"),
+            float, from_zero(1, "m"), about("look-ahead with which it begins on a new path")
         ] = 0.01
         push_scale: Annotated[
             float, Meta(ge=-1, le=1), about("factor of both pushing terms, for control experiments; below 0: backward")
         ] = 1.0
         push_sign_s: Annotated[
             float,
-            Meta(ge=0, le=100, extra_json_schema={"unit": "s"}),
+            from_zero(100, "s"),
             about("for control experiments: after each such time the sign of the push is drawn at random; 0: never"),
         ] = 0.0
         push_ns_m: Annotated[
-            float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"}),
-            about("push on obstacles for each m/s that the speed is too low"),
+            float, from_zero(1000, "N*s/m"), about("push on obstacles for each m/s that the speed is too low")
         ] = 40.0
         push_n_m: Annotated[
-            float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"}),
-            about("push on obstacles for each metre that the body has fallen behind"),
+            float, from_zero(1000, "N/m"), about("push on obstacles for each metre that the body has fallen behind")
         ] = 120.0
-        largest_push_n: Annotated[
-            float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"}), about("bound of the push along the path")
-        ] = 60.0
+        largest_push_n: Annotated[float, from_zero(1000, "N"), about("bound of the push along the path")] = 60.0
         largest_torque_nm: Annotated[
             float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "N*m"}),
+            from_zero(1000, "N*m"),
             about("bound of a joint's torque for pushing"),
         ] = 5.0
         largest_contact_n: Annotated[
-            float,
-            Meta(gt=0, le=1000, extra_json_schema={"unit": "N"}),
-            about("bound of the force that is asked of one contact"),
+            float, above(1000, "N"), about("bound of the force that is asked of one contact")
         ] = 60.0
-        reach_m: Annotated[
-            float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"}), about("an obstacle so near to the body is pushed")
-        ] = 0.03
-        loose_m: Annotated[
-            float,
-            Meta(gt=0, le=1, extra_json_schema={"unit": "m"}),
-            about("gap to an obstacle at which a contact counts half"),
-        ] = 0.005
+        reach_m: Annotated[float, above(1, "m"), about("an obstacle so near to the body is pushed")] = 0.03
+        loose_m: Annotated[float, above(1, "m"), about("gap to an obstacle at which a contact counts half")] = 0.005
         torque_filter_s: Annotated[
-            float,
-            Meta(gt=0, le=5, extra_json_schema={"unit": "s"}),
-            about("time constant of the filter of the pushing torques"),
+            float, above(5, "s"), about("time constant of the filter of the pushing torques")
         ] = 0.1
         search_after_s: Annotated[
             float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
+            from_zero(1000, "s"),
             about("in which the body comes no 2 cm on, until it moves by a wave in search of contacts; 0: never"),
         ] = 1.2
-        search_s: Annotated[
-            float,
-            Meta(gt=0, le=1000, extra_json_schema={"unit": "s"}),
-            about("how long it does so, and then tries its path again"),
-        ] = 30.0
-        blend_s: Annotated[
-            float,
-            Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
-            about("over which the command changes smoothly to a new reference"),
-        ] = 0.3
-        speed_filter_s: Annotated[
-            float,
-            Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
-            about("time constant of the filter of the speed along the path; 0: none"),
-        ] = 0.05
+        search_s: Annotated[float, above(1000, "s"), about("how long it does so, and then tries its path again")] = 30.0
+        blend_s: Blend = 0.3
+        speed_filter_s: SpeedFilter = 0.05
         slides: Annotated[
             float,
             Meta(ge=0, le=1),
@@ -153,17 +117,17 @@ class ObstacleAided:
         ] = 0.0
         servo_lag_s: Annotated[
             float,
-            Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
+            from_zero(1, "s"),
             about("by which joints are behind their targets, from latency and damping; the shape leads by it"),
         ] = 0.0
         empty_price: Annotated[
             float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "1"}),
+            from_zero(1000, "1"),
             about("how many times dearer the force on an obstacle is that is not felt; 0: as dear as on others"),
         ] = 0.0
         felt_push_s: Annotated[
             float,
-            Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
+            from_zero(1000, "s"),
             about(
                 "time constant in which the push of a moving body becomes what its contacts are felt to do; 0: never"
             ),

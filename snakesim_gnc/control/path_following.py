@@ -6,15 +6,13 @@ The obstacles turn the change of shape into motion. The reference moves with the
 
 from typing import Annotated
 
-from msgspec import Meta
-
-from snakesim_gnc.control.bumpless import BumplessReference
+from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_gnc.control.progress import Progress
+from snakesim_gnc.control.progress import Progress, SpeedFilter
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import about, from_zero
 
 
 class PathFollowing:
@@ -25,19 +23,11 @@ class PathFollowing:
 
         look_ahead_m: Annotated[
             float,
-            Meta(ge=0, le=1, extra_json_schema={"unit": "m"}),
+            from_zero(1, "m"),
             about("how far ahead on its path the shape is at most"),
         ] = 0.03
-        blend_s: Annotated[
-            float,
-            Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
-            about("over which the command changes smoothly to a new reference"),
-        ] = 0.3
-        speed_filter_s: Annotated[
-            float,
-            Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
-            about("time constant of the filter of the speed along the path; 0: none"),
-        ] = 0.03
+        blend_s: Blend = 0.3
+        speed_filter_s: SpeedFilter = 0.03
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._set = settings

@@ -1,6 +1,7 @@
 """Present position and speed of the body along its path, from a world model that is some ticks old."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -10,7 +11,11 @@ from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_inst
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Trajectory, World
+from snakesim_hal.wire.quantities import about, from_zero
 
+SpeedFilter = Annotated[
+    float, from_zero(1, "s"), about("time constant of the filter of the speed along the path; 0: none")
+]
 AGAIN_STEPS = 8  # to localise a body again that may have slid meanwhile
 
 

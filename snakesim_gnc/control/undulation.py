@@ -9,17 +9,21 @@ import math
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import BumplessReference
+from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import about, above, bounded, from_zero
 
 AIM_M = 1.0  # how far ahead on the path the head steers for
+Steering = Annotated[
+    float,
+    from_zero(2, "1"),
+    about("bend of all joints for each radian that the path leads aside; 0: it goes where it goes"),
+]
 
 
 def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float:
@@ -34,25 +38,15 @@ class LateralUndulation:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The wave, and how much it is bent towards the goal."""
 
-        amplitude_rad: Annotated[
-            float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"}), about("swing of every joint to each side")
-        ] = 0.5
-        period_s: Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"}), about("of the wave")] = 2.0
+        amplitude_rad: Annotated[float, from_zero(2, "rad"), about("swing of every joint to each side")] = 0.5
+        period_s: Annotated[float, above(100, "s"), about("of the wave")] = 2.0
         lag_rad: Annotated[
             float,
-            Meta(ge=-3.2, le=3.2, extra_json_schema={"unit": "rad"}),
+            bounded(-3.2, 3.2, "rad"),
             about("phase of a joint behind the one ahead of it; below 0 the wave travels to the head"),
         ] = 0.9
-        steering: Annotated[
-            float,
-            Meta(ge=0, le=2, extra_json_schema={"unit": "1"}),
-            about("bend of all joints for each radian that the path leads aside; 0: it goes where it goes"),
-        ] = 0.0
-        blend_s: Annotated[
-            float,
-            Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
-            about("over which the command changes smoothly to a new reference"),
-        ] = 1.0
+        steering: Steering = 0.0
+        blend_s: Blend = 1.0
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
@@ -102,11 +96,7 @@ class HeadSteeredUndulation(LateralUndulation):
     class Settings(LateralUndulation.Settings, frozen=True, kw_only=True):
         """As of lateral undulation, with steering."""
 
-        steering: Annotated[
-            float,
-            Meta(ge=0, le=2, extra_json_schema={"unit": "1"}),
-            about("bend of all joints for each radian that the path leads aside; 0: it goes where it goes"),
-        ] = 0.8
+        steering: Steering = 0.8
 
 
 class CompliantUndulation(HeadSteeredUndulation):
@@ -122,12 +112,10 @@ class CompliantUndulation(HeadSteeredUndulation):
 
         softness_rad_per_nm: Annotated[
             float,
-            Meta(ge=0, le=10, extra_json_schema={"unit": "rad/(N*m)"}),
+            from_zero(10, "rad/(N*m)"),
             about("how far the amplitude yields to the torque that obstacles put on the wave"),
         ] = 0.05
-        yield_s: Annotated[
-            float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"}), about("time constant with which it yields")
-        ] = 0.2
+        yield_s: Annotated[float, above(10, "s"), about("time constant with which it yields")] = 0.2
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         super().__init__(robot, settings)

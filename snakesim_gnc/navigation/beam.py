@@ -96,8 +96,6 @@ class PlannedPath:
     """A path ahead of the head."""
 
     points_w: Floats  # (n + 1, 2) every STEP_M, the first is the head
-    headings_rad: Floats  # (n + 1,)
-    bends_per_m: Floats  # (n,)
     margins_n: Floats  # (n + 1,) of the body with its head there
     cost_m: float
 
@@ -275,9 +273,8 @@ class Beam:
             return None
         rows = rows[np.argsort(cost.ravel()[rows], kind="stable")]
         cells = _cells(x1.ravel()[rows], y1.ravel()[rows], heading.ravel()[rows], CELL_M, CELL_RAD)
-        rows = rows[
-            np.sort(np.unique(cells, return_index=True)[1])[: 3 * config.kept_nodes]
-        ]  # the cheapest of each cell
+        cheapest = np.sort(np.unique(cells, return_index=True)[1])  # of each cell
+        rows = rows[cheapest[: 3 * config.kept_nodes]]
         parents = rows // count
         nodes = layer.take(parents)
         nodes.parent = parents
@@ -304,10 +301,8 @@ class Beam:
 
     def _fits(self, x: Floats, y: Floats, heading: Floats) -> NDArray[np.bool_]:
         """Whether the body clears everything; x, y in m and heading in rad: (n, c)."""
-        cuts, clear_m = (
-            self._set.segment_m**2 * np.abs(self._bends_per_m) / 8,
-            self._set.radius_m + self._set.clearance_m,
-        )
+        cuts = self._set.segment_m**2 * np.abs(self._bends_per_m) / 8
+        clear_m = self._set.radius_m + self._set.clearance_m
         rough_m = self._map.roughly_m(x, y)
         fits = rough_m >= clear_m + cuts + ROUGH_M
         unsure = np.nonzero(~fits & (rough_m >= clear_m - ROUGH_M))
@@ -326,10 +321,8 @@ class Beam:
             rows.append(row)
             row = int(layer.parent[row])
         picked = zip(layers, reversed(rows), strict=True)
-        x, y, heading, bend, margin = np.array(
-            [(n.x_m[r], n.y_m[r], n.heading_rad[r], n.bend_per_m[r], n.margin_n[r]) for n, r in picked]
-        ).T
-        return PlannedPath(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
+        x, y, margin = np.array([(n.x_m[r], n.y_m[r], n.margin_n[r]) for n, r in picked]).T
+        return PlannedPath(np.stack([x, y], axis=-1), margin, cost)
 
 
 def _cells(x: Floats, y: Floats, heading: Floats, size_m: float, size_rad: float) -> NDArray[np.int64]:

@@ -2,10 +2,9 @@
 
 from typing import Annotated
 
-from msgspec import Meta
-
+from snakesim_gnc.control.progress import SpeedFilter
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.quantities import about, above, from_zero
+from snakesim_hal.wire.quantities import about, above, bounded, from_zero
 
 
 class TripletSettings(FileStruct, frozen=True, kw_only=True):
@@ -35,18 +34,16 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
 
     condition_max: Annotated[
         float,
-        Meta(ge=1, le=1e9, extra_json_schema={"unit": "1"}),
+        bounded(1, 1e9, "1"),
         about("triplets above this condition number are refused"),
     ] = 100.0
     authority_min: Annotated[
         float,
-        Meta(ge=0, le=1, extra_json_schema={"unit": "1 (sine of the angle)"}),
+        from_zero(1, "1 (sine of the angle)"),
         about("joints whose lever is so nearly along the normal at o_3 are refused"),
     ] = 0.02
     switch_share: Annotated[
-        float,
-        Meta(ge=0, le=1, extra_json_schema={"unit": "1"}),
-        about("a triplet is left for one that needs less than this share of its torque"),
+        float, from_zero(1, "1"), about("a triplet is left for one that needs less than this share of its torque")
     ] = 0.5
 
     blend_m: Annotated[float, above(10, "m"), about("travel over which one joint hands over to the next")] = 0.055
@@ -94,12 +91,8 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
         float, from_zero(0.1, "m"), about("slack of the arc length that the joints in position mode follow")
     ] = 0.001
     overspeed_share: Annotated[
-        float,
-        Meta(ge=1, le=100, extra_json_schema={"unit": "1"}),
-        about("the largest speed of that arc length, as a share of the mission's"),
+        float, bounded(1, 100, "1"), about("the largest speed of that arc length, as a share of the mission's")
     ] = 1.2
     brake_m: Annotated[float, from_zero(1, "m"), about("how far that arc length stays behind the body at most")] = 0.02
 
-    speed_filter_s: Annotated[
-        float, from_zero(1, "s"), about("time constant of the filter of the speed along the path; 0: none")
-    ] = 0.03
+    speed_filter_s: SpeedFilter = 0.03
