@@ -5,6 +5,7 @@ estimate gets the IMU readings of the tick.
 """
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -61,10 +62,25 @@ class Score:
 
 
 def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool = True) -> Score:
-    """Run a scenario in the simulator, and estimate as it goes. settings: KEY=VALUE, or -KEY to leave it out."""
+    """Of the estimates in a run of a scenario. settings: KEY=VALUE, or -KEY to leave it out."""
+    result, (robot, seen) = Score(), watched(scenario, *settings, seconds=seconds)
+    nothing = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    for samples, true in seen:
+        imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
+        assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
+        felt = estimate(
+            robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
+        )
+        result.add(true, pushes(robot, felt))
+    return result
+
+
+@lru_cache(maxsize=1)
+def watched(scenario: str, *settings: str, seconds: float) -> tuple[Description, list[tuple[Samples, list[Push]]]]:
+    """A run's robot, and its samples with what was true; the last run is kept, to be judged in another way."""
     sets = (Override(text[1:], None, text) if text.startswith("-") else parse_set(text) for text in settings)
     config = load(scenario, [parse_set(f"duration_s={seconds}"), *sets]).config
-    factory, result, seen = find_plugin(BACKENDS, config.backend), Score(), list[tuple[Samples, list[Push]]]()
+    factory, seen = find_plugin(BACKENDS, config.backend), list[tuple[Samples, list[Push]]]()
 
     class Watched(factory):
         """The backend, with a look at what is true."""
@@ -85,16 +101,7 @@ def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool =
     with offered(BACKENDS, config.backend, Watched), InProcessRun(config) as run:
         for _ in run.turns():
             pass
-        robot = run.host.description
-    nothing = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
-    for samples, true in seen:
-        imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
-        assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
-        felt = estimate(
-            robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
-        )
-        result.add(true, pushes(robot, felt))
-    return result
+        return run.host.description, seen
 
 
 def pushes(robot: Description, felt: list[FeltContact]) -> list[Push]:

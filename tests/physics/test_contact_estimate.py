@@ -1,13 +1,14 @@
 """The contact estimate against the simulator's truth, on runs that push off pegs."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
 from tests.physics.contact_score import score
 
 
-@pytest.mark.parametrize("scenario", ["triplet", "peg_row"])
-@pytest.mark.parametrize("with_pose", [True, False])
+@pytest.mark.parametrize(("scenario", "with_pose"), product(["triplet", "peg_row"], [True, False]))
 def test_the_median_error_of_a_push_is_below_15_percent(scenario: str, with_pose: bool) -> None:
     found = score(scenario, seconds=3.0, with_pose=with_pose)
     assert len(found.share) > 100

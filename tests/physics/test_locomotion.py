@@ -130,13 +130,6 @@ def test_commands_are_smooth_through_the_whole_run():
     assert steps[same & (whole.record.mode[1:] == Mode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
 
 
-def test_the_same_seed_gives_the_same_run():
-    config = configure("triplet")
-    first, again = (run(config, duration_s=2.0) for _ in range(2))
-    assert np.array_equal(first.record.target, again.record.target)
-    assert np.array_equal(first.record.angle_rad, again.record.angle_rad)
-
-
 @pytest.mark.parametrize("seed", [2, 3])
 def test_other_noise_gives_the_same_picture(seed):
     whole = run(configure("triplet", f"seed={seed}"))
@@ -203,11 +196,6 @@ def test_a_body_that_is_clear_of_every_peg_is_not_called_jammed():
     assert "no obstacle touches the body" in whole.reasons[-1] and "has swung out" in whole.reasons[-1]
 
 
-def test_holding_does_not_move():
-    whole = run(configure("triplet", "controller=hold"))
-    assert abs(whole.moved_m) < 0.02
-
-
 # --- long rows, other bodies ----------------------------------------------------------------------------------
 
 
@@ -272,14 +260,6 @@ def test_pegs_that_grip_are_a_jam_too():
     whole = run(configure("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0)
     assert whole.moved_m < 0.15
     assert whole.reports[-1].jammed
-
-
-def test_a_motor_that_is_too_weak_says_so():
-    whole = run(configure("triplet", "robot.limits.torque_nm=0.4"), duration_s=3.0)
-    saturated = [report for report in whole.reports if report.saturated]
-    assert saturated
-    assert all(known(report.torque_headroom_nm) < 0 for report in saturated)
-    assert max(known(report.propulsion_n) for report in saturated) < 35.0
 
 
 # --- clutter --------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import find
 from snakesim_hal.wire import keys
 from tests.whole.command import snakesim
 
@@ -121,10 +120,3 @@ def test_config_runs_no_code_of_a_file(tmp_path: Path) -> None:
     ended = snakesim("config", "triplet", "--controller", "./wave.py", cwd=tmp_path)
     assert ended.code == 2 and "the classes in it are Wave" in ended.err
     assert not (tmp_path / "mark").exists()
-
-
-def test_a_scenario_with_a_byte_order_mark(tmp_path: Path) -> None:
-    text = find("triplet", "scenarios").read_text(encoding="utf-8")
-    (tmp_path / "mine.toml").write_text(text, encoding="utf-8-sig")
-    ended = snakesim("config", "./mine.toml", cwd=tmp_path)
-    assert ended.code == 0 and "'mine'" in ended.out, ended.err

@@ -95,8 +95,10 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("damage", ["flipped", "halved", "taken out"])
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: "-".join(command[:1] + command[3:4]))
+@pytest.mark.parametrize(
+    ("command", "damage"),
+    [*((command, "flipped") for command in COMMANDS), (COMMANDS[0], "halved"), (COMMANDS[0], "taken out")],
+)
 def test_every_command_tells_of_the_damage_and_ends_with_3(
     whole: bytes, tmp_path: Path, command: list[str], damage: str
 ) -> None:
@@ -190,9 +192,9 @@ def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
         assert not (tmp_path / "elsewhere").exists()
 
 
-def test_what_a_full_disk_or_a_slow_one_cost_is_told(whole: bytes, tmp_path: Path) -> None:
+def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_path: Path) -> None:
     end = next(span for span in spans(whole) if span.opcode == Opcode.METADATA)
-    path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])  # nothing of a robot is lost
+    path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
     reader = RecordingReader(path)
     assert list(reader.messages()) and reader.finished and not reader.lacks
 

@@ -82,7 +82,10 @@ def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path,
     [
         (["run", "triplet", "--fault", "mute:joint_14@1"], "--fault mute:joint_14@1: `faults[0]`: "),
         (["run", "triplet", "--fault", "mute:joint_1@1", "--fault", "drop:a/b@1"], "`faults[1]`: 'a/b': no part"),
-        (["run", "triplet", "--fault", "leak:joint_1@1"], "backend 'sim' cannot do leak to joint_1"),
+        (
+            ["run", "triplet", "--fault", "leak:joint_1@1"],
+            "cannot do leak to joint_1: the simulator has neither modules",
+        ),
         (["fault", "mute"], "give a target"),
         (["fault", "mote", "joint_1"], "did you mean `mute`?"),
         (["fault", "reboot", "joint_1", "--for", "2"], "happens once and has no end"),

@@ -21,12 +21,6 @@ def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
     assert "in one process" in ended.out and str(out / REPORT) in ended.out and not ended.err
 
 
-def test_a_program_may_have_the_folder_too(tmp_path: Path) -> None:
-    config = load("triplet", [parse_set("duration_s=0.5")]).config
-    simulate(config, tmp_path / "run")
-    assert {path.name for path in (tmp_path / "run").iterdir()} == LEFT | {WORDS}
-
-
 FAILING = """
 from snakesim_gnc.control.hold import Hold
 

@@ -3,31 +3,19 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.record import UNRECORDED
+from snakesim_operator.results.record import UNRECORDED, RunRecord
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.run.in_process import simulate
 from tests.whole.command import run_to_summary, snakesim
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--controller", "hold"], ["--set", "control.propulsion_n=2"]], ids=["hold", "below-drag"]
-)
-def test_control_experiments_stay_where_they_are(tmp_path: Path, arguments: list[str]) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", *arguments)
+def test_the_control_experiment_stays_where_it_is(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--controller", "hold")
     assert ended.code == 0, ended.out + ended.err
     assert summary.path_distance_m is not None and abs(summary.path_distance_m) < 0.02
     assert summary.net_displacement_m is not None and summary.net_displacement_m < 0.02
-
-
-@pytest.mark.slow  # tests/e2e/test_computers.py holds the digests of shipped scenarios
-def test_one_seed_one_digest(tmp_path: Path) -> None:
-    def digest(name: str, seed: int) -> str:
-        return run_to_summary(tmp_path / name, "triplet", "--duration", "1", "--seed", str(seed))[1].command_digest
-
-    assert digest("a", 1) == digest("again", 1) != digest("b", 2)
 
 
 def test_a_run_repeats_from_the_configuration_that_it_left(tmp_path: Path) -> None:
@@ -37,28 +25,9 @@ def test_a_run_repeats_from_the_configuration_that_it_left(tmp_path: Path) -> No
     assert again.config == first.config
 
 
-@pytest.mark.parametrize("modules", [8, 13, pytest.param(30, marks=pytest.mark.slow)])
-def test_any_number_of_modules_without_a_code_change(tmp_path: Path, modules: int) -> None:
-    ended, summary = run_to_summary(
-        tmp_path / "run", "peg_row", "--duration", "6", "--set", f"robot.chain.modules={modules}"
-    )
-    assert ended.code == 0, ended.out + ended.err
-    assert summary.path_distance_m is not None and summary.path_distance_m > 0.4
-    assert summary.propulsion_joints
-
-
-def test_a_jam_is_reported_as_such(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "jam")
-    assert ended.code == 0, ended.out + ended.err
-    assert summary.jammed
-    assert "jam" in ended.out.lower()
-
-
-@pytest.mark.slow  # mamba_flat is among the digests
-def test_another_robot_in_another_world(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "mamba_hills")
-    assert ended.code == 0, ended.out + ended.err
-    assert summary.robot == "mamba" and summary.path_distance_m is not None and summary.path_distance_m > 0.3
+def test_a_jam_is_told_at_the_end(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "jam", "--duration", "4")
+    assert ended.code == 0 and summary.jammed and "JAMMED" in ended.out, ended.out + ended.err
 
 
 def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
@@ -73,15 +42,6 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
     ended = snakesim("run", "./mine.toml", "--in-process", "--out", "out", cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     assert (tmp_path / "out" / "report.html").is_file()
-
-
-@pytest.mark.slow  # tests/e2e/test_run.py has it in processes
-def test_a_run_may_end_with_its_mission(tmp_path: Path) -> None:
-    short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "6"]
-    ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)
-    assert ended.code == 0, ended.out + ended.err
-    assert summary.ended == "complete" and 1.0 < summary.duration_s < 5.0
-    assert "reached after" in ended.out
 
 
 def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
@@ -115,10 +75,11 @@ def test_a_mission_without_a_goal_has_no_end(tmp_path: Path) -> None:
     assert ended.code == 2 and "until_goal" in ended.err and "this mission has no goal to reach" in ended.err
 
 
-def test_at_its_goal_the_snake_stands_still_whatever_it_touches() -> None:
-    record = simulate(
-        load("surveyed_clutter", [parse_set("mission.goal.distance_m=0.4"), parse_set("duration_s=6")]).config
-    ).record
+def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) -> None:
+    near = ["--set", "mission.goal.distance_m=0.4", "--duration", "6"]
+    ended, _ = run_to_summary(tmp_path / "run", "surveyed_clutter", *near)
+    assert ended.code == 0 and "reached after" in ended.out
+    record = RunRecord.load(tmp_path / "run")
     reached_s = next(state.stamp_ns * 1e-9 for state in record.control if "the goal is reached" in state.reason)
     assert 1.0 < reached_s < 4.0
     after = record.position_w[record.time_s > reached_s + 0.5, :2]

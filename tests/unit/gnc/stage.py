@@ -1,7 +1,7 @@
 """A robot, a wavy path with pegs, and views of a body on it, without any physics."""
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.robot import Chain, Module, RobotFile, describe
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
-from snakesim_hal.wire.messages import Axis, Description, JointState, Obstacle, Trajectory, World, WorldContact
+from snakesim_hal.wire.messages import Axis, Description, Obstacle, Trajectory, World, WorldContact
+from tests.unit.hal.rig import state
 
 T = TypeVar("T")
 
@@ -49,6 +50,35 @@ def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: 
         ),
     )
     return describe(file, backend="none", period_ns=round(PERIOD_S * 1e9), lease_ns=10**8, config_hash="0")
+
+
+def make_world(**changes: Any) -> World:
+    """A world model with a body at the origin and nothing around it, with whatever is to be different."""
+    values: dict[str, Any] = {
+        "tick": 0,
+        "stamp_ns": 0,
+        "base_position_w": (0.0, 0.0, 0.0),
+        "base_orientation_wxyz": (1.0, 0.0, 0.0, 0.0),
+        "base_confidence": 1.0,
+        "contacts": [],
+        "obstacles": [],
+    }
+    return World(**(values | changes))
+
+
+def make_contact(
+    obstacle: str, force_w: tuple[float, float, float], link: int = 0, body_s_m: float = 0.1
+) -> WorldContact:
+    """A contact on the right of a body along x."""
+    return WorldContact(
+        link=link,
+        obstacle=obstacle,
+        body_s_m=body_s_m,
+        position_w=(0.0, 0.0, 0.0),
+        normal_w=(0.0, 1.0, 0.0),
+        tangent_w=(1.0, 0.0, 0.0),
+        force_w=force_w,
+    )
 
 
 def make_route(amplitude_m: float = AMPLITUDE_M, wavelength_m: float = WAVELENGTH_M) -> Route:
@@ -102,27 +132,17 @@ class Stage:
         for joint, by in (turned or {}).items():
             angles[joint] += by
         seen = lay if world_tail_s_m is None else lay_chain(self.route, world_tail_s_m, segments)
-        world = World(
+        world = make_world(
             tick=tick - world_age_ticks,
             stamp_ns=stamp_of(tick - world_age_ticks),
             pose_stamp_ns=stamp_of(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
             base_position_w=(*seen.tail_w, BODY_RADIUS_M),
             base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
-            base_confidence=1.0,
             contacts=contacts or [],
             contacts_stamp_ns=None if contacts is None else stamp_of(tick - world_age_ticks),
             obstacles=self.pegs,
         )
-        count = len(axes)
-        joints = JointState(
-            tick=tick,
-            stamp_ns=stamp_of(tick),
-            angle_rad=angles.tolist(),
-            velocity_rad_s=[0.0] * count,
-            torque_nm=[torque_nm] * count,
-            valid=[True] * count,
-            age_ns=[0] * count,
-        )
+        joints = state(self.robot, angles.tolist(), torque=torque_nm, tick=tick, stamp_ns=stamp_of(tick))
         trajectory = Trajectory(
             tick=0,
             stamp_ns=0,

@@ -7,23 +7,12 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_hal.safety.gate import bumpless_target
-from snakesim_hal.wire.messages import JointState, Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import make_robot
+from tests.unit.hal.rig import state
 
 ROBOT = make_robot(4)
 values = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
-
-
-def joints(angle, velocity, torque) -> JointState:
-    return JointState(
-        tick=0,
-        stamp_ns=0,
-        angle_rad=list(angle),
-        velocity_rad_s=list(velocity),
-        torque_nm=list(torque),
-        valid=[True] * 4,
-        age_ns=[0] * 4,
-    )
 
 
 def bumpless(mode: Mode, angle, velocity, torque):
@@ -35,7 +24,7 @@ def bumpless(mode: Mode, angle, velocity, torque):
 @given(values, values, values, values)
 def test_it_starts_from_what_the_motors_do(angle, velocity, torque, reference):
     hand_over = HandOver(ROBOT)
-    hand_over.start(joints(angle, velocity, torque), np.array(reference))
+    hand_over.start(state(ROBOT, angle, velocity, torque), np.array(reference))
     targets = hand_over.positions_rad(np.array(reference))
     assert targets == pytest.approx(bumpless(Mode.POSITION, angle, velocity, torque))
 
@@ -43,11 +32,11 @@ def test_it_starts_from_what_the_motors_do(angle, velocity, torque, reference):
 @given(values, values, values, values, st.floats(-5, 5), st.floats(0, 1))
 def test_nothing_jumps_by_more_than_the_fade(angle, velocity, torque, reference, wanted, fade):
     """A released joint and one that takes over: within `fade` times the way that is left."""
-    state, reference = joints(angle, velocity, torque), np.array(reference)
+    measured, reference = state(ROBOT, angle, velocity, torque), np.array(reference)
     hand_over = HandOver(ROBOT)
-    hand_over.pass_to(2, state, reference)
+    hand_over.pass_to(2, measured, reference)
     hand_over.fade(1.0)
-    hand_over.pass_to(1, state, reference)
+    hand_over.pass_to(1, measured, reference)
     hand_over.fade(fade)
     held = bumpless(Mode.POSITION, angle, velocity, torque)
     position = hand_over.positions_rad(reference)[2]
@@ -57,16 +46,16 @@ def test_nothing_jumps_by_more_than_the_fade(angle, velocity, torque, reference,
 
 def test_the_same_joint_keeps_its_turn():
     hand_over = HandOver(ROBOT)
-    state = joints([0.0] * 4, [0.0] * 4, [3.0] * 4)
-    hand_over.pass_to(1, state, np.zeros(4))
+    measured = state(ROBOT, torque=3.0)
+    hand_over.pass_to(1, measured, np.zeros(4))
     hand_over.fade(0.6)
-    hand_over.pass_to(1, state, np.zeros(4))
+    hand_over.pass_to(1, measured, np.zeros(4))
     assert hand_over.torque_nm(0.0) == pytest.approx(1.2)
 
 
 def test_differences_fade_away():
     hand_over = HandOver(ROBOT)
-    hand_over.start(joints([0.5] * 4, [0.0] * 4, [0.0] * 4), np.zeros(4))
+    hand_over.start(state(ROBOT, 0.5), np.zeros(4))
     for _ in range(200):
         hand_over.fade(0.05)
     assert np.abs(hand_over.positions_rad(np.zeros(4))).max() < 1e-3
@@ -74,6 +63,6 @@ def test_differences_fade_away():
 
 def test_a_new_reference_does_not_move_the_targets():
     hand_over = HandOver(ROBOT)
-    hand_over.start(joints([0.5] * 4, [0.0] * 4, [0.0] * 4), np.zeros(4))
+    hand_over.start(state(ROBOT, 0.5), np.zeros(4))
     hand_over.shift(np.full(4, 0.2))
     assert hand_over.positions_rad(np.full(4, 0.2)) == pytest.approx([0.5] * 4)

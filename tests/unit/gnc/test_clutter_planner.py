@@ -10,11 +10,11 @@ from snakesim_gnc.navigation.beam import Beam, PathSearch, PlannedPath, Search
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
-from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, load, parse_set, place_all, start_of
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
+from tests.unit.gnc.stage import make_world
 
 TURN_S = 0.08  # a plan takes some of them
 SECOND = 10**9
@@ -37,15 +37,7 @@ def body_of(config: RunConfig) -> np.ndarray:
 
 
 def world(at_s: float, obstacles: list[Obstacle]) -> World:
-    return World(
-        tick=round(100 * at_s),
-        stamp_ns=round(at_s * SECOND),
-        base_position_w=(0.0, 0.0, 0.04),
-        base_orientation_wxyz=quaternion_from_yaw(0.0),
-        base_confidence=1.0,
-        contacts=[],
-        obstacles=obstacles,
-    )
+    return make_world(tick=round(100 * at_s), stamp_ns=round(at_s * SECOND), obstacles=obstacles)
 
 
 def planner(known: list[Obstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:

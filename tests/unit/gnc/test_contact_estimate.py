@@ -8,6 +8,7 @@ from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
 from tests.unit.gnc.stage import make_robot
+from tests.unit.hal.rig import pose
 
 ROBOT = make_robot()
 COUNT = len(ROBOT.joints)
@@ -53,16 +54,8 @@ def test_nothing_is_felt_where_nothing_pushes():
 
 
 def test_friction_of_the_ground_is_no_contact():
-    pose = Pose(
-        tick=0,
-        stamp_ns=0,
-        position_w=(0, 0, 0),
-        orientation_wxyz=(1, 0, 0, 0),
-        velocity_w=(0.3, 0.0, 0.0),
-        angular_velocity_w=(0, 0, 0),
-    )
     torques, imu, *_ = readings([], friction=0.3, acceleration=(-0.3 * GRAVITY_M_S2, 0.0))
-    assert estimated(torques, imu, pose=pose) == []
+    assert estimated(torques, imu, pose=pose(velocity_w=(0.3, 0.0, 0.0))) == []
 
 
 @pytest.mark.parametrize("side", [1, -1])

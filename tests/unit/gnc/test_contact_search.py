@@ -15,8 +15,8 @@ from snakesim_gnc.control.obstacle_aided import ObstacleAided
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.policy import POLICIES
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle, WorldContact
-from tests.unit.gnc.stage import Stage, make_stage
+from snakesim_hal.wire.messages import Obstacle
+from tests.unit.gnc.stage import Stage, make_contact, make_stage
 
 TAIL_S_M = 0.3
 SEARCHES = "in search of contacts"
@@ -97,16 +97,7 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     view = stage.view(0, TAIL_S_M)
     assert view.world is not None and view.trajectory is not None
     contacts = [
-        WorldContact(
-            link=link,
-            obstacle="peg",
-            body_s_m=0.0,
-            position_w=(0.0, 0.0, 0.0),
-            normal_w=(0.0, 1.0, 0.0),
-            tangent_w=(1.0, 0.0, 0.0),
-            force_w=(3.0, force_n, 4.0),
-        )
-        for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
+        make_contact("peg", (3.0, force_n, 4.0), link) for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
     ]
     forces_n = np.zeros(14)
     for contact in contacts:

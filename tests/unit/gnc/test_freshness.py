@@ -8,6 +8,7 @@ import pytest
 from snakesim_gnc.control.freshness import Limits
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Description, SensorDescription, Trajectory, World
+from tests.unit.gnc.stage import make_world
 from tests.unit.hal.rig import description, run_config, state
 
 SCHEDULE = {
@@ -30,18 +31,7 @@ def limits(config: RunConfig | None = None, **rates: float) -> Limits:
 
 
 def world(**changes: Any) -> World:
-    values: dict[str, Any] = {
-        "tick": 9_990,
-        "stamp_ns": NOW,
-        "base_position_w": (0.0, 0.0, 0.0),
-        "base_orientation_wxyz": (1.0, 0.0, 0.0, 0.0),
-        "base_confidence": 1.0,
-        "contacts": [],
-        "obstacles": [],
-        "pose_stamp_ns": NOW,
-        "contacts_stamp_ns": NOW,
-    }
-    return World(**(values | changes))
+    return make_world(**({"tick": 9_990, "stamp_ns": NOW, "pose_stamp_ns": NOW, "contacts_stamp_ns": NOW} | changes))
 
 
 def trajectory(stamp_ns: int | None) -> Trajectory:

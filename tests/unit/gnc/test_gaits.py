@@ -45,9 +45,8 @@ def test_a_raised_head_is_level_above_the_ground_and_looks_around() -> None:
     assert np.ptp(np.unwrap(np.arctan2(run[:, 1], run[:, 0]))) > 0.4
 
 
-@pytest.mark.parametrize("gait", ["sidewinding", "rolling", "raised_head"])
-def test_at_speed_zero_a_gait_stands(gait: str) -> None:
-    result = on_flat_ground(f"controller={gait}", "mission.speed_m_s=0", "duration_s=2")
+def test_at_speed_zero_a_gait_stands() -> None:
+    result = on_flat_ground("controller=rolling", "mission.speed_m_s=0", "duration_s=2")
     assert np.hypot(*moved_m(result.record)) < 0.005
 
 

@@ -10,7 +10,6 @@ import pytest
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.guarded import Guarded
-from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.gnc.stage import make_stage
@@ -96,8 +95,3 @@ def test_a_wrong_one_is_named(answer: Any, words: str) -> None:
 def test_somebody_who_presses_ctrl_c_is_no_fault_of_the_controller() -> None:
     with pytest.raises(KeyboardInterrupt):
         update(KeyboardInterrupt)
-
-
-def test_a_missing_field_of_the_set_points_cannot_even_be_made() -> None:
-    with pytest.raises(TypeError):
-        SetPoints([Mode.POSITION] * 3, [0.0] * 3)  # pyright: ignore[reportCallIssue]

@@ -8,6 +8,7 @@ from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.navigation.intents import LONGEST_NS, DesiredMotion, Intents
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
+from tests.unit.gnc.stage import make_world
 
 MISSION_M_S = 0.2
 MISSION = DesiredMotion(MISSION_M_S)
@@ -21,15 +22,7 @@ def intent(at_s: float, **more: Any) -> Intent:
 
 
 def world(tail_x_m: float, stamp_ns: int = 0) -> World:
-    return World(
-        tick=0,
-        stamp_ns=stamp_ns,
-        base_position_w=(tail_x_m, 0.0, 0.0),
-        base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-        base_confidence=1.0,
-        contacts=[],
-        obstacles=[],
-    )
+    return make_world(stamp_ns=stamp_ns, base_position_w=(tail_x_m, 0.0, 0.0))
 
 
 def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:

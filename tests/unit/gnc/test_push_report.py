@@ -1,5 +1,7 @@
 """What a controller tells about its push: where, how hard, and the class of a stall."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,8 @@ from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.push import find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle, World
-from tests.unit.gnc.stage import make_robot
+from snakesim_hal.wire.messages import Obstacle
+from tests.unit.gnc.stage import make_robot, make_world
 
 BODY = PlanarBody(make_robot())
 NODES = np.vstack([np.array(BODY.node_s_m), 0.06 * np.sin(2 * np.pi * np.array(BODY.node_s_m) / 0.6)])
@@ -23,26 +25,14 @@ def peg(name: str, x: float, side: int) -> Obstacle:
     return Obstacle(name=name, shape="cylinder", position_w=(*place.tolist(), 0.1), radius_m=0.05, height_m=0.2)
 
 
-def seen(*obstacles: Obstacle) -> World:
-    return World(
-        tick=0,
-        stamp_ns=0,
-        base_position_w=(0.0, 0.0, 0.04),
-        base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-        base_confidence=1.0,
-        contacts=[],
-        obstacles=list(obstacles),
-    )
-
-
-def pushing(world: World):
-    touches = find_touches(NODES, 0.04, Outlines.of(world.obstacles), reach_m=0.03, friction=0.0)
+def pushing(pegs: Sequence[Obstacle]):
+    touches = find_touches(NODES, 0.04, Outlines.of(pegs), reach_m=0.03, friction=0.0)
     return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), loose_m=0.005)
 
 
 def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
-    world = seen(peg("c", 0.9, -1), peg("a", 0.3, -1), peg("b", 0.6, 1))
-    touches, push = pushing(world)
+    world = make_world(obstacles=[peg("c", 0.9, -1), peg("a", 0.3, -1), peg("b", 0.6, 1)])
+    touches, push = pushing(world.obstacles)
     reported = push_points(BODY, world, touches, push, 10.0)
     assert [contact.obstacle for contact in reported] == ["a", "b", "c"]  # tail to head
     total = np.sum([contact.force_w for contact in reported], axis=0)
@@ -61,12 +51,5 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
 )
 def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
     nothing = Carried(strongest_n=0.0, ahead_n=0.0, back_n=0.0, holder="", touched=frozenset())
-    jammed, why = why_it_stands(*pushing(seen(*pegs)), force_n, max_force_n, nothing, ["a", "b", "c"])
+    jammed, why = why_it_stands(*pushing(pegs), force_n, max_force_n, nothing, ["a", "b", "c"])
     assert not jammed and words in why
-
-
-def test_a_jam_is_what_contacts_hold_back() -> None:
-    pegs = peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)
-    felt = Carried(strongest_n=40.0, ahead_n=20.0, back_n=17.0, holder="c", touched=frozenset({"a", "b", "c"}))
-    jammed, why = why_it_stands(*pushing(seen(*pegs)), 9.0, 30.0, felt, ["a", "b", "c"])
-    assert jammed and why.endswith("obstacles push it on with 20 N and hold it back with 17 N, c most")

@@ -5,8 +5,8 @@ import pytest
 
 from snakesim_gnc.control.carried import Carried, FeltContacts
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
-from snakesim_hal.wire.messages import World, WorldContact
-from tests.unit.gnc.stage import known
+from snakesim_hal.wire.messages import World
+from tests.unit.gnc.stage import known, make_contact, make_world
 
 
 def watch() -> StallWatch:
@@ -38,17 +38,8 @@ def test_forgetting_starts_a_new_window():
 
 def world_with(*forces: tuple[str, float, float], stamp_ns: int = 1) -> World:
     """Contacts with these forces in x and y."""
-    contacts = [
-        WorldContact(
-            link=0, obstacle=name, body_s_m=0.1, position_w=(0.0, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-            tangent_w=(1.0, 0.0, 0.0), force_w=(ahead_n, across_n, 0.0),
-        )
-        for name, ahead_n, across_n in forces
-    ]  # fmt: skip
-    return World(
-        tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-        base_confidence=1.0, contacts=contacts, contacts_stamp_ns=stamp_ns, obstacles=[],
-    )  # fmt: skip
+    contacts = [make_contact(name, (ahead_n, across_n, 0.0)) for name, ahead_n, across_n in forces]
+    return make_world(contacts=contacts, contacts_stamp_ns=stamp_ns)
 
 
 def along(*forces: tuple[str, float, float]) -> Carried:

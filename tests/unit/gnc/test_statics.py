@@ -70,14 +70,6 @@ def test_beyond_30_degrees_the_tail_contact_would_have_to_pull(slope_deg, feasib
     assert bool(solved.reason) is not feasible
 
 
-def test_torque_pushes_the_part_ahead_against_the_third_contact():
-    case = at_inflections(np.radians(20.0))
-    solved = case.solve()
-    r = case.points[2] - case.joint
-    assert solved.torque_nm == pytest.approx(-solved.forces_n[2] * cross(r, case.normals[2]))
-    assert solved.torque_nm > 0  # o_3 lies on the left and pushes right and forward: the front turns left, against it
-
-
 @given(cases())
 def test_forces_and_moments_balance(case):
     forces = case.solve().forces_n

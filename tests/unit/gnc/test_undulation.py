@@ -25,13 +25,6 @@ def test_the_wave_travels_from_head_to_tail() -> None:
     assert peaks[11] < peaks[10] < peaks[9]
 
 
-def test_it_rests_without_a_path() -> None:
-    stage = make_stage()
-    controller = LateralUndulation(stage.robot, LateralUndulation.Settings())
-    held = [controller.update(stage.view(t, TAIL_S_M, without="trajectory")).report.reference_rad for t in range(20)]
-    assert all(one == held[0] for one in held)
-
-
 @pytest.mark.parametrize(("lag_rad", "bends"), [(0.9, 1.0), (-0.9, -1.0)])
 def test_the_head_steers_towards_the_path_and_against_its_bend_if_the_wave_goes_to_it(
     lag_rad: float, bends: float

@@ -1,16 +1,17 @@
 """Robots and scenes for the tests: small, noiseless, and changed in one place at a time."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.files import read_part
 from snakesim_hal.model.scenario import RunConfig, check
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import Message, Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 
+MessageT = TypeVar("MessageT", bound=Message)
 G = 9.81
 QUIET = {
     "joints": {},
@@ -79,6 +80,11 @@ class Run:
     def sample(self) -> Samples:
         """The samples of the present tick."""
         return self.sim.sample(self.tick, self.tick * self.config.period_ns)
+
+    def sensed(self, kind: type[MessageT]) -> MessageT:
+        """What the one sensor with such messages says at the present tick."""
+        (message,) = (message for message in self.sample().others.values() if isinstance(message, kind))
+        return message
 
     def go(self, seconds: float = 0.0) -> None:
         """At least one tick."""

@@ -46,14 +46,6 @@ def test_velocity_mode_reaches_its_speed_and_holds_it_against_friction():
     assert torque(run) == pytest.approx(viscous * speed, rel=0.01)
 
 
-def test_torque_mode_follows_as_a_first_order_lag():
-    run = fast_run()
-    run.command(Mode.TORQUE, 0.02)
-    for k in range(1, 40):
-        run.go()
-        assert torque(run) == pytest.approx(0.02 * (1 - np.exp(-k * 1e-3 / RESPONSE_S)), rel=1e-6)
-
-
 def test_a_motor_without_response_time_answers_at_once():
     run = fast_run({**TWO_LINKS, "motor": {"response_time_s": 0.0}})
     run.command(Mode.TORQUE, 0.02)

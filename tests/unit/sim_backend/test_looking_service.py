@@ -49,9 +49,8 @@ def test_a_robot_on_can_sees_what_the_simulated_robot_sees_from_the_same_place()
     simulated = Run(config_of())
     simulated.sample()
     simulated.go(0.03)
-    there = simulated.sample().others[HEAD]
+    there = simulated.sensed(DepthImage)
     simulated.sim.close()
-    assert isinstance(there, DepthImage)
     mine, other = (np.frombuffer(image.depth, "<u2").astype(int) for image in (can[0], there))
     near = (mine > 0) & (other > 0) & (other < 1000)
     assert near.mean() > 0.3

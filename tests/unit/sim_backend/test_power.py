@@ -15,12 +15,6 @@ from tests.unit.sim_backend.rig import Run, make_config
 WITH = {"sensors!": {"joints": {}, "power": {"rate_hz": 5.0}}}
 
 
-def reported(run: Run) -> Power:
-    power = run.sample().others[keys.POWER]
-    assert isinstance(power, Power)
-    return power
-
-
 def overheat(end_s: float = inf) -> Injection:
     return Injection("overheat", "joint_3", 0.0, end_s)
 
@@ -29,7 +23,7 @@ def test_power_comes_at_its_rate_and_a_cold_robot_is_at_ambient():
     run = Run(make_config(WITH))
     sensor = SensorDescription(key=keys.POWER, rate_hz=5.0, delay_s=0.0)
     assert sensor in run.sim.describe().sensors
-    power = reported(run)
+    power = run.sensed(Power)
     assert power.motor_c == power.board_c == [20.0] * run.count and power.voltage_v == [24.0] * run.count
     assert power.current_a == pytest.approx([0.05] * run.count)
     assert power.valid == [True] * run.count and power.leak == [False] * run.count
@@ -46,7 +40,7 @@ def test_a_motor_that_works_gets_warm_and_takes_current():
     run.sample()
     run.command(Mode.TORQUE, [3.5, *[0.0] * (run.count - 1)])
     run.go(6.0)
-    power = reported(run)
+    power = run.sensed(Power)
     # The joint turns to its stop and pushes; 3.5 of 7 N·m settle at 80 °C, by a time constant of a minute.
     assert power.motor_c[0] == pytest.approx(20 + 60 * (1 - 2.718 ** (-6 / 60)), abs=0.6)
     assert power.motor_c[-1] < 20.5 and power.current_a[0] > 0.4 > power.current_a[-1]
@@ -57,11 +51,11 @@ def test_heat_on_request_goes_away_by_itself_or_is_held():
     for end_s, later_c in ((inf, 109.0), (5.0, 110.0)):
         assert run.sim.inject(overheat(end_s), begins=True)
         run.go(1.0)
-        assert reported(run).motor_c[2] == pytest.approx(later_c, abs=1.0)
-    assert reported(run).motor_c[1] == pytest.approx(20.0, abs=0.1)
+        assert run.sensed(Power).motor_c[2] == pytest.approx(later_c, abs=1.0)
+    assert run.sensed(Power).motor_c[1] == pytest.approx(20.0, abs=0.1)
     assert run.sim.inject(overheat(5.0), begins=False)
     run.go(10.0)
-    assert reported(run).motor_c[2] < 98.0
+    assert run.sensed(Power).motor_c[2] < 98.0
 
 
 def test_without_the_sensor_there_is_no_heat_on_request():

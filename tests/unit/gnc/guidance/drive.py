@@ -17,6 +17,7 @@ from snakesim_hal.model.route import Route, lay_chain, sine_points, yaw_segments
 from snakesim_hal.wire.messages import DepthImage, Imu, JointState, Obstacle, Pose
 from tests.unit.gnc.guidance.rendered import Eye, Ground, box, cylinder, depth_image, flat
 from tests.unit.gnc.stage import BODY_RADIUS_M, make_robot
+from tests.unit.hal.rig import pose, state
 
 STEP_NS = 20_000_000  # guidance's turn
 IMAGE_EVERY = 3  # turns
@@ -88,17 +89,9 @@ class Drive:
 
     def joints(self, here: Place, before: Place) -> JointState:
         """With the noise of an encoder."""
-        count = len(here.angles_rad)
-        angles = here.angles_rad + 0.0005 * self.random.standard_normal(count)
-        return JointState(
-            tick=self.turn,
-            stamp_ns=self.turn * STEP_NS,
-            angle_rad=angles.tolist(),
-            velocity_rad_s=((here.angles_rad - before.angles_rad) / (STEP_NS * 1e-9)).tolist(),
-            torque_nm=[0.0] * count,
-            valid=[True] * count,
-            age_ns=[0] * count,
-        )
+        angles = here.angles_rad + 0.0005 * self.random.standard_normal(len(here.angles_rad))
+        speeds = (here.angles_rad - before.angles_rad) / (STEP_NS * 1e-9)
+        return state(self.robot, angles.tolist(), speeds.tolist(), tick=self.turn, stamp_ns=self.turn * STEP_NS)
 
     def imu(self, here: Place, before: Place) -> Imu:
         """Of every link."""
@@ -115,13 +108,11 @@ class Drive:
     def pose(self, here: Place, off_m: float = 0.0) -> Pose:
         """With the noise of motion capture. off_m: a jump."""
         x, y, turn = self.random.standard_normal(3) * [POSE_NOISE.position_m, POSE_NOISE.position_m, 0.001]
-        return Pose(
-            tick=self.turn,
-            stamp_ns=self.turn * STEP_NS,
+        return pose(
+            self.turn,
+            self.turn * STEP_NS,
             position_w=(here.base_w[0] + float(x) + off_m, here.base_w[1] + float(y), BODY_RADIUS_M),
             orientation_wxyz=quaternion_from_yaw(here.base_w[2] + float(turn)),
-            velocity_w=(0.0, 0.0, 0.0),
-            angular_velocity_w=(0.0, 0.0, 0.0),
         )
 
     def image(self, here: Place, stamp_ns: int) -> DepthImage:

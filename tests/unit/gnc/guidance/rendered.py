@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -67,16 +67,9 @@ def distance_along(origin: Floats, rays: Floats, obstacles: Sequence[Obstacle], 
             t = np.clip(t, 0.0, 50.0)
         nearest = np.where(t < 50.0, t, nearest)
         for o in obstacles:
-            t = _on_sphere(origin, rays, o) if o.shape == "sphere" else _on_upright(origin, rays, o)
+            t = _on_upright(origin, rays, o)
             nearest = np.minimum(nearest, np.where(t > 0, t, np.inf))
     return nearest
-
-
-def _on_sphere(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
-    to = origin - np.array(o.position_w)
-    a, b, c = (rays**2).sum(1), rays @ to, to @ to - o.radius_m**2
-    root = b * b - a * c
-    return np.where(root >= 0, (-b - np.sqrt(root)) / a, np.inf)
 
 
 def _on_upright(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
@@ -106,28 +99,20 @@ def depth_image(
     ground: Ground = flat,
     eye: Eye | None = None,
     stamp_ns: int = 0,
-    tick: int = 0,
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    orientation_l_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    lens: Intrinsics = INTRINSICS,
 ) -> DepthImage:
     """An image from a camera at a pose in the world (rotation: world_from_camera); the mount is only told."""
-    rays = lens.rays().astype(np.float64) @ rotation.T
+    rays = INTRINSICS.rays().astype(np.float64) @ rotation.T
     depth = (eye or Eye()).through(distance_along(position_w, rays, obstacles, ground))
     counts = np.where(np.isfinite(depth) & (depth < RANGE_M[1]) & (depth > RANGE_M[0]), depth / SCALE_M, 0.0)
     return DepthImage(
-        tick=tick,
+        tick=0,
         stamp_ns=stamp_ns,
         link=link,
         position_l=position_l,
-        orientation_l_wxyz=orientation_l_wxyz,
-        width=lens.width,
-        height=lens.height,
-        fx_px=lens.fx_px,
-        fy_px=lens.fy_px,
-        cx_px=lens.cx_px,
-        cy_px=lens.cy_px,
+        orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
+        **asdict(INTRINSICS),
         range_min_m=RANGE_M[0],
         range_max_m=RANGE_M[1],
         scale_m=SCALE_M,

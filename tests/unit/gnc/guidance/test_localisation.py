@@ -8,7 +8,7 @@ import pytest
 from snakesim_gnc.guidance.body_history import Base, BodyHistory
 from snakesim_gnc.guidance.perceived_world import quaternion_of
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from tests.unit.gnc.guidance.drive import ROUTE, STEP_NS, Drive, random_field
+from tests.unit.gnc.guidance.drive import STEP_NS, Drive, random_field
 from tests.unit.gnc.guidance.rendered import turned
 
 
@@ -93,7 +93,3 @@ def test_quaternions_go_there_and_back():
     for angles in ((0.3, 0.2, -0.1), (3.1, 0.0, 0.0), (-2.0, 1.2, 3.0), (0.0, -1.5, 1.0)):
         rotation = turned(*angles)
         assert rotation_from_quaternion(quaternion_of(rotation)) == pytest.approx(rotation)
-
-
-def test_the_route_of_these_tests_is_long_enough():
-    assert ROUTE.length_m > 10

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from snakesim_gnc.guidance.obstacle_map import KEPT_M, MAX_TRACKS, ObstacleMap
 from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
 from snakesim_hal.model.outlines import outline_distance_m
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import Obstacle, World
+from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.guidance.rendered import box, cylinder, lidar, turned
 
 S = 1_000_000_000
@@ -48,20 +47,6 @@ def test_what_is_seen_again_and_again_is_believed_more():
     assert only(once).confidence < 0.65
     assert reported.confidence > 0.9 and reported.last_seen_ns == 5 * S // 20 and not reported.felt
     assert only(often, now_ns=120 * S).confidence < reported.confidence  # belief fades
-
-
-def test_the_message_holds_what_is_told():
-    reported = mapped(cylinder("a", 0.8, 0.3), box("b", 0.9, -0.3, (0.2, 0.1))).obstacles(0, 0.0)
-    world = World(
-        tick=0,
-        stamp_ns=0,
-        base_position_w=(0, 0, 0),
-        base_orientation_wxyz=(1, 0, 0, 0),
-        base_confidence=1.0,
-        contacts=[],
-        obstacles=reported,
-    )
-    assert Decoder(World).decode(encode(world), encoding_of(World)) == world
 
 
 @given(st.floats(0.03, 0.07), st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=12))
