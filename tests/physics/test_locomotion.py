@@ -130,7 +130,7 @@ def test_commands_are_smooth_through_the_whole_run():
     assert steps[same & (whole.record.mode[1:] == Mode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_other_noise_gives_the_same_picture(seed):
     whole = run(configure("triplet", f"seed={seed}"))
     turns = propelled(whole)

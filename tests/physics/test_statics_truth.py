@@ -180,6 +180,7 @@ def test_so_they_are_with_shipped_servos_whose_targets_lead_by_the_load(bench: B
     assert force == pytest.approx(bench.solved.forces_n, rel=0.01)  # 0.43 to 1.09 of them without the lead
 
 
+@pytest.mark.slow  # a share of the push above
 @each_bench
 def test_and_within_the_torque_that_the_shipped_robot_has(bench: Bench):
     shipped = with_shipped(bench, limits=configure("triplet").robot.limits)

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_gnc.guidance.obstacle_map import KEPT_M, MAX_TRACKS, ObstacleMap
+from snakesim_gnc.guidance import obstacle_map
+from snakesim_gnc.guidance.obstacle_map import KEPT_M, ObstacleMap
 from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.wire.messages import Obstacle
@@ -128,12 +129,14 @@ def test_the_newest_look_counts_most_after_drift():
     assert only(still).position_w[0] < 0.812
 
 
-def test_far_things_are_forgotten_and_their_number_is_bounded():
+def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
+    monkeypatch.setattr(obstacle_map, "MAX_TRACKS", 64)
     map_ = mapped(cylinder("a", 0.8, 0.0))
     map_.forget(np.array([[KEPT_M + 0.5, 0.0]]))
     assert len(map_.tracks) == 1
     map_.forget(np.array([[KEPT_M + 1.0, 0.0]]))
     assert not map_.tracks
-    map_.take_touches([(np.array([0.2 * (k % 50), 0.2 * (k // 50)]), np.array([1.0, 0.0])) for k in range(1100)], 0)
-    map_.forget(np.array([[0.2 * k, 0.2 * j] for k in range(50) for j in range(25)]))
-    assert len(map_.tracks) == MAX_TRACKS
+    map_.take_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
+    assert len(map_.tracks) == 100
+    map_.forget(np.zeros((1, 2)))
+    assert len(map_.tracks) == 64

@@ -57,8 +57,8 @@ def test_an_image_counts_where_it_was_taken_not_where_it_arrives():
 
 def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     drive = Drive(random_field(1))
-    *_, here = drive.turns(100)
-    image, before = drive.image(here, 100 * STEP_NS), reported(drive)
+    *_, here = drive.turns(30)
+    image, before = drive.image(here, 30 * STEP_NS), reported(drive)
     drive.world.take_look(msgspec.structs.replace(image, stamp_ns=STEP_NS), NOISE)  # older than what is in the map
     drive.world.take_look(msgspec.structs.replace(image, stamp_ns=900 * STEP_NS), NOISE)  # of the future
     joints = drive.joints(here, here)
@@ -72,10 +72,11 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
 
 def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     drive = Drive(random_field(1))
-    for _ in drive.turns(150):
+    for _ in drive.turns(60):
         pass
     drive.under_way.clear()
     before = reported(drive)
+    assert len(before.obstacles) > 3
     for _ in drive.turns(100, pose=False, images=False, imu=False):
         pass
     after = reported(drive)
