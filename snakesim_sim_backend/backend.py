@@ -17,9 +17,8 @@ from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build, of_joints
+from snakesim_sim_backend.model import FREE_QPOS, SimModel, build, of_joints
 from snakesim_sim_backend.physics import Physics
-from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.registry import check_models
 from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import SimSettings
@@ -179,7 +178,6 @@ class SimBackend:
         """The state as it is, without noise, rate or delay."""
         data, sim = self._data, self._sim
         angles_rad, velocities_rad_s = of_joints(data, self._motors.count)
-        w, x, y, z, ox, oy, oz = *data.qpos[3:FREE_QPOS].tolist(), *data.qvel[3:FREE_DOFS].tolist()
         contacts = [
             TrueContact(t.body - sim.first_link_body, t.obstacle, *map(np.array, (t.position_w, t.normal_w, t.force_w)))
             for t in TouchReader(sim, data).read()
@@ -189,7 +187,6 @@ class SimBackend:
             base_position_w=data.qpos[:3].copy(),
             base_orientation_wxyz=data.qpos[3:FREE_QPOS].copy(),
             base_velocity_w=data.qvel[:3].copy(),
-            base_angular_velocity_w=np.array(rotate((w, x, y, z), (ox, oy, oz))),
             angles_rad=angles_rad.copy(),
             velocities_rad_s=velocities_rad_s.copy(),
             torques_nm=self._motors.applied_nm().copy(),

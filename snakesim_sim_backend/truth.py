@@ -24,7 +24,6 @@ class TrueState:
     base_position_w: Floats  # (3,), m: the tail end of link 0
     base_orientation_wxyz: Floats  # (4,)
     base_velocity_w: Floats  # (3,), m/s
-    base_angular_velocity_w: Floats  # (3,), rad/s
     angles_rad: Floats  # (n_joints,), tail to head
     velocities_rad_s: Floats  # (n_joints,)
     torques_nm: Floats  # (n_joints,), of the motors over the last physics step

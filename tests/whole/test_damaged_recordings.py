@@ -238,33 +238,41 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
         assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
 
 
-@pytest.mark.parametrize("way", ["recorded", "named", "flag", "other"])
-def test_code_that_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, way: str) -> None:
-    (tmp_path / "mine.py").write_text(
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run of a controller whose file leaves a mark when it is loaded."""
+    folder = tmp_path_factory.mktemp("foreign")
+    (folder / "mine.py").write_text(
         "from pathlib import Path\n"
         "from snakesim_gnc.control.hold import Hold\n"
         "(Path(__file__).parent / 'ran').touch()\n"
         "class Mine(Hold):\n    pass\n"
     )
     begin = ["run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", "--controller", "./mine.py:Mine"]
-    ended = snakesim(*begin, cwd=tmp_path)
-    assert ended.code == 0, ended
-    (tmp_path / "ran").unlink()
-    more = {
-        "recorded": [],
-        "named": ["--controller", "./mine.py:Mine"],
-        "flag": ["--run-recorded-code"],
-        "other": ["--controller", "hold"],
-    }[way]
-    for other in (["info", "run"], ["report", "run"], ["export", "run", "--format", "csv"], ["compare", "run", "run"]):
-        assert snakesim(*other, cwd=tmp_path).code == 0 and not (tmp_path / "ran").exists()
-    replayed = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
-    assert (tmp_path / "ran").exists() == (way in ("named", "flag"))
-    if way == "recorded":
-        assert replayed.code == 2 and "the recording names './mine.py:Mine' as its controller" in replayed.err
-        assert "--run-recorded-code" in replayed.err and "--controller ./mine.py:Mine" in replayed.err
-    else:
-        assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+    ended = snakesim(*begin, cwd=folder)
+    assert ended.code == 0 and (folder / "ran").exists(), ended
+    return folder
+
+
+def test_who_reads_a_recording_runs_no_code_that_it_names(foreign: Path) -> None:
+    (foreign / "ran").unlink(missing_ok=True)
+    for words in ("info run", "report run", "export run --format csv", "compare run run"):
+        assert snakesim(*words.split(), cwd=foreign).code == 0
+    replayed = snakesim("replay", "run", "--control", cwd=foreign)
+    assert replayed.code == 2 and "the recording names './mine.py:Mine' as its controller" in replayed.err
+    assert "--run-recorded-code" in replayed.err and "--controller ./mine.py:Mine" in replayed.err
+    assert not (foreign / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "runs"),
+    [("--controller ./mine.py:Mine", True), ("--run-recorded-code", True), ("--controller hold", False)],
+)
+def test_it_runs_when_its_user_says_so(foreign: Path, more: str, runs: bool) -> None:
+    (foreign / "ran").unlink(missing_ok=True)
+    replayed = snakesim("replay", "run", "--control", *more.split(), cwd=foreign)
+    assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+    assert (foreign / "ran").exists() == runs
 
 
 def test_a_folder_with_a_black_box_tells_of_its_recording_too(run: Path, whole: bytes, tmp_path: Path) -> None:
