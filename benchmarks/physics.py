@@ -1,11 +1,10 @@
 """The simulator in this process: with everything published, and as a bare loop of `mj_step`."""
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.session import Link, Publisher, Session, open_session
 from snakesim_hal.wire.codec import encode
@@ -13,6 +12,7 @@ from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import Clock, JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
 from tests.harness.endpoint import free_endpoint
+from tests.unit.hal.rig import command
 from tests.whole_run import run as run_in_process
 
 TICKS_A_BLOCK = 50
@@ -25,25 +25,8 @@ def config_of(*sets: str) -> RunConfig:
 
 def open_simulator(config: RunConfig) -> SimBackend:
     """As the host opens it."""
-    factory = find_plugin(BACKENDS, "sim")
-    backend = factory(config, plugin_settings(factory, config.backends.get("sim", {}), "benchmarks", "backends.sim"))
-    assert isinstance(backend, SimBackend)
-    return backend
-
-
-def holding(backend: SimBackend) -> SetPoints:
-    """Every joint stays where it is."""
-    joints = backend.describe().joints
-    angles = list(backend.sample(0, 0).joints.angle_rad)
-    return SetPoints([Mode.POSITION] * len(joints), angles, [joint.torque_limit_nm for joint in joints])
-
-
-@contextmanager
-def listened_session() -> Iterator[tuple[Session, Session]]:
-    """A listening session and one that is connected to it, so that what is published really goes over the wire."""
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "bench", True)) as host, open_session(Link(endpoint, "bench")) as other:
-        yield host, other
+    settings = plugin_settings(SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim")
+    return SimBackend(config, settings)
 
 
 class Publishing:
@@ -107,7 +90,8 @@ def sensing(config: RunConfig) -> tuple[list[float], list[float]]:
     points, _ = motion(config)
     ours: list[float] = []
     theirs: list[float] = []
-    with listened_session() as (session, other):
+    endpoint = free_endpoint()  # what is published really goes over the wire
+    with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
         first = full.sample(0, 0)
         readers = [other.reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.others.items())]
         publishing = Publishing(session, config.period_ns)
@@ -130,18 +114,9 @@ def sensing(config: RunConfig) -> tuple[list[float], list[float]]:
 def wire_bytes(config: RunConfig) -> tuple[bytes, bytes]:
     """All state of one tick, and one command, as they stand on the wire."""
     backend = open_simulator(config)
-    samples = backend.sample(0, 0)
-    points = holding(backend)
+    samples, robot = backend.sample(0, 0), backend.describe()
     backend.close()
-    command = JointCommand(
-        tick=10**6,
-        sequence=10**6,
-        lease_epoch=1,
-        layout=backend.describe().layout,
-        valid_for_ns=50_000_000,
-        mode=points.mode,
-        target=points.target,
-        torque_limit_nm=points.torque_limit_nm,
-    )
+    limits_nm = [joint.torque_limit_nm for joint in robot.joints]
+    held = command(robot, samples.joints.angle_rad, tick=10**6, sequence=10**6, torque_limit_nm=limits_nm)
     state = encode(samples.joints) + b"".join(encode(message) for message in samples.others.values())
-    return state, encode(command)
+    return state, encode(held)

@@ -1,6 +1,7 @@
 """The planner through clutter: what it plans is free, pushes, is the same again, and changes when it must."""
 
 import time
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, load, parse_set, place_all, start_of
+from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, load, parse_set, place_all, start_of
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 from tests.unit.gnc.stage import make_world
 
@@ -21,19 +22,14 @@ SECOND = 10**9
 SEARCH = Search(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
 
 
-def field(seed: int = 1, density: float = 8.0) -> RunConfig:
-    flags = (f"scene.random_field.0.seed={seed}", f"scene.random_field.0.density_per_m2={density}")
-    return load("surveyed_clutter", [parse_set(flag) for flag in flags]).config
-
-
-def obstacles_of(config: RunConfig) -> list[Obstacle]:
-    return [placed.obstacle for placed in place_all(config)]
-
-
-def body_of(config: RunConfig) -> np.ndarray:
-    start = start_of(config)
-    segments = yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
-    return chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
+@cache
+def field(density: float = 8.0) -> tuple[list[Obstacle], np.ndarray]:
+    """Obstacles, and the nodes of the body where it is laid down."""
+    flags = ("scene.random_field.0.seed=1", f"scene.random_field.0.density_per_m2={density}")
+    config = load("surveyed_clutter", [parse_set(flag) for flag in flags]).config
+    start, segments = start_of(config), yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
+    body = chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
+    return [placed.obstacle for placed in place_all(config)], body
 
 
 def world(at_s: float, obstacles: list[Obstacle]) -> World:
@@ -70,7 +66,7 @@ def path_of(search: PathSearch) -> PlannedPath | None:
 
 
 def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
-    obstacles = obstacles_of(field())
+    obstacles, _ = field()
     made, random = ObstacleMap(obstacles), np.random.default_rng(0)
     points = random.uniform((0.0, -1.2), (6.5, 1.2), (300, 2))
     near = made.near(points[:, 0], points[:, 1])
@@ -86,23 +82,23 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
 
 @pytest.mark.parametrize("density", [8.0, 12.0])
 def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -> None:
-    config = field(density=density)
-    body, made = body_of(config), ObstacleMap(obstacles_of(config))
+    obstacles, body = field(density)
+    made = ObstacleMap(obstacles)
     found = path_of(Beam(made, SEARCH).ahead(body, 0.0, 60))
     assert found is not None and len(found.points_w) == 61
     near = made.near(found.points_w[1:, 0], found.points_w[1:, 1])
     assert near.distance_m.min() >= SEARCH.radius_m + SEARCH.clearance_m
     assert found.points_w[-1, 0] - found.points_w[0, 0] > 2.0
     assert np.median(found.margins_n) > 20.0
-    smooth = planned(planner(obstacles_of(config)), body)
+    smooth = planned(planner(obstacles), body)
     points = np.array(smooth.path_w)
     assert made.near(points[:, 0], points[:, 1]).distance_m.min() > SEARCH.radius_m - 0.012  # pressed, not through
     assert points[0] == pytest.approx(body[0], abs=0.01)
 
 
 def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None:
-    config = field()
-    made, body = planner(obstacles_of(config)), body_of(config)
+    obstacles, body = field()
+    made = planner(obstacles)
     seen = [planned(made, body, at_s) for at_s in np.arange(0.0, 6.0, 0.2).tolist()]
     assert len({one.path_id for one in seen}) >= 3
     assert any(one.speed_m_s < 0 for one in seen)
@@ -110,8 +106,8 @@ def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None
 
 
 def test_a_body_that_has_left_where_it_stood_gets_a_path_from_where_it_lies() -> None:
-    config = field()
-    made, body = planner(obstacles_of(config)), body_of(config)
+    obstacles, body = field()
+    made = planner(obstacles)
     stood = [planned(made, body, at_s) for at_s in np.arange(0.0, 1.2, 0.2).tolist()][-1]
     moved = body + np.array([0.0, 0.05])
     again = planned(made, moved, 2.5)
@@ -120,8 +116,8 @@ def test_a_body_that_has_left_where_it_stood_gets_a_path_from_where_it_lies() ->
 
 
 def test_only_what_is_seen_is_planned_around() -> None:
-    config = field()
-    made, body = planner(None), body_of(config)
+    _, body = field()
+    made = planner(None)
     blind = planned(made, body)
     wall = Obstacle(name="wall", shape="box", position_w=(2.2, 0.0, 0.1), half_size_m=(0.05, 0.4, 0.1), height_m=0.2)
     points = np.array(blind.path_w)
@@ -132,8 +128,8 @@ def test_only_what_is_seen_is_planned_around() -> None:
 
 
 def test_a_goal_is_reached() -> None:
-    config = field()
-    made, body = planner(obstacles_of(config), HeadingGoal(distance_m=0.5)), body_of(config)
+    obstacles, body = field()
+    made = planner(obstacles, HeadingGoal(distance_m=0.5))
     assert not planned(made, body).finished
     there = planned(made, body + np.array([0.6, 0.0]), 1.0)
     assert there.finished and there.speed_m_s == 0.0 and there.reason == "the goal is reached"
@@ -141,15 +137,15 @@ def test_a_goal_is_reached() -> None:
     assert not planned(made, body + np.array([0.45, 0.0]), 3.0).finished  # it was measured wrong, or slid back
     head = body[-1]
     points = [(float(head[0]) + 0.1, float(head[1])), (float(head[0]) + 1.0, float(head[1]))]
-    made = planner(obstacles_of(config), WaypointGoal(points_m=points, within_m=0.2))
+    made = planner(obstacles, WaypointGoal(points_m=points, within_m=0.2))
     assert not planned(made, body).finished
     assert planned(made, body + np.array([0.95, 0.0]), 1.0).finished
 
 
 @pytest.mark.parametrize("heading_rad", [0.7, -0.7, 3.0])
 def test_a_heading_that_is_asked_for_counts_and_not_the_mission(heading_rad: float) -> None:
-    config = field()
-    made, body = planner(obstacles_of(config), HeadingGoal(distance_m=0.1)), body_of(config)
+    obstacles, body = field()
+    made = planner(obstacles, HeadingGoal(distance_m=0.1))
     ahead = planned(made, body)
     moved = body + np.array([0.3, 0.0])
     turned = planned(made, moved, 0.2, heading_rad=heading_rad)
@@ -168,8 +164,8 @@ def turns(made: ClutterPlanner, body: np.ndarray, count: int, heading_rad: float
 
 
 def test_no_turn_does_more_than_its_share_and_the_path_before_is_followed_until_the_plan_is_there() -> None:
-    config = field()
-    made, body = planner(obstacles_of(config)), body_of(config)
+    obstacles, body = field()
+    made = planner(obstacles)
     route = Route(np.concatenate([body, body[-1] + np.array([[1.0, 0.0], [5.0, 0.0]])]))
     made.follow(route, ["peg"])
     seen = turns(made, body, 6, heading_rad=0.7)
@@ -189,15 +185,15 @@ def test_no_turn_does_more_than_its_share_and_the_path_before_is_followed_until_
 
 
 def test_a_plan_is_the_same_in_however_many_slices() -> None:
-    config = field()
-    made = [ClutterPlanner(HeadingGoal(), obstacles_of(config), search=SEARCH, turn_s=turn_s) for turn_s in (0.08, 0.5)]
-    few, many = (turns(one, body_of(config), 40)[-1] for one in made)
+    obstacles, body = field()
+    made = [ClutterPlanner(HeadingGoal(), obstacles, search=SEARCH, turn_s=turn_s) for turn_s in (0.08, 0.5)]
+    few, many = (turns(one, body, 40)[-1] for one in made)
     assert few.path_id == 1 and few.path_w == many.path_w
 
 
 def test_nothing_moves_before_the_first_path_is_there() -> None:
-    config = field()
-    made, body = planner(obstacles_of(config)), body_of(config)
+    obstacles, body = field()
+    made = planner(obstacles)
     first = turns(made, body, 1)[0]
     assert not made.ready
     assert (first.speed_m_s, first.searching) == (0.0, "the first path")
@@ -207,10 +203,9 @@ def test_nothing_moves_before_the_first_path_is_there() -> None:
 
 
 def test_a_tick_that_is_shown_again_is_one_turn() -> None:
-    config = field()
-    made, body, desired = planner(None), body_of(config), DesiredMotion(0.2)
+    obstacles, body = field()
+    made, desired = planner(None), DesiredMotion(0.2)
     assert planned(made, body).path_id == 1
-    obstacles = obstacles_of(config)
     shown = [made.update(400, world(4.0, obstacles), body, desired) for _ in range(20)]
     assert shown[0].searching == "the map has changed" and shown[-1] == shown[0]
 
@@ -221,8 +216,7 @@ def test_a_tick_that_is_shown_again_is_one_turn() -> None:
 )
 def test_the_work_of_a_turn_is_bounded_whatever_is_planned(seen: bool, turn_s: float) -> None:
     """Counted, and in CPU time: ten times what the rate allows, so that a slow computer passes."""
-    config = field(density=12.0)
-    obstacles, body = obstacles_of(config), body_of(config)
+    obstacles, body = field(density=12.0)
     made = ClutterPlanner(HeadingGoal(), None if seen else obstacles, search=SEARCH, turn_s=turn_s)
     done, paths, took_s = [], set(), []
     for k in range(round(12.0 / turn_s)):  # it stands: stuck paths, backing out, and a turn to the left
