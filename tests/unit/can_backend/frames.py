@@ -5,7 +5,7 @@ from typing import Any
 
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Frame, ModuleState, Opcode
+from snakesim_can_backend.protocol.definitions import Frame, ModuleState, Opcode, opcode_of
 
 
 def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> Frame:
@@ -32,6 +32,11 @@ def accelerometer(node: int, count: int, acceleration_z: float) -> Frame:
 
 def health(node: int, **values: float) -> Frame:
     return codec()[Opcode.HEALTH].frame(node, **values)
+
+
+def read(frame: Frame) -> dict[str, float]:
+    """The values of its signals."""
+    return dict(codec()[Opcode(opcode_of(frame.id))].values(frame.data))
 
 
 def corrupted(frame: Frame) -> Frame:

@@ -21,6 +21,7 @@ from snakesim_can_backend.driver.bring_up import (
 )
 from snakesim_can_backend.driver.parameters import parameters_of
 from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
     Action,
@@ -33,12 +34,11 @@ from snakesim_can_backend.protocol.definitions import (
     opcode_of,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
-from tests.unit.can_backend.frames import heartbeat
+from tests.unit.can_backend.frames import heartbeat, read
 from tests.unit.can_backend.loop import config
-from tests.unit.can_backend.twin import rig
+from tests.unit.can_backend.twin.rig import chain
 
 NAMES = [f"joint_{i}" for i in range(1, 5)]
 Spoil = Callable[[Frame], list[Frame]]
@@ -51,8 +51,8 @@ def as_it_is(frame: Frame) -> list[Frame]:
 class Modules:
     """Four stepped twins at the other end of a bus. to_modules, to_host: what becomes of each frame."""
 
-    def __init__(self, chain: ModuleChain | None = None) -> None:
-        self.chain = chain or rig.chain()
+    def __init__(self) -> None:
+        self.chain = chain()
         self.channel = f"bring-up-{uuid.uuid4().hex[:8]}"
         self.far = VirtualWire(self.channel)
         self.near = VirtualWire(self.channel, self)
@@ -88,7 +88,7 @@ def modules() -> Iterator[Modules]:
 
 
 def actions(frames: list[Frame]) -> list[float]:
-    return [rig.read(f)["action"] for f in frames if opcode_of(f.id) == Opcode.COMMAND]
+    return [read(f)["action"] for f in frames if opcode_of(f.id) == Opcode.COMMAND]
 
 
 # --- who is there ------------------------------------------------------------------------------------------
@@ -245,7 +245,7 @@ def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) ->
     assert in_force[2][Parameter.STIFFNESS] == 12.5 and in_force[1][Parameter.STIFFNESS] == 40.0
     assert [in_force[node][Parameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
     assert in_force[1][Parameter.RATED_TORQUE] == pytest.approx(4.0)
-    requests = [rig.read(f) for f in modules.heard]
+    requests = [read(f) for f in modules.heard]
     assert {opcode_of(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
     read_only = [r["index"] for r in requests if r["operation"] == Operation.READ]
     assert set(read_only) == {Parameter.RATED_TORQUE, Parameter.RATED_SPEED} and len(requests) == 4 * len(Parameter)
@@ -299,7 +299,7 @@ def test_a_value_out_of_range_is_told_with_node_name_value_and_range(modules: Mo
 
 
 def test_an_armed_module_refuses(modules: Modules) -> None:
-    modules.chain.receive(0, rig.command(Action.ARM))
+    modules.chain.receive(0, command(Action.ARM))
     modules.chain.take(0)
     with pytest.raises(BackendError, match="not while armed"):
         configure([modules.bus], wanted(), 5.0)

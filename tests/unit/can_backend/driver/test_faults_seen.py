@@ -5,7 +5,8 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_hal.errors import BackendError
-from tests.unit.can_backend.loop import loop
+from snakesim_hal.injection import parse
+from tests.unit.can_backend.loop import cleared_and_armed_again, loop
 
 START_TICK = 60
 AT_REST_RAD_S = 0.05
@@ -22,6 +23,7 @@ MODULE_FAULTS = [
     ("undervoltage", "module_voltage", 3),
     ("babble", "module_babbling", 3),
 ]
+ONCE = ("reboot",)
 
 
 @pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
@@ -43,6 +45,11 @@ def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_res
         assert what in [f.what for f in run.faults]
         assert stopped < run.tick - 5, "everything comes to rest"
         assert all(run.states()[i] == ModuleState.DISARMED for i in healthy), run.states()
+        if kind not in ONCE:
+            run.backend.inject(parse(f"{kind}:joint_3@0"), begins=False)
+            run.run(10)
+        if kind != "overheat":  # it would cool for minutes
+            cleared_and_armed_again(run)
 
 
 def test_a_module_that_is_there_twice_is_found_before_anything_is_enabled() -> None:

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command, sync
 from snakesim_can_backend.protocol.definitions import (
-    COMMAND_KEY,
     Action,
     Frame,
     ModuleState,
@@ -25,6 +25,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
+from tests.unit.can_backend.frames import read
 from tests.unit.hal.rig import run_config
 
 NODE = 3
@@ -33,18 +34,6 @@ MS = 1000.0
 BOOTED = 100 * MS
 HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 QUIET = Readings(0, 0, 0)
-
-
-def emergency() -> Frame:
-    return codec()[Opcode.EMERGENCY].frame(0, reason=1)
-
-
-def command(action: Action, node: int = 0, key: int = COMMAND_KEY) -> Frame:
-    return codec()[Opcode.COMMAND].frame(node, action=action, key=key)
-
-
-def sync(count: int, time_us: int = 0) -> Frame:
-    return codec()[Opcode.SYNC].frame(0, count=count % 256, time=time_us % (1 << 32))
 
 
 def set_point(count: int, mode: Mode = Mode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE) -> Frame:
@@ -56,14 +45,6 @@ def set_point(count: int, mode: Mode = Mode.TORQUE, target: float = 1.0, limit: 
 def parameter(index: int, value: float = 0.0, operation: int = Operation.WRITE, node: int = NODE) -> Frame:
     frame = codec()[Opcode.PARAMETER_REQUEST].frame(node, index=index, value=value)
     return Frame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])  # also operations that there are not
-
-
-def corrupted(frame: Frame) -> Frame:
-    return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 1,)))
-
-
-def read(frame: Frame) -> dict[str, float]:
-    return dict(codec()[Opcode(opcode_of(frame.id))].values(frame.data))
 
 
 def only(frames: Sequence[Frame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
@@ -155,7 +136,7 @@ def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], 
         for answer in twins.take(0):
             if opcode_of(answer.id) == Opcode.JOINT_STATE:
                 late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
-        twins.receive(0, sync(tick))
+        twins.receive(0, sync(tick, 0))
         for node in range(1, joints + 1):
             twins.receive(0, set_point(tick, node=node, target=0.0))
         backlog = max(backlog, sum(map(len, twins.buses[0]._waiting.values())))

@@ -4,9 +4,10 @@ import pytest
 
 from snakesim_can_backend.bus.load import Reports, load, worst_bits
 from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import sync
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id, opcode_of
 from snakesim_can_backend.twin.bus_time import MAX_AHEAD_US, BusTime, by_opcode
-from tests.unit.can_backend.twin.rig import run_at, set_point, sync
+from tests.unit.can_backend.twin.rig import run_at, set_point
 
 FULL = worst_bits(8)
 
@@ -52,7 +53,7 @@ def test_the_host_s_frames_take_their_time():
 
 def test_a_newer_frame_takes_the_place_of_an_unsent_one_but_answers_are_all_sent():
     bus = BusTime()
-    bus.heard(sync(0), 0.0)
+    bus.heard(sync(0, 0), 0.0)
     for mark in range(5):
         bus.offer(1, frame(Opcode.JOINT_STATE, 1, mark), 1.0 + mark)
         bus.offer(1, frame(Opcode.PARAMETER_ANSWER, 1, mark), 1.0 + mark)
@@ -84,15 +85,11 @@ def test_measured_load_is_the_computed_one_and_every_answer_comes_in_its_period(
     assert set(late) == {0} and after.replaced == 0
 
 
-@pytest.mark.parametrize(("joints", "rate_hz"), [(13, 200), (30, 200)])
-def test_too_much_traffic_is_late_and_the_backlog_is_bounded(joints: int, rate_hz: int):
-    _, before, after, backlog = run_at(joints, rate_hz)
-    computed = load(joints, Reports(rate_hz))
-    if computed < 1.0:
-        assert after.load_since(before) == pytest.approx(computed, rel=0.05)
-        return
+@pytest.mark.parametrize("joints", [13, 30])
+def test_too_much_traffic_is_late_and_the_backlog_is_bounded(joints: int):
+    _, before, after, backlog = run_at(joints, 200)
     assert after.load_since(before) == pytest.approx(1.0, abs=0.03)
-    assert after.replaced > 0 and backlog <= 9 * joints and after.late_us > 1e6 / rate_hz
+    assert after.replaced > 0 and backlog <= 9 * joints and after.late_us > 5000
 
 
 def test_every_opcode_is_counted():

@@ -6,13 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from snakesim_can_backend.protocol.commands import command, sync
 from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
 from snakesim_can_backend.twin.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
 from snakesim_hal.drivers.mocap_sample import MocapSample
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
-from tests.unit.can_backend.twin.rig import Host, chain, command, config, only, set_point, sync
+from tests.unit.can_backend.twin.rig import Host, chain, config, only, set_point
 from tests.unit.hal.rig import pose
 
 G = 9.81
@@ -90,7 +91,7 @@ def test_two_buses_with_one_sync_time_share_one_step_of_time():
 def test_forces_are_felt_by_the_link_in_front_and_the_tail():
     made = chain(config(**SENSORS), plant=Pushed(4))
     made.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
-    made.receive(0, sync(0))
+    made.receive(0, sync(0, 0))
     frames = made.take(0)
     contacts = only(frames, Opcode.CONTACT)
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
@@ -107,10 +108,10 @@ def test_neighbours_take_turns_with_their_imus():
     for slot in made.slots:
         slot.module.parameters.values[Parameter.IMU_EVERY] = 4.0
     for tick in range(4):
-        made.receive(0, sync(tick))
+        made.receive(0, sync(tick, 0))
         gyros = only(made.take(0), Opcode.GYRO)
         assert len(gyros) == 1 and gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
-    made.receive(0, sync(4))
+    made.receive(0, sync(4, 0))
     frames = made.take(0)
     assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
     assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
@@ -140,14 +141,6 @@ def test_the_same_commands_give_the_same_frames():
     assert frames != run_of(2)[0]
     angles = [s["angle"] for s in only(frames[49], Opcode.JOINT_STATE)]
     assert angles == pytest.approx([0.3] * 4, abs=0.01)
-
-
-def test_set_points_act_from_the_sync_after_them():
-    host = Host(chain())
-    host.arm()
-    host.tick(2.0, Mode.TORQUE)
-    assert only(host.tick(2.0, Mode.TORQUE), Opcode.JOINT_STATE)[0]["torque"] == 0.0
-    assert only(host.tick(2.0, Mode.TORQUE), Opcode.JOINT_STATE)[0]["torque"] > 1.0
 
 
 def test_the_watchdog_ends_within_the_step_in_stepped_time_too():

@@ -15,12 +15,6 @@ def ask(module, *request, **given):
     return Result(int(answer["result"])), answer["value"]
 
 
-def test_what_is_written_is_in_force_and_read_back():
-    module = booted()
-    assert ask(module, Parameter.STIFFNESS, 60.0) == (Result.DONE, 60.0)
-    assert ask(module, Parameter.STIFFNESS, operation=Operation.READ) == (Result.DONE, 60.0)
-
-
 @pytest.mark.parametrize("index", [p for p, r in PARAMETERS.items() if r.writable])
 def test_both_ends_of_every_range_can_be_written_in_single_precision(index):
     module = booted()

@@ -8,13 +8,14 @@ from contextlib import contextmanager
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire, wait
+from snakesim_can_backend.protocol.commands import command, sync
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import InProcessTwins, TwinServer
 from snakesim_hal.drivers.mocap_twin import PoseSender
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.can_backend.twin.rig import chain, command, only, set_point, sync
+from tests.unit.can_backend.twin.rig import chain, only, set_point
 
 Wall = tuple[VirtualWire, TwinServer, Callable[[float], list[Frame]]]
 JOINTS = 4
@@ -46,7 +47,7 @@ def served(made: ModuleChain) -> Iterator[Wall]:
 
 
 def send_tick(near: VirtualWire, tick: int) -> None:
-    near.send(sync(tick))
+    near.send(sync(tick, 0))
     for node in range(1, JOINTS + 1):
         near.send(set_point(tick, Mode.POSITION, 0.2, node=node))
 
@@ -102,7 +103,7 @@ def test_stepped_twins_run_when_the_host_has_nothing_to_do():
         assert wait([near], 1.0), "their first heartbeats"
         near.receive()
         assert not wait([near], 1.0), "nothing can come before something is sent"
-        near.send(sync(0))
+        near.send(sync(0, 0))
         assert wait([near], 1.0)
         assert len(only(near.receive(), Opcode.JOINT_STATE)) == JOINTS
     finally:

@@ -8,8 +8,8 @@ from snakesim_can_backend.protocol.definitions import BROADCAST, Action, Frame, 
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.wire.messages import LifecycleState
+from tests.unit.can_backend.frames import read
 from tests.unit.can_backend.loop import Loop
-from tests.unit.can_backend.twin import rig
 
 ARMED, DISARMED, EMERGENCY = ModuleState.ARMED, ModuleState.DISARMED, ModuleState.EMERGENCY
 Which = Callable[[Frame], bool]
@@ -53,7 +53,7 @@ WIRES: list[RecordedWire] = []
 
 
 def is_action(frame: Frame, *actions: Action) -> bool:
-    return opcode_of(frame.id) == Opcode.COMMAND and rig.read(frame)["action"] in actions
+    return opcode_of(frame.id) == Opcode.COMMAND and read(frame)["action"] in actions
 
 
 def is_set_point(frame: Frame) -> bool:
@@ -67,7 +67,7 @@ def words(frames: list[Frame]) -> list[str]:
         opcode = Opcode(opcode_of(frame.id))
         if opcode == Opcode.COMMAND:
             who = "" if node_of(frame.id) == BROADCAST else f" {node_of(frame.id)}"
-            found.append(Action(int(rig.read(frame)["action"])).name.lower() + who)
+            found.append(Action(int(read(frame)["action"])).name.lower() + who)
         elif opcode == Opcode.EMERGENCY:
             found.append("emergency")
     return found

@@ -8,6 +8,7 @@ from snakesim_can_backend.driver import backend as backend_module
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.modules import answer_limit_s
+from snakesim_can_backend.protocol.commands import command, emergency
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     Action,
@@ -38,8 +39,8 @@ from tests.unit.can_backend.driver.whole.recorded import (
     module_of,
     words,
 )
+from tests.unit.can_backend.frames import read
 from tests.unit.can_backend.loop import JOINTS, config, loop
-from tests.unit.can_backend.twin import rig
 
 # --- opening -----------------------------------------------------------------------------------------------
 
@@ -73,9 +74,9 @@ def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch:
 def left_behind(module: Module, kind: str) -> None:
     """What a module is like whose driver was killed, or worse."""
     if kind == "emergency":
-        module.receive(rig.emergency(), 0.0)
+        module.receive(emergency(), 0.0)
         return
-    module.receive(rig.command(Action.ARM), 0.0)
+    module.receive(command(Action.ARM), 0.0)
     module._fail(ModuleFault.STREAM if kind == "stream" else ModuleFault.WATCHDOG, 0.0)
     if kind == "leak":  # after the watchdog had stopped it, water came, and went
         module.inside.leak = True
@@ -212,7 +213,7 @@ def test_a_period_has_one_sync_and_one_set_point_for_each_module() -> None:
             sent = go(run, "armed")
             assert [opcode_of(frame.id) for frame in sent] == [Opcode.SYNC, *[Opcode.SET_POINT] * JOINTS]
             assert [node_of(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
-        counts = [rig.read(f)["count"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
+        counts = [read(f)["count"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
         assert counts == [i % 256 for i in range(len(counts))]
-        times = [rig.read(f)["time"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
+        times = [read(f)["time"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
         assert np.diff(times[-20:]).tolist() == [10_000] * 19

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import pytest
 
+from snakesim_can_backend.protocol.commands import command
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     Action,
@@ -28,8 +29,8 @@ from tests.unit.can_backend.driver.whole.recorded import (
     none,
     words,
 )
+from tests.unit.can_backend.frames import read
 from tests.unit.can_backend.loop import JOINTS, loop
-from tests.unit.can_backend.twin import rig
 
 # --- who may move ------------------------------------------------------------------------------------------
 
@@ -87,7 +88,7 @@ def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
     with loop() as run:
         go(run, "armed", 3)
         assert run.states() == [ARMED] * JOINTS
-        module_of(run, 2).receive(rig.command(Action.DISARM), 0.0)
+        module_of(run, 2).receive(command(Action.DISARM), 0.0)
         before = len(WIRES[0].sent)
         run.run(5)
         assert words(WIRES[0].sent[before:]) == ["stop"] and module_of(run, 2).state == DISARMED
@@ -133,7 +134,7 @@ def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
             before = len(WIRES[0].sent)
             run.run(1, lambda tick: SetPoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
             mine = [f for f in WIRES[0].sent[before:] if is_set_point(f) and node_of(f.id) == 2]
-            by_tick[tick] = [rig.read(frame) for frame in mine]
+            by_tick[tick] = [read(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
         assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)
         sent = {tick: frames[0] for tick, frames in by_tick.items() if frames}
