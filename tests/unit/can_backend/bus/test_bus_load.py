@@ -13,7 +13,6 @@ from snakesim_can_backend.bus.load import (
     MAX_EVERY,
     MAX_LOAD,
     Reports,
-    arithmetic,
     busiest_s,
     check_load,
     every,
@@ -91,12 +90,6 @@ def test_the_worst_case_is_nearly_met() -> None:
 
 
 # --- the sum -----------------------------------------------------------------------------------------------
-
-
-def test_the_sum_is_that_of_its_streams_by_hand() -> None:
-    per_s = 100 * 105 + 1300 * (115 + 135 + 135) + 100 * 135 + 65 * (125 + 125 + 85) + 130 * 135 + 26 * 125
-    assert load(13, Reports(100.0)) == pytest.approx(per_s / 1e6)
-    assert sum(s.bits_per_s for s in streams(13, Reports(100.0))) == pytest.approx(per_s)
 
 
 def test_what_is_not_reported_costs_nothing() -> None:
@@ -193,18 +186,6 @@ def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[
         assert changes, way
         found.append((config, msgspec.structs.replace(settings, **changes)))
     return found
-
-
-def test_18_joints_at_200_hz_are_refused_with_the_sum_and_ways_out() -> None:
-    config, settings = run_of(18, 200.0), CanSettings(channels=["can7"])
-    text = refusal(config, settings)
-    assert text is not None and text.startswith("18 joints at 200 Hz do not fit on can7:\n")
-    assert "\n".join(arithmetic(18, Reports(200.0, 2, 40))) in text
-    for words in ("SetPoint         3600 frames/s x 115 bits (6 bytes) =  41.4 %", "together 123.6 % of 1 Mbit/s"):
-        assert words in text
-    ways = ways_out(text, config, settings)
-    assert len(ways) == 2
-    assert [refusal(*way) for way in ways] == [None, None]
 
 
 def test_fewer_forces_are_suggested_when_that_is_enough() -> None:

@@ -1,6 +1,5 @@
 """Virtual buses within the process, and how one waits for frames."""
 
-import contextlib
 import math
 import socket
 import time
@@ -9,14 +8,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from snakesim_can_backend.bus import bus as wire_module
 from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
-from tests.unit.can_backend.bus.test_wire import can_frame
-
-# --- virtual buses, and waiting ----------------------------------------------------------------------------
 
 
 class End:
@@ -40,17 +35,15 @@ class End:
         self.closed = True
 
 
-class Readable:
-    """A wire whose file may be ready."""
+class OnSocket(VirtualWire):
+    """A bus that is waited for by a socket, as a kernel interface is."""
 
-    def __init__(self, file: socket.socket) -> None:
-        self.file = file
+    def __init__(self, source: socket.socket) -> None:
+        super().__init__(f"waits-{uuid.uuid4().hex}")
+        self.source = source
 
     def fileno(self) -> int | None:
-        return self.file.fileno()
-
-    def idle(self) -> float | None:
-        return math.inf
+        return self.source.fileno()
 
 
 @pytest.fixture
@@ -117,18 +110,19 @@ def test_wait_says_when_nothing_can_come(pair: tuple[VirtualWire, VirtualWire]) 
     assert not wait([near], 5.0) and took_s(began) < 1.0
 
 
-def test_wait_wakes_up_for_a_socket() -> None:
-    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with near, far, contextlib.ExitStack():
-        wires: list[wire_module.Wire] = [Readable(near)]  # pyright: ignore[reportAssignmentType]
+def test_wait_wakes_up_for_a_socket_and_tells_one_that_is_gone() -> None:
+    near, far = socket.socketpair()
+    with far:
+        wire = OnSocket(near)
         began = time.monotonic()
-        assert wait(wires, 0.05) and took_s(began) > 0.045
-        far.send(can_frame(1, b""))
+        assert wait([wire], 0.05) and took_s(began) > 0.045
+        far.send(b"!")
         began = time.monotonic()
-        assert wait(wires, 5.0) and took_s(began) < 1.0
-
-
-# --- what breaks -------------------------------------------------------------------------------------------
+        assert wait([wire], 5.0) and took_s(began) < 1.0
+        near.close()
+        with pytest.raises(BackendError, match=r"waits-\w+: cannot be waited for: "):
+            wait([wire], 0.0)
+        wire.close()
 
 
 def test_a_virtual_bus_that_is_gone_is_an_error_of_the_backend() -> None:
@@ -138,25 +132,3 @@ def test_a_virtual_bus_that_is_gone_is_an_error_of_the_backend() -> None:
         wire.send(Frame(0x80, b"12345"))
     with pytest.raises(BackendError, match=r"gone-\w+: cannot receive: "):
         wire.receive()
-
-
-class OnSocket(VirtualWire):
-    """A bus that is waited for by a socket, as a kernel interface is."""
-
-    def __init__(self, source: socket.socket) -> None:
-        super().__init__(f"waits-{uuid.uuid4().hex}")
-        self.source = source
-
-    def fileno(self) -> int | None:
-        return self.source.fileno()
-
-
-def test_a_socket_that_cannot_be_waited_for_is_an_error_of_the_backend() -> None:
-    ours, other = socket.socketpair()
-    with other:
-        wire = OnSocket(ours)
-        assert wait([wire], 0.0)
-        ours.close()
-        with pytest.raises(BackendError, match=r"waits-\w+: cannot be waited for: "):
-            wait([wire], 0.0)
-        wire.close()

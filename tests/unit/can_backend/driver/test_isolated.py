@@ -213,13 +213,3 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
         robot.must_be_armed()
         assert robot.states()[FAILS] == ModuleState.DISARMED
         assert robot.chain.slots[FAILS].module.demand == PASSIVE
-
-
-def test_what_the_host_alone_finds_switches_the_module_off_too() -> None:
-    """A joint that is too hot for the HAL is healthy for its module."""
-    with lame_robot() as robot:
-        joints = robot.authority._isolation.mask(f"joint_{FAILS + 1}")
-        assert robot.authority._isolation.add(joints)
-        robot.wave(10)
-        robot.must_be_armed()
-        assert robot.states()[FAILS] != ModuleState.ARMED and all(robot.turning())

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_can_backend.driver import own_twins
-from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins, twins_here
+from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.injection import Injection
 from tests.harness.wait import wait_until
@@ -41,15 +40,6 @@ VCAN = ["vcan0"]
 def test_twins_that_cannot_be_are_refused(settings: CanSettings, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         check_twins(RUN, settings)
-
-
-def test_twins_here_are_at_the_other_end_of_the_named_bus() -> None:
-    end = twins_here(RUN, CanSettings(plant="inertia"), "own-twins-test", None, stepped=True)
-    try:
-        assert isinstance(end, InProcessTwins) and end.server.wires[0].channel == "own-twins-test"
-        assert end.server.chain.stepped and end.server.chain.count == 4
-    finally:
-        end.close()
 
 
 # --- the child ---------------------------------------------------------------------------------------------

@@ -27,18 +27,6 @@ from tests.unit.can_backend.frames import accelerometer, begin, contact, gyro, h
 # --- forces, IMUs, health ----------------------------------------------------------------------------------
 
 
-def test_forces_belong_to_the_link_in_front_and_the_tails_own_to_link_0() -> None:
-    made = reading()
-    begin(made, contacts=True, tail=True)
-    made.take(contact(1, made.sync, tail=True, force_x=1.0))
-    made.take(contact(1, made.sync, force_y=2.0, along=0.05))
-    made.take(contact(2, made.sync, touched=False, force_z=3.0))
-    made.take(contact(3, made.sync, force_z=4.0, bearing=0.0))
-    touched = made.links_touched()
-    assert [link for link, _ in touched] == [0, 1, 3]
-    assert [list(raw) for _, raw in touched] == [[20, 0, 0, 0, 0], [0, 40, 0, 100, 0], [0, 0, 80, 0, 0]]
-
-
 def test_forces_of_another_sync_do_not_count_and_old_ones_are_forgotten() -> None:
     made = reading()
     begin(made, contacts=True)
@@ -54,15 +42,6 @@ def test_forces_of_another_sync_do_not_count_and_old_ones_are_forgotten() -> Non
     assert made.links_touched() == []
 
 
-def test_an_imu_is_told_once_and_whole() -> None:
-    made = reading()
-    made.take(gyro(2, 7, 1.0))
-    assert made.imus() == []
-    made.take(accelerometer(2, 7, 9.81))
-    assert [(link, list(rates), list(force)) for link, rates, force in made.imus()] == [(2, [1000, 0, 0], [0, 0, 981])]
-    assert made.imus() == []
-
-
 def test_an_imus_halves_are_of_one_sync() -> None:
     made = reading()
     made.take(gyro(2, 7, 1.0))
@@ -71,14 +50,6 @@ def test_an_imus_halves_are_of_one_sync() -> None:
     made.take(gyro(2, 47, 2.0))
     made.take(accelerometer(2, 47, 9.81))
     assert [list(rates) for _, rates, _ in made.imus()] == [[2000, 0, 0]]
-
-
-def test_health_and_shaft_load_are_kept() -> None:
-    made = reading()
-    made.take(health(3, voltage=24.0, current=-1.0, motor_temperature=50, board_temperature=30, leak=1))
-    made.take(codec()[Opcode.SHAFT_LOAD].frame(2, torque=-1.5))
-    assert made.health() == [None, None, (24000, -1000, 90, 70, 1)]
-    assert made.shaft_raw == [None, -1500, None]
 
 
 # --- heartbeats --------------------------------------------------------------------------------------------

@@ -1,10 +1,8 @@
 """What the HAL publishes of the modules' frames, and what the twins make of a touch, there and back."""
 
 import math
-import socket
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,7 +21,7 @@ from snakesim_hal.drivers.mocap import MocapReceiver
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, Imu, Pose, Power
+from snakesim_hal.wire.messages import Contacts, Imu, Power
 from snakesim_hal.wire.quantities import Vector
 from tests.unit.can_backend.frames import accelerometer, answer, begin, contact, gyro, health, syncs
 from tests.unit.can_backend.loop import config
@@ -224,27 +222,6 @@ def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
     assert valid(150) == [False, True, False, False]
 
 
-def pose_at(stamp_ns: int) -> bytes:
-    still = b'"velocity_w":[0,0,0],"angular_velocity_w":[0,0,0]'
-    return b'{"stamp_ns":%d,"position_w":[1,2,3],"orientation_wxyz":[1,0,0,0],%s}' % (stamp_ns, still)
-
-
-def test_a_pose_is_told_once() -> None:
-    mocap = MocapReceiver("127.0.0.1:0", 0.0, clock=lambda stamp_ns: stamp_ns)
-    try:
-        reading, sensors = sensors_of(config(), mocap=mocap)
-        syncs(reading, 1)
-        assert keys.POSE not in sensors.sample(0, 0).others
-        host, _, port = mocap.address.rpartition(":")
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as camera:
-            camera.sendto(pose_at(20), (host, int(port)))
-        found = sensors.sample(1, 10).others[keys.POSE]
-        assert isinstance(found, Pose) and (found.tick, found.position_w) == (1, (1.0, 2.0, 3.0))
-        assert keys.POSE not in sensors.sample(2, 0).others
-    finally:
-        mocap.close()
-
-
 # --- what is described -------------------------------------------------------------------------------------
 
 
@@ -256,36 +233,3 @@ def test_sensors_are_described_with_their_rates() -> None:
     assert {s.key: s.delay_s for s in sensors if s.delay_s} == {keys.POSE: 0.02}
     bare = {s.key for s in described(run, Reports(100.0, 0, 0), pose_delay_s=None)}
     assert bare == {keys.JOINTS, keys.POWER}
-
-
-@pytest.mark.parametrize(("contact_every", "imu_every", "pose"), [(1, 20, True), (3, 0, False), (0, 5, False)])
-def test_what_is_described_is_what_is_delivered(contact_every: int, imu_every: int, pose: bool) -> None:
-    run = config(**EVERYTHING)
-    reports = Reports(100.0, contact_every, imu_every)
-    mocap = MocapReceiver("127.0.0.1:0", 0.0, clock=lambda stamp_ns: stamp_ns) if pose else None
-    reading, sensors = sensors_of(run, reports, mocap)
-    delivered: dict[str, int] = {}
-    ticks = 200
-    camera = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        for tick in range(ticks):
-            begin(reading, contacts=contacts_due(reports, tick))
-            answer(reading)
-            if imu_every and tick % imu_every == 0:
-                reading.take(gyro(1, tick, 0.0))
-                reading.take(accelerometer(1, tick, 0.0))
-            if mocap is not None:
-                host, _, port = mocap.address.rpartition(":")
-                camera.sendto(pose_at(tick * PERIOD_NS), (host, int(port)))
-            samples = sensors.sample(tick, tick * PERIOD_NS)
-            for key, message in {keys.JOINTS: samples.joints, **samples.others}.items():
-                delivered[key] = delivered.get(key, 0) + 1
-                assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=type(message)) == message
-    finally:
-        camera.close()
-        if mocap is not None:
-            mocap.close()
-    rates = {s.key: s.rate_hz for s in described(run, reports, pose_delay_s=0.0 if pose else None)}
-    assert set(delivered) == set(rates)
-    for key, count in delivered.items():
-        assert count == pytest.approx(rates[key] * ticks / 100.0, abs=1), key

@@ -17,7 +17,6 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.wire.messages import Mode
 
 DATABASE = load_database()
 TARGETS = ("position", "velocity", "torque")
@@ -102,16 +101,6 @@ def test_what_does_not_fit_is_refused_in_words(layout: Layout, signal: Signal, w
         assert part in str(caught.value)
 
 
-@given(any_signal, st.data())
-@often
-def test_a_raw_number_means_one_value_and_the_value_that_number(of: tuple[Layout, Signal], data: st.DataObject) -> None:
-    signal = of[1]
-    raw = data.draw(raw_numbers(signal))
-    value = signal.value(raw)
-    held = min(max(value, signal.low), signal.high)  # 32767 x 0.001 is a hair more than 32.767
-    assert abs(held - value) <= slack(signal, value) and signal.raw(held) == raw
-
-
 # --- against cantools --------------------------------------------------------------------------------------
 
 
@@ -168,12 +157,3 @@ def test_a_frame_of_another_length_is_refused(layout: Layout) -> None:
     for length in set(range(9)) - {layout.length}:
         with pytest.raises(CodecError, match=f"{layout.name} has {layout.length} bytes, this one {length}"):
             layout.values(bytes(length))
-
-
-def test_a_set_point_carries_the_target_of_its_mode_in_one_place() -> None:
-    signals = codec()[Opcode.SET_POINT].signals
-    assert len({(signals[name].shift, signals[name].bits, signals[name].signed) for name in TARGETS}) == 1
-    message = DATABASE.get_message_by_name("SetPoint")
-    for mode in (Mode.POSITION, Mode.VELOCITY, Mode.TORQUE):
-        signal = next(s for s in message.signals if s.name == mode.name.lower())
-        assert signal.multiplexer_ids == [int(mode)]

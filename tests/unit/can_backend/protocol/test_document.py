@@ -243,12 +243,6 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
 # --- pictures and neighbours -------------------------------------------------------------------------------
 
 
-def test_pictures_and_files_that_are_named_are_there() -> None:
-    here = Path(__file__).parents[4] / "docs"
-    for target in re.findall(r"\]\(([^)#:]+)\)", TEXT):
-        assert (here / target).exists(), target
-
-
 def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:
     lengths = {int(opcode): codec()[opcode].length for opcode in Opcode}
     for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):

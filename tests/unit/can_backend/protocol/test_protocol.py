@@ -14,7 +14,6 @@ from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     NODE_BITS,
     NODE_MASK,
-    PARAMETERS,
     WITH_CHECKSUM,
     Action,
     EmergencyReason,
@@ -29,8 +28,6 @@ from snakesim_can_backend.protocol.definitions import (
     checksum,
     frame_id,
     intact,
-    node_of,
-    opcode_of,
 )
 from snakesim_hal.wire.messages import Mode
 
@@ -100,17 +97,6 @@ def test_signals_of_a_message_do_not_overlap_but_for_the_targets_of_a_set_point(
             targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {"position", "velocity", "torque"}
             assert bool(shared) == targets, (opcode, a.name, b.name)
             assert (a.mask << a.shift).bit_length() <= 8 * layout.length
-
-
-def test_every_parameter_has_a_range_that_holds_zero_or_more() -> None:
-    assert set(PARAMETERS) == set(Parameter)
-    assert all(0 <= allowed.low < allowed.high and allowed.unit for allowed in PARAMETERS.values())
-
-
-@given(st.sampled_from(list(Opcode)), st.integers(0, NODE_MASK))
-def test_an_id_is_opcode_and_node(opcode: Opcode, node: int) -> None:
-    identifier = frame_id(opcode, node)
-    assert (opcode_of(identifier), node_of(identifier)) == (opcode, node)
 
 
 # --- checksum ----------------------------------------------------------------------------------------------
