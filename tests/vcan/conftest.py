@@ -1,6 +1,6 @@
 """Tests in this folder need a real SocketCAN bus, vcan0; they find its name in the fixture `channel`.
 
-RobotSelection there is none they are skipped, except in CI: a run there that met no bus has not tested what it says.
+Where there is none they are skipped, except in CI: a run there that met no bus has not tested what it says.
 """
 
 import os

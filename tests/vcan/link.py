@@ -6,10 +6,6 @@ import struct
 import subprocess
 
 FRAME = struct.Struct("=IB3x8s")  # can_id, length, data: linux/can.h
-# From linux/can/raw.h, linux/can/error.h and asm-generic/socket.h; Python's socket module lacks these names.
-CAN_RAW_ERR_FILTER = 2
-CAN_ERR_MASK = 0x1FFFFFFF
-SO_RXQ_OVFL = 40
 
 
 def ip(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -17,13 +17,12 @@ from snakesim_can_backend.protocol.definitions import COMMAND_KEY, Action, Frame
 pytestmark = pytest.mark.slow
 START_LIMIT_S, ANSWER_LIMIT_S = 90.0, 20.0  # an emulated machine is slow
 COMMAND = "snakesim_can_backend.twin.command"
-INERTIA = "snakesim_can_backend/twin/inertia.py:InertiaPlant"
 
 
 def started(channel: str, *arguments: str) -> subprocess.Popen[str]:
     parent = ["--parent", str(os.getpid())]
     process = subprocess.Popen(
-        [sys.executable, "-m", COMMAND, "triplet", "--channel", channel, "--plant", INERTIA, *parent, *arguments],
+        [sys.executable, "-m", COMMAND, "triplet", "--channel", channel, "--plant", "inertia", *parent, *arguments],
         stdout=subprocess.PIPE,
         text=True,
     )

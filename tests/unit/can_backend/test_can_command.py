@@ -7,12 +7,11 @@ from pathlib import Path
 import can
 import pytest
 
-from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.bus.bus import VirtualWire, message_of
 from snakesim_can_backend.bus.load import check_load, load, reports_at
 from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, opcode_of
-from snakesim_can_backend.protocol.expanded import expanded_dbc
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
@@ -74,13 +73,6 @@ def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureF
 
 
 # --- expand ------------------------------------------------------------------------------------------------
-
-
-def test_expand_writes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "all.dbc"
-    assert main(["expand", "--out", str(path)]) == 0
-    assert path.read_bytes() == expanded_dbc().encode("cp1252")
-    assert capsys.readouterr().out.strip() == str(path)
 
 
 def test_expand_needs_a_folder(tmp_path: Path) -> None:
@@ -173,7 +165,7 @@ def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.
         can.Message(arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False),
         can.Message(arbitration_id=0x1234567, data=bytes(8)),
         can.Message(arbitration_id=0x7FF, data=bytes(3), is_extended_id=False),
-        codec_message(codec()[Opcode.HEARTBEAT].frame(4, state=ModuleState.DISARMED)),
+        message_of(codec()[Opcode.HEARTBEAT].frame(4, state=ModuleState.DISARMED)),
     ]
     with can.Bus(interface="virtual", channel=channel) as bus:
         chatter = [bus.send_periodic(message, 0.01) for message in theirs]
@@ -194,7 +186,3 @@ def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.
     ):
         assert re.search(line, said), f"{line} is not in {said}"
     assert "0x1C4" not in said  # a heartbeat of ours
-
-
-def codec_message(frame: Frame) -> can.Message:
-    return can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)

@@ -176,11 +176,6 @@ def wrong_with(found: list[Identity], *, lockstep: bool = False) -> list[str]:
     return discovery_errors(two_buses(), found, NAMES, lockstep=lockstep)
 
 
-def test_a_whole_robot_is_not_objected_to() -> None:
-    assert wrong_with(GOOD) == []
-    assert wrong_with([replace(i, stepped=True) for i in GOOD], lockstep=True) == []
-
-
 @pytest.mark.parametrize(
     ("found", "words"),
     [
@@ -249,11 +244,6 @@ def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) ->
     assert {opcode_of(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
     read_only = [r["index"] for r in requests if r["operation"] == Operation.READ]
     assert set(read_only) == {Parameter.RATED_TORQUE, Parameter.RATED_SPEED} and len(requests) == 4 * len(Parameter)
-
-
-def test_only_the_nodes_asked_for_are_written(modules: Modules) -> None:
-    assert set(configure([modules.bus], {3: wanted()[3]}, 5.0)) == {3}
-    assert {node_of(frame.id) for frame in modules.heard} == {3}
 
 
 @pytest.mark.parametrize("way", ["to_modules", "to_host"])

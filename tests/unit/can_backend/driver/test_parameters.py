@@ -42,23 +42,6 @@ def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(n
             assert allowed.writable and allowed.low <= value <= allowed.high, parameter.name
 
 
-def test_values_are_those_of_the_robot_file_and_of_the_settings() -> None:
-    first = parameters_of(ROBOT, CanSettings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
-    assert first == {
-        Parameter.STIFFNESS: 60.0,
-        Parameter.DAMPING: 1.5,
-        Parameter.VELOCITY_GAIN: 1.5,
-        Parameter.TORQUE_LIMIT: 7.0,
-        Parameter.SPEED_LIMIT: 7.5,
-        Parameter.ANGLE_LIMIT: 1.5708,
-        Parameter.WATCHDOG: 0.05,
-        Parameter.SAFE_ACTION: SafeMotion.DAMP,
-        Parameter.CONTACT_EVERY: 3.0,
-        Parameter.IMU_EVERY: 17.0,
-        Parameter.TAIL: 1.0,
-    }
-
-
 def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
     own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
@@ -102,9 +85,13 @@ def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
 
 
 @pytest.mark.parametrize(("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)])
-def test_the_safe_action_is_the_robots(action: str, motion: SafeMotion) -> None:
+def test_the_safe_action_is_the_robots_the_watchdog_that_of_the_settings_and_reports_come_as_often_as_fits(
+    action: str, motion: SafeMotion
+) -> None:
     robot = changed("safety", action=action)
-    assert parameters_of(robot, CanSettings(), Reports(100.0))[1][Parameter.SAFE_ACTION] == motion
+    told = parameters_of(robot, CanSettings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
+    names = (Parameter.SAFE_ACTION, Parameter.WATCHDOG, Parameter.CONTACT_EVERY, Parameter.IMU_EVERY)
+    assert [told[name] for name in names] == [motion, 0.05, 3.0, 17.0]
     check_ratings(robot)
 
 
@@ -130,11 +117,6 @@ def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, 
         ConfigError, match=rf"planar13.*limits\.{field}` = .* {unit} exceeds the range of the bus protocol"
     ):
         check_ratings(changed("limits", **{field: most * 1.001}))
-
-
-def test_modules_that_can_do_what_the_robot_asks_for_are_taken() -> None:
-    check_ratings(ROBOT, rated(7.0, 7.5))
-    check_ratings(ROBOT, rated(9.0, 9.0))
 
 
 @pytest.mark.parametrize(

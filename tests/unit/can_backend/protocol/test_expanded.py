@@ -11,6 +11,7 @@ from cantools.database.can import Database, Message
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire
+from snakesim_can_backend.can_command import main
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.codec import codec, load_database
 from snakesim_can_backend.protocol.definitions import (
@@ -22,10 +23,8 @@ from snakesim_can_backend.protocol.definitions import (
     Frame,
     ModuleState,
     Opcode,
-    Operation,
-    Parameter,
 )
-from snakesim_can_backend.protocol.expanded import expanded_dbc, nodes_of
+from snakesim_can_backend.protocol.expanded import nodes_of
 from snakesim_hal.wire.messages import Mode
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
@@ -35,7 +34,7 @@ EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
 def expanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file, as `snakesim can expand` writes it."""
     path = tmp_path_factory.mktemp("dbc") / "expanded.dbc"
-    path.write_bytes(expanded_dbc().encode("cp1252"))
+    assert main(["expand", "--out", str(path)]) == 0
     return path
 
 
@@ -81,9 +80,6 @@ def sent() -> list[tuple[Frame, str]]:
     state = layouts[Opcode.JOINT_STATE].frame(
         62, angle=1.0, velocity=-2.0, torque=0.5, count=3, state=ModuleState.ARMED, derated=1
     )
-    request = layouts[Opcode.PARAMETER_REQUEST].frame(
-        13, index=Parameter.STIFFNESS, operation=Operation.WRITE, value=60.0
-    )
     return [
         (commands.emergency(), "Emergency(reason: host)"),
         (commands.command(Action.ARM), "Command(action: arm, key: 23214, checksum: 50)"),
@@ -91,13 +87,6 @@ def sent() -> list[tuple[Frame, str]]:
         (commands.sync(200, 12345678), "Sync(count: 200, time: 12345678 us)"),
         (set_point, "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m"),
         (state, "JointState_62(angle: 1.0 rad, velocity: -2.0 rad/s, torque: 0.5 N.m, count: 3, state: armed"),
-        (
-            layouts[Opcode.TAIL_CONTACT].frame(1, force_y=-3.5, touched=1),
-            "TailContact_01(force_x: 0.0 N, force_y: -3.5 N",
-        ),
-        (layouts[Opcode.HEARTBEAT].frame(9, fault_leak=1, uptime=2.5), "Heartbeat_09(state: boot"),
-        (layouts[Opcode.HEALTH].frame(9, voltage=24.0), "Health_09(voltage: 24.0 V"),
-        (request, "ParameterRequest_13(index: stiffness, operation: write, value: 60.0)"),
     ]
 
 
