@@ -11,12 +11,13 @@ from snakesim_can_backend.bus.bus import VirtualWire, message_of
 from snakesim_can_backend.bus.load import check_load, load, reports_at
 from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
 from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, opcode_of
+from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
+from tests.unit.can_backend.frames import health, heartbeat
 
 TRIPLET = load_scenario("triplet").config
 
@@ -84,65 +85,44 @@ def test_expand_needs_a_folder(tmp_path: Path) -> None:
 # --- scan --------------------------------------------------------------------------------------------------
 
 
-class Bystanders:
-    """The other end of a virtual bus: modules that answer to identify, and say now and then how they are."""
-
-    def __init__(self, channel: str, modules: list[tuple[int, int]], chatter: list[Frame]) -> None:
-        self.wire = VirtualWire(channel)
-        self.modules, self.chatter = modules, chatter
-        self.heard: list[Frame] = []
-
-    def __call__(self) -> None:
-        identity, command = codec()[Opcode.IDENTITY], codec()[Opcode.COMMAND]
-        for frame in self.wire.receive():
-            self.heard.append(frame)
-            if opcode_of(frame.id) == Opcode.COMMAND and command.values(frame.data)["action"] == Action.IDENTIFY:
-                for node, serial in self.modules:
-                    self.wire.send(identity.frame(node, serial=serial, firmware_major=1, protocol=1, emulated=1))
-        for frame in self.chatter:
-            self.wire.send(frame)
-        self.chatter = []
-
-    def inject(self, injection: Injection, *, begins: bool) -> None:
-        raise NotImplementedError
-
-    def close(self) -> None:
-        self.wire.close()
+def identity(node: int, serial: int) -> Frame:
+    return codec()[Opcode.IDENTITY].frame(node, serial=serial, firmware_major=1, protocol=1, emulated=1)
 
 
-def scanned(modules: list[tuple[int, int]], chatter: list[Frame]) -> tuple[list[dict[str, str]], list[Frame]]:
+def scanned(*said: Frame) -> tuple[list[dict[str, str]], list[Frame]]:
+    """What a scan makes of the frames on a bus, and what it sends."""
     channel = f"scan-{uuid.uuid4().hex[:8]}"
-    others = Bystanders(channel, modules, chatter)
-    wire = VirtualWire(channel, others)
-    try:
-        return scan(wire, 0.25), others.heard
-    finally:
-        wire.close()
+    wire, others = VirtualWire(channel), VirtualWire(channel)
+    for frame in said:
+        others.send(frame)
+    rows = scan(wire, 0.25)
+    heard = others.receive()
+    wire.close()
+    others.close()
+    return rows, heard
 
 
 def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
-    layouts = codec()
-    chatter = [
-        layouts[Opcode.HEARTBEAT].frame(3, state=ModuleState.FAULT, fault_leak=1, fault_voltage=1, uptime=12.34),
-        layouts[Opcode.HEALTH].frame(3, voltage=23.9, motor_temperature=41, board_temperature=33),
-        layouts[Opcode.SHAFT_LOAD].frame(3, torque=-1.25),
-        layouts[Opcode.HEARTBEAT].frame(62, state=ModuleState.DISARMED, uptime=1.0),
-    ]
-    rows, heard = scanned([(62, 0xBEEF), (3, 0xCAFE), (3, 0xF00D)], chatter)
+    rows, heard = scanned(
+        *(identity(node, serial) for node, serial in ((62, 0xBEEF), (3, 0xCAFE), (3, 0xF00D))),
+        heartbeat(3, 12.34, ModuleState.FAULT, fault_leak=1, fault_voltage=1),
+        health(3, voltage=23.9, motor_temperature=41, board_temperature=33),
+        codec()[Opcode.SHAFT_LOAD].frame(3, torque=-1.25),
+        heartbeat(62, 1.0),
+    )
     assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
     assert rows[0]["state"] == "fault" and rows[0]["faults"] == "leak+voltage" and rows[0]["uptime"] == "12.3 s"
     assert (rows[0]["voltage"], rows[0]["motor"], rows[0]["board"]) == ("23.9 V", "41 °C", "33 °C")
     assert rows[0]["shaft"] == "-1.250 N·m" and rows[0]["emulated"] == "yes" and rows[0]["firmware"] == "1.0"
     assert rows[2]["state"] == "disarmed" and rows[2]["faults"] == "none"
     assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
-    assert heard and {frame.data[0] for frame in heard} == {Action.IDENTIFY}
-    assert {opcode_of(frame.id) for frame in heard} == {Opcode.COMMAND}
+    assert heard and set(heard) == {command(Action.IDENTIFY)}
     heading, *lines = aligned(rows)
     assert heading.split() == list(COLUMNS) and len(lines) == 3
 
 
 def test_a_module_that_only_says_who_it_is_has_nothing_made_up() -> None:
-    rows, _ = scanned([(5, 1), (0, 2), (63, 3)], [])
+    rows, _ = scanned(identity(5, 1), identity(0, 2), identity(63, 3))
     assert [row["node"] for row in rows] == ["0", "5", "63"]
     for row in rows:
         assert {row[name] for name in ("state", "faults", "uptime", "voltage", "motor", "shaft")} == {UNKNOWN}
@@ -165,7 +145,7 @@ def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.
         can.Message(arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False),
         can.Message(arbitration_id=0x1234567, data=bytes(8)),
         can.Message(arbitration_id=0x7FF, data=bytes(3), is_extended_id=False),
-        message_of(codec()[Opcode.HEARTBEAT].frame(4, state=ModuleState.DISARMED)),
+        message_of(heartbeat(4, 1.0)),
     ]
     with can.Bus(interface="virtual", channel=channel) as bus:
         chatter = [bus.send_periodic(message, 0.01) for message in theirs]

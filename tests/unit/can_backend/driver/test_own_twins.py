@@ -5,6 +5,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,83 +46,83 @@ def test_twins_that_cannot_be_are_refused(settings: CanSettings, words: str) -> 
 # --- the child ---------------------------------------------------------------------------------------------
 
 
-def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> Path:
-    """Instead of `snakesim modules` runs a program that notes its arguments and does as told; where it notes them."""
-    noted = tmp_path / "noted.json"
-    program = tmp_path / "python"
-    program.write_text(
-        f"#!{sys.executable}\n"
-        "import json, os, pathlib, signal, sys, time\n"
-        "config = pathlib.Path(sys.argv[3])\n"
-        f"noted = pathlib.Path({str(noted)!r})\n"
-        "noted.write_text(json.dumps({'arguments': sys.argv[1:], 'pid': os.getpid(), 'session': os.getsid(0),"
-        " 'config': json.loads(config.read_text())}))\n" + body
-    )
-    program.chmod(0o755)
-    monkeypatch.setattr(own_twins.sys, "executable", str(program))
-    return noted
+class Child:
+    """Instead of `snakesim modules` runs a program that notes how it was started, and does as told."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._noted, self._program = folder / "noted.json", folder / "python"
+        self._patch = monkeypatch
+
+    def does(self, *lines: str) -> None:
+        noting = "{'arguments': sys.argv[1:], 'pid': os.getpid(), 'session': os.getsid(0), 'config': config}"
+        self._program.write_text(
+            f"#!{sys.executable}\n"
+            "import json, os, pathlib, signal, sys, time\n"
+            "config = json.loads(pathlib.Path(sys.argv[3]).read_text())\n"
+            f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n" + "\n".join(lines)
+        )
+        self._program.chmod(0o755)
+        self._patch.setattr(own_twins.sys, "executable", str(self._program))
+
+    def noted(self) -> dict[str, Any]:
+        return json.loads(self._noted.read_text())
+
+    def must_be_gone(self) -> None:
+        """The process, and the configuration that was written for it."""
+        noted = self.noted()
+        with pytest.raises(ProcessLookupError):
+            os.kill(noted["pid"], 0)
+        assert not Path(noted["arguments"][2]).exists()
 
 
-def gone(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    return False
+@pytest.fixture
+def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Child:
+    return Child(tmp_path, monkeypatch)
 
 
-SERVE = "print('modules ready: 4 on vcan0', flush=True)\ntime.sleep(60)\n"
+READY, SERVE = "print('modules ready: 4 on vcan0', flush=True)", "time.sleep(60)"
+ON_VCAN = CanSettings(channels=VCAN, twins="process", plant="inertia")
 
 
-def test_a_child_is_told_everything_and_ends_when_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    end = "signal.signal(signal.SIGTERM, lambda *_: (print('last words', flush=True), sys.exit(0)))\n"
-    noted = child(tmp_path, monkeypatch, end + "print('a warning')\n" + SERVE)
+def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: pytest.CaptureFixture[str]) -> None:
+    end = "signal.signal(signal.SIGTERM, lambda *_: (print('last words', flush=True), sys.exit(0)))"
+    child.does(end, "print('a warning')", READY, SERVE)
     settings = CanSettings(channels=["vcan0", "vcan1"], twins="process", plant="inertia", faults=["mute:joint_1@2"])
     twins = TwinProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
-    reported = json.loads(noted.read_text())
-    arguments = reported["arguments"]
+    noted = child.noted()
+    arguments = noted["arguments"]
     assert arguments[:2] == ["-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
     assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
-    assert reported["session"] == reported["pid"], "Ctrl-C is not for it"
-    assert reported["config"]["backends"]["can"]["plant"] == "inertia"
-    assert reported["config"]["backends"]["can"]["faults"] == ["mute:joint_1@2"]
+    assert noted["session"] == noted["pid"], "Ctrl-C is not for it"
+    assert noted["config"]["backends"]["can"]["plant"] == "inertia"
+    assert noted["config"]["backends"]["can"]["faults"] == ["mute:joint_1@2"]
     twins.stop()
-    assert gone(reported["pid"]) and not Path(arguments[2]).exists()
+    child.must_be_gone()
     said = capsys.readouterr().err
     assert "a warning" in said and "last words" in said
 
 
-def test_without_a_camera_and_in_real_time_it_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noted = child(tmp_path, monkeypatch, SERVE)
-    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
-    twins.stop()
-    arguments = json.loads(noted.read_text())["arguments"]
-    assert arguments[arguments.index("--pose") + 1] == "none" and "--stepped" not in arguments
-
-
-def test_a_child_that_will_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_twins, "STOP_LIMIT_S", 0.2)
-    noted = child(tmp_path, monkeypatch, "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + SERVE)
-    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
+    child.does("signal.signal(signal.SIGTERM, signal.SIG_IGN)", READY, SERVE)
+    twins = TwinProcess(RUN, ON_VCAN, None, stepped=False)
     began = time.monotonic()
     twins.stop()
-    assert gone(json.loads(noted.read_text())["pid"]) and time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 5.0
+    child.must_be_gone()
 
 
-@pytest.mark.parametrize("ending", ["sys.exit(2)\n", "time.sleep(60)\n"])
+@pytest.mark.parametrize("ending", ["sys.exit(2)", SERVE])
 def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
-    ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ending: str, child: Child, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(own_twins, "START_LIMIT_S", 1.0)
-    noted = child(tmp_path, monkeypatch, "print('no such plant', flush=True)\n" + ending)
+    child.does("print('no such plant', flush=True)", ending)
     with pytest.raises(BackendError, match="the module twins did not start"):
-        TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
-    reported = json.loads(noted.read_text())
-    assert gone(reported["pid"]) and not Path(reported["arguments"][2]).exists()
+        TwinProcess(RUN, ON_VCAN, None, stepped=False)
+    child.must_be_gone()
     assert "no such plant" in capsys.readouterr().err
 
 
@@ -131,21 +132,23 @@ def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixtu
     assert "vcan77" in capsys.readouterr().err
 
 
-def test_a_child_that_ends_by_itself_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    child(tmp_path, monkeypatch, "print('modules ready: 4', flush=True)\ntime.sleep(0.3)\nsys.exit(3)\n")
-    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
+def test_a_child_that_ends_by_itself_is_noticed_even_when_its_log_is_gone(child: Child) -> None:
+    child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
+    twins = TwinProcess(RUN, ON_VCAN, None, stepped=False)
     assert twins.how_it_ended() is None
+    twins._said.unlink()
     wait_until(twins.how_it_ended, "the end of the child")
     assert twins.how_it_ended() == "the module twins have ended, with exit code 3"
     twins.stop()
 
 
-def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(child: Child, tmp_path: Path) -> None:
     heard = tmp_path / "heard"
-    listen = "print('modules ready: 4', flush=True)\nfor line in sys.stdin:\n    "
-    noted = child(tmp_path, monkeypatch, f"{listen}pathlib.Path({str(heard)!r}).open('a').write(line)\n")
-    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
-    assert "--interactive" in json.loads(noted.read_text())["arguments"]
+    child.does(READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)")
+    twins = TwinProcess(RUN, ON_VCAN, None, stepped=False)
+    arguments = child.noted()["arguments"]
+    assert "--interactive" in arguments and "--stepped" not in arguments
+    assert arguments[arguments.index("--pose") + 1] == "none"
     twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=True)
     twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=False)
     wait_until(lambda: heard.exists() and heard.read_text().endswith("off\n"), "the end told to the child")
@@ -161,12 +164,4 @@ def test_a_child_that_cannot_be_started_is_an_error_of_the_backend(
 ) -> None:
     monkeypatch.setattr(own_twins.sys, "executable", str(tmp_path / "no python"))
     with pytest.raises(BackendError, match=r"the module twins cannot be started: .*No such file"):
-        TwinProcess(RUN, CanSettings(channels=VCAN), None, stepped=True)
-
-
-def test_a_log_that_is_gone_keeps_no_child_from_ending(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    child(tmp_path, monkeypatch, "print('modules ready', flush=True)\ntime.sleep(60)\n")
-    twins = TwinProcess(RUN, CanSettings(channels=VCAN), None, stepped=True)
-    twins._said.unlink()
-    twins.stop()
-    assert twins.how_it_ended() is not None
+        TwinProcess(RUN, ON_VCAN, None, stepped=True)

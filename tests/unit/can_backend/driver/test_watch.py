@@ -43,20 +43,15 @@ WRONGS = [
     (doubled, 3, "duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id"),
     (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES + 1} frames within one period"),
 ]
-each_wrong = pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
 
 
-@each_wrong
-def test_it_is_named_in_time_with_joint_and_cause(speak: Speak, after: int, what: str, cause: str) -> None:
+@pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
+def test_it_is_named_in_time_with_joint_and_cause_once_and_again_after_a_clearing(
+    speak: Speak, after: int, what: str, cause: str
+) -> None:
     bench = Bench()
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
     assert bench.tick(speak) == [Finding(what, WHO + cause, 1, alone=what not in CONCERNS_ALL)]
-
-
-@each_wrong
-def test_it_is_told_once_and_again_after_a_clearing(speak: Speak, after: int, what: str, cause: str) -> None:
-    bench = Bench()
-    bench.ticks(after, speak)
     assert bench.ticks(40, speak) == []
     bench.clear()
     assert (what, 1) in said(bench.ticks(CLEAR_GRACE + 1, speak))
@@ -117,18 +112,13 @@ def test_a_restart_is_told_once_with_its_joint_and_what_it_lost() -> None:
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
 
 
-def test_who_has_not_its_parameters_is_told_when_the_robot_is_armed() -> None:
+def test_who_has_not_its_parameters_is_told_once_when_the_robot_is_armed_with_its_joint() -> None:
     bench = Bench()
-    steps: list[tuple[LifecycleState, list[tuple[str, int]]]] = [
-        ("disarmed", []),
-        ("armed", [("module_not_configured", 1)]),
-        ("armed", []),
-    ]
-    for lifecycle, reported in steps:
-        bench.lifecycle = lifecycle
-        begin(bench.reading)
-        answer(bench.reading)
-        assert said(bench.watch.look(bench.reading, bench.lifecycle, unconfigured={1})) == reported
+    assert bench.watch.look(bench.reading, "disarmed", unconfigured={1}) == []
+    assert bench.watch.look(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
+    (found,) = bench.watch.look(bench.reading, "armed", unconfigured={1})
+    assert said([found]) == [("module_not_configured", 1)] and not found.alone
+    assert bench.watch.look(bench.reading, "armed", unconfigured={1}) == []
 
 
 def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
@@ -172,14 +162,6 @@ def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
     bench.isolated = {1}
     (found,) = bench.ticks(9, emergency)
     assert found.what == "module_overheat" and not found.alone
-
-
-def test_a_joint_without_its_parameters_that_is_set_aside_is_no_news() -> None:
-    bench = Bench("armed")
-    reported = bench.watch.look(bench.reading, "armed", unconfigured={1}, isolated={1})
-    assert reported == []
-    (found,) = bench.watch.look(bench.reading, "armed", unconfigured={1})
-    assert found.what == "module_not_configured" and not found.alone
 
 
 def test_water_after_heat_is_told_again() -> None:

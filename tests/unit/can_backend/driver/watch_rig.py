@@ -23,10 +23,10 @@ def quiet(_reading: Reading) -> None:
 class Bench:
     """Ticks of a robot whose joint_2 does what a test wants; the others are well."""
 
-    def __init__(self, lifecycle: LifecycleState = "disarmed") -> None:
+    def __init__(self) -> None:
         self.reading = Reading(JOINTS)
         self.watch = Watch(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S)
-        self.lifecycle: LifecycleState = lifecycle
+        self.lifecycle: LifecycleState = "disarmed"
         self.state = ModuleState.DISARMED
         self.isolated: set[int] = set()
         self.ticks(3)
