@@ -291,11 +291,10 @@ def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> N
     check_interface("lo")
 
 
-def test_what_is_not_there_is_not_up() -> None:
+def test_an_interface_that_is_not_there_or_going_away_is_not_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert not is_up("nocan7")
-
-
-def test_an_interface_that_is_going_away_is_not_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "flags").write_text("")
     monkeypatch.setattr(wire_module, "Path", lambda *parts: tmp_path / parts[-1])
     assert not is_up("can0")

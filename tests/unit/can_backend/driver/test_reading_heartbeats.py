@@ -8,10 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.commands import command
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
-    Action,
     Frame,
     LastStop,
     ModuleState,
@@ -125,35 +123,11 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
     assert made.modules == before and made.health() == [None] * JOINTS
 
 
-def test_frames_are_counted_for_each_module_and_tick() -> None:
-    made = reading()
-    begin(made)
-    identity = codec()[Opcode.IDENTITY].frame(2, serial=1)
-    for frame in (joint_state(2, made.sync), heartbeat(2, 1.0), identity, Frame(heartbeat(2, 0.0).id, b"")):
-        made.take(frame)
-    assert [module.frames for module in made.modules] == [0, 4, 0]
-    begin(made)
-    assert made.modules[1].frames == 0
-
-
 def test_strangers_are_counted_by_node() -> None:
     made = reading()
     for node in (4, 4, LAST_NODE, 0):
         made.take(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
     assert made.strangers == {4: 2, LAST_NODE: 1, 0: 1} and not made.from_other_host
-
-
-def test_another_host_is_noticed_and_is_no_stranger() -> None:
-    made = reading()
-    made.take(codec()[Opcode.SYNC].frame(0, count=3))
-    made.take(codec()[Opcode.SET_POINT].frame(2))
-    made.take(codec()[Opcode.SET_POINT].frame(40))
-    made.take(Frame(frame_id(Opcode.EMERGENCY, 0), b""))
-    for node in (0, 2, 40):
-        made.take(command(Action.IDENTIFY, node))  # who merely asks who is there, commands nothing
-    assert made.from_other_host == {Opcode.SYNC: 1, Opcode.SET_POINT: 2, Opcode.EMERGENCY: 1} and not made.strangers
-    made.take(command(Action.STOP, 2))
-    assert made.from_other_host[Opcode.COMMAND] == 1
 
 
 # --- whatever comes ----------------------------------------------------------------------------------------

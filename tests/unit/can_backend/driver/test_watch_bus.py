@@ -76,6 +76,7 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
     [
         (codec()[Opcode.SYNC].frame(0), "second_host", "another program commands the modules"),
         (codec()[Opcode.SET_POINT].frame(2), "second_host", "end one of the two"),
+        (codec()[Opcode.SET_POINT].frame(40), "second_host", "end one of the two"),
         (codec()[Opcode.COMMAND].frame(2, action=Action.STOP), "second_host", "another program"),
         (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
     ],

@@ -30,16 +30,22 @@ from tests.unit.can_backend.driver.whole.recorded import (
     words,
 )
 from tests.unit.can_backend.frames import read
-from tests.unit.can_backend.loop import JOINTS, loop
+from tests.unit.can_backend.loop import JOINTS, cleared_and_armed_again, loop
 
 # --- who may move ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("lifecycle", "said", "state"),
-    [("disarmed", ["disarm"], DISARMED), ("fault", ["stop"], DISARMED), ("estop", ["emergency"], EMERGENCY)],
+    ("lifecycle", "said", "state", "cleared"),
+    [
+        ("disarmed", ["disarm"], DISARMED, []),
+        ("fault", ["stop"], DISARMED, ["clear"]),
+        ("estop", ["emergency"], EMERGENCY, ["clear"]),
+    ],
 )
-def test_only_an_armed_robot_gets_set_points(lifecycle: LifecycleState, said: list[str], state: ModuleState) -> None:
+def test_only_an_armed_robot_gets_set_points_and_what_stopped_it_stays_until_somebody_clears(
+    lifecycle: LifecycleState, said: list[str], state: ModuleState, cleared: list[str]
+) -> None:
     with loop() as run:
         run.arm()
         run.run(20, run.waving)
@@ -48,20 +54,8 @@ def test_only_an_armed_robot_gets_set_points(lifecycle: LifecycleState, said: li
         assert not any(map(is_set_point, sent))
         assert words(sent)[:1] == said and len(words(sent)) <= 3, "a word, and not all the time"
         assert run.states() == [state] * JOINTS and run.true_speed_rad_s[-1] < 0.05
-        assert run.faults == []
-
-
-def test_an_emergency_stays_in_the_modules_until_somebody_clears() -> None:
-    with loop() as run:
-        run.arm()
-        go(run, "estop", 30)
-        assert run.states() == [EMERGENCY] * JOINTS
-        assert words(go(run, "disarmed"))[0] == "clear"
-        go(run, "disarmed", 10)
-        assert run.states() == [DISARMED] * JOINTS and run.faults == []
-        run.wanted = None
-        run.arm()
-        run.run(20, run.waving)
+        assert words(go(run, "disarmed"))[:1] == cleared
+        cleared_and_armed_again(run)
         assert run.faults == []
 
 
