@@ -22,7 +22,7 @@ def test_every_module_is_there_and_answers_and_in_the_end_the_traffic_is_told(mo
     with can.Bus(interface="virtual", channel=channel) as bus:
         asking = bus.send_periodic(message_of(command(Action.IDENTIFY)), 0.1)
         where = ("--channel", f"virtual:{channel}", "--plant", "inertia", "--pose", "none")
-        assert main(["triplet", *where, "--duration", "1.5", "--stats", "--fault", "mute:joint_3@1"]) == 0
+        assert main(["triplet", *where, "--duration", "2", "--stats", "--fault", "leak:joint_3@0"]) == 0
         asking.stop()
         heard = defaultdict(set)
         while (message := bus.recv(0)) is not None:
@@ -36,7 +36,7 @@ def test_every_module_is_there_and_answers_and_in_the_end_the_traffic_is_told(mo
         r"load virtual:\S+ \d",
         r"% of 1 Mbit/s; longest",
         r"  identity  +\d+ frames",
-        "fault: 1.00 s mute:joint_3",
+        "fault: 0.00 s leak:joint_3",
     ):
         assert re.search(words, said), f"{words} is not in {said}"
 
