@@ -16,6 +16,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from snakesim_can_backend.can_command import COLUMNS
@@ -262,22 +263,10 @@ def uptimes_ms(heard: Sequence[Heard], node: int) -> list[tuple[int, float]]:
 
 
 def passed_for_module_ms(heard: Sequence[Heard], node: int, from_ns: int, to_ns: int) -> float:
-    """How long a stretch of the kernel's time took in a module's own; heartbeats give both."""
-    beats = uptimes_ms(heard, node)
-
-    def uptime_at(at_ns: int) -> float:
-        before, after = beats[0], beats[-1]
-        for beat in beats:
-            if beat[0] <= at_ns:
-                before = beat
-            else:
-                after = beat
-                break
-        if after[0] <= before[0]:
-            return before[1] + (at_ns - before[0]) / 1e6
-        return before[1] + (after[1] - before[1]) * (at_ns - before[0]) / (after[0] - before[0])
-
-    return uptime_at(to_ns) - uptime_at(from_ns)
+    """How long a stretch of the kernel's time took in a module's own; heartbeats around it give both."""
+    at_ns, uptime_ms = zip(*uptimes_ms(heard, node), strict=True)
+    from_ms, to_ms = np.interp([from_ns - at_ns[0], to_ns - at_ns[0]], [ns - at_ns[0] for ns in at_ns], uptime_ms)
+    return float(to_ms - from_ms)
 
 
 def all_armed(robot: Bench) -> tuple[subprocess.Popen[str], subprocess.Popen[str], Operator]:

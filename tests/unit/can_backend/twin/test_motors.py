@@ -77,11 +77,8 @@ def test_torque_fades_to_nothing_at_the_limit_of_speed_and_is_full_below_nine_te
         for _ in range(200):
             motors.step(REST, np.array([speed]))
         assert motors.torque_nm[0] == pytest.approx(torque, abs=1e-6)
-
-
-def test_passive_means_no_torque_beyond_the_limit_of_speed():
     motors, _ = motor()
-    assert motors.step(REST, np.array([3 * SPEED]))[0] == 0.0
+    assert motors.step(REST, np.array([3 * SPEED]))[0] == 0.0, "and none when passive"
 
 
 def test_position_mode_of_the_shipped_robot_is_stable_at_1_ms_and_arrives():
