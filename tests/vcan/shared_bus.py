@@ -88,9 +88,9 @@ class SharedBus(Loop):
 
 
 @contextmanager
-def shared_bus(channel: str, **dotted: object) -> Iterator[SharedBus]:
+def shared_bus(channel: str) -> Iterator[SharedBus]:
     """Open, and close at the end."""
-    run = config(pace="realtime", **dotted)
+    run = config(pace="realtime")
     settings = CanSettings(channels=[channel], plant="inertia")
     modules_end = SocketCanWire(channel, FROM_HOST)
     server = TwinServer(

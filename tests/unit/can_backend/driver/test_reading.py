@@ -1,11 +1,10 @@
 """What is taken of the modules' frames, and what is noticed of those that are not as they should be."""
 
-import numpy as np
 import pytest
 
 from snakesim_can_backend.driver.reports import LATE_SYNCS, Reading
 from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Frame, LastStop, ModuleState, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode
 from tests.unit.can_backend.frames import answer, begin, contact, joint_state, syncs
 
 JOINTS = 3
@@ -22,17 +21,6 @@ def angles(made: Reading) -> list[float]:
 
 
 # --- states ------------------------------------------------------------------------------------------------
-
-
-def test_joints_are_in_si_units_tail_to_head() -> None:
-    made = Reading(JOINTS)
-    begin(made)
-    for node in (3, 1, 2):
-        made.take(joint_state(node, 0, 0.1 * node, velocity=-node, torque=0.5 * node, state=ModuleState.ARMED))
-    expected = [[0.1, 0.2, 0.3], [-1.0, -2.0, -3.0], [0.5, 1.0, 1.5]]
-    assert made.joints().shape == (3, JOINTS) and np.allclose(made.joints(), expected)
-    assert [module.sync for module in made.modules] == [0, 0, 0] and made.complete
-    assert {module.state for module in made.modules} == {ModuleState.ARMED}
 
 
 def test_states_three_syncs_late_are_taken_and_those_of_four_have_a_wrong_count() -> None:
@@ -53,20 +41,6 @@ def test_an_older_state_never_replaces_a_newer_one() -> None:
     made.take(joint_state(2, made.sync - 1, -0.5))
     assert angles(made)[1] == pytest.approx(0.5) and made.modules[1].sync == made.sync
     assert made.modules[1].twice == 0, "late is not twice"
-
-
-def test_counts_go_round_and_syncs_do_not() -> None:
-    made = Reading(JOINTS)
-    syncs(made, 300)
-    assert made.sync == 299 and {module.sync for module in made.modules} == {299}
-    assert not any(module.wrong_counts or module.repeats for module in made.modules)
-
-
-def test_a_state_under_another_nodes_id_is_corrupt() -> None:
-    made = reading()
-    begin(made)
-    made.take(Frame(frame_id(Opcode.JOINT_STATE, 3), joint_state(2, made.sync, 0.9).data))
-    assert made.modules[2].corrupt == 1 and 0.9 not in angles(made)
 
 
 def test_two_answers_to_one_sync_are_counted_once_a_sync_and_in_a_row() -> None:

@@ -95,8 +95,8 @@ def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -
 class Host:
     """Ticks of a stepped chain with one bus: Sync, answers, set-points."""
 
-    def __init__(self, made: ModuleChain, period_us: int = 10_000) -> None:
-        self.chain, self.period_us, self.count = made, period_us, -1
+    def __init__(self, made: ModuleChain) -> None:
+        self.chain, self.count = made, -1
         made.take(0)
 
     def arm(self) -> None:
@@ -105,7 +105,7 @@ class Host:
 
     def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
         self.count += 1
-        self.chain.receive(0, sync(self.count, self.count * self.period_us))
+        self.chain.receive(0, sync(self.count, self.count * 10_000))
         frames = self.chain.take(0)
         if target is not None:
             for node in range(1, self.chain.count + 1):

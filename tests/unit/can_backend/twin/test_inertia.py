@@ -47,3 +47,8 @@ def test_a_whole_number_of_steps_makes_a_period():
     run = config(3, rate_hz=300)
     steps = run.period_ns * 1e-9 / InertiaPlant(run, InertiaSettings()).step_s
     assert steps == pytest.approx(4.0)
+
+
+def test_there_is_no_world():
+    made = plant()
+    assert made.loads() == [] and made.imu() is None and made.pose() is None
