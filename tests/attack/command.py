@@ -1,6 +1,5 @@
 """The `snakesim` command as anybody runs it, with a home of its own."""
 
-import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -15,7 +14,6 @@ STANDING = (
     *("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50"),
     *("--duration", "3600", "--stay"),
 )
-CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def _machine(home: Path) -> dict[str, str]:
@@ -36,6 +34,11 @@ def running(
 ) -> AbstractContextManager[Run]:
     """A run in the background, as `tests.harness.command.running` has it."""
     return command.running(home / name, *arguments, endpoint=endpoint, more=_machine(home), inside=inside)
+
+
+def steering(text: str) -> list[str]:
+    """What of it a terminal obeys or turns around, but for new lines."""
+    return [char for char in text if not char.isprintable() and char != "\n"]
 
 
 def address(endpoint: str) -> tuple[str, int]:

@@ -1,5 +1,6 @@
 """Queries and names that are too long, too deep, too many, or not for a terminal."""
 
+import json
 import random
 import time
 from collections.abc import Callable
@@ -9,14 +10,14 @@ from typing import Any
 import pytest
 import zenoh
 
-from tests.attack.command import CONTROL_CHARACTERS, running
+from tests.attack.command import running, steering
 from tests.attack.effort import effort
 from tests.attack.means import wire
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import NAMESPACE, Stranger
 from tests.harness.endpoint import free_endpoint
 
-EVIL = "\x1b[2J\x1b]0;evil\x07\r\nplanar13: armed - all is well\n\x9b31m"
+EVIL = "\x1b[2J\x1b]0;evil\x07\r\nplanar13: armed - all is well\n\x9b31m\u202e"
 STATUS_S = 20.0
 
 
@@ -77,11 +78,11 @@ def printed_safely(robot: Robot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
     for tool in (["status"], ["estop"], ["clear"]):
         ended = robot.run.tell(*tool)
-        assert not CONTROL_CHARACTERS.search(ended.said), f"snakesim {tool[0]} prints {ended.said!r}"
+        assert not steering(ended.said), f"snakesim {tool[0]} prints {ended.said!r}"
         lines = ended.said.splitlines()
         assert not any(line.startswith("planar13: armed - all is well") for line in lines), ended.said
     news = robot.run.said()[len(before) :]
-    assert not CONTROL_CHARACTERS.search(news), f"the run prints {news!r}"
+    assert not steering(news), f"the run prints {news!r}"
     assert not any(line.startswith("planar13: armed - all is well") for line in news.splitlines()), news
 
 
@@ -89,8 +90,11 @@ def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robo
     said = robot.run.said()
     with Stranger(robot.endpoint) as stranger:
         stranger.ask("hal/estop", {"who": EVIL})
-    robot.operator.until(lambda: robot.operator.lifecycle() in ("armed", "estop"), "an answer")
-    time.sleep(0.3)
+    robot.operator.until(lambda: robot.operator.lifecycle() == "estop", "the stop")
+    robot.run.wait_for("evil")
+    assert "evil" in robot.run.tell("status").out
+    echoed = robot.run.tell("echo", "hal/status", "--count", "1")
+    assert EVIL in json.loads(echoed.out)["message"]["why"] and not steering(echoed.said), echoed.said
     printed_safely(robot, said)
 
 

@@ -11,6 +11,7 @@ from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 
 BAD = """
+import ctypes
 import os
 import signal
 import sys
@@ -25,6 +26,7 @@ DEEDS = {
     "dies": lambda: os._exit(0),
     "hangs": lambda: time.sleep(1e6),
     "spins": lambda: [None for _ in iter(int, 1)],
+    "holds the interpreter": lambda: ctypes.PyDLL(None).sleep(1000),
     "spams": lambda: [print("x" * 100_000) for _ in iter(int, 1)],
     "stops": lambda: os.kill(os.getpid(), signal.SIGSTOP),
     "closes": lambda: os.closerange(3, 4096),

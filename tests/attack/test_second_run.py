@@ -1,5 +1,7 @@
 """A1, A14: a second run beside a robot that is not its own; and tools that must find every robot of a machine."""
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -31,11 +33,9 @@ def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
 
 
 @pytest.mark.parametrize("_time", TIMES)
-def test_a1_a_second_run_on_a_router_does_not_arm_the_robot_there(tmp_path: Path, _time: int) -> None:
-    with running(tmp_path, *STANDING, "--backend", "can", "--with-router") as first, joined(first) as operator:
-        operator.recover()
-        operator.stand_by()
-        stays_disarmed(operator, tmp_path, "--router", first.endpoint)
+def test_a1_a_second_run_on_a_router_does_not_arm_the_robot_there(routed: Robot, tmp_path: Path, _time: int) -> None:
+    routed.operator.stand_by()
+    stays_disarmed(routed.operator, tmp_path, "--router", routed.endpoint)
 
 
 def test_a1_a_second_run_at_the_same_endpoint_does_not_arm_the_robot_there(robot: Robot, tmp_path: Path) -> None:
@@ -58,19 +58,21 @@ def test_a1_a_second_run_at_the_endpoint_of_a_router_does_not_arm_the_robot_ther
         operator.recover()
 
 
-def test_a1_a_robot_that_only_seems_to_be_there_keeps_a_run_from_starting_and_no_more(tmp_path: Path) -> None:
-    with running(tmp_path, *STANDING, "--with-router") as first, joined(first) as operator:
-        with Stranger(first.endpoint, "mamba") as stranger:
-            stranger.seem_alive("alive/hal")
-            stranger.latch("hal/status", {**operator.status(), "robot": "mamba"})
-            stranger.latch("hal/description", {**operator.newest("hal/description"), "robot": "mamba"})
-            second = snakesim(
-                *(tmp_path, "run", *SHORT, "--set", 'robot="mamba"', "--router", first.endpoint),
-                *("--out", str(tmp_path / "second")),
-                limit_s=20.0,
-            )
-        assert second.code in (1, 2) and "mamba" in second.said, second.said
-        operator.recover()
+def test_a1_a_robot_that_only_seems_to_be_there_keeps_a_run_from_starting_and_no_more(
+    routed: Robot, tmp_path: Path
+) -> None:
+    operator = routed.operator
+    with Stranger(routed.endpoint, "mamba") as stranger:
+        stranger.seem_alive("alive/hal")
+        stranger.latch("hal/status", {**operator.status(), "robot": "mamba"})
+        stranger.latch("hal/description", {**operator.newest("hal/description"), "robot": "mamba"})
+        second = snakesim(
+            *(tmp_path, "run", *SHORT, "--set", 'robot="mamba"', "--router", routed.endpoint),
+            *("--out", str(tmp_path / "second")),
+            limit_s=20.0,
+        )
+    assert second.code in (1, 2) and "mamba" in second.said, second.said
+    operator.recover()
 
 
 @pytest.mark.parametrize("_time", TIMES)
@@ -94,11 +96,12 @@ def test_a14_a_stop_without_arguments_names_every_robot_of_the_machine_stopped_o
     ):
         is_armed(machine, one)
         is_armed(machine, two)
-        machine.freeze(two.part("host"))
+        frozen = two.part("host")
+        os.kill(frozen, signal.SIGSTOP)
         stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
         assert machine.lifecycles(one.endpoint) == ["estop"], stopped.said
         assert stopped.code == 1 and named(one, stopped.said) and named(two, stopped.said), stopped.said
-        machine.thaw()
+        os.kill(frozen, signal.SIGCONT)
         stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
         assert [machine.lifecycles(run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.said
         assert stopped.code == 0 and stopped.said.count("stopped") == 2, stopped.said

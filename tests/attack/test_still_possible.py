@@ -88,21 +88,15 @@ def test_a_forged_description_misleads_neither_host_nor_services(robot: Robot) -
     with Stranger(robot.endpoint) as stranger:
         publisher = stranger.latch("hal/description", forged)
         os.kill(robot.run.part("control"), signal.SIGKILL)  # so that a controller learns the robot again
-        over = threading.Event()
 
-        def repeat() -> None:
+        def repeat(over: threading.Event) -> None:
             while not over.wait(0.02):
                 publisher.put(wire.encode(forged))
 
-        thread = threading.Thread(target=repeat, daemon=True)
-        thread.start()
-        try:
+        with meanwhile(repeat):
             operator.until(lambda: operator.lifecycle() == "fault", "a stop")
             operator.recover(30.0)
             time.sleep(0.5)
-        finally:
-            over.set()
-            thread.join()
     rows = [heard.message for heard in operator.heard("hal/applied")]
     assert beyond_limits(about, rows) == []
 

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from tests.attack.command import CONTROL_CHARACTERS, snakesim
+from tests.attack.command import snakesim, steering
 from tests.attack.effort import FULL, effort
 from tests.attack.means import datagrams
 from tests.attack.means.floods import Flooder, flood, half_open
@@ -163,7 +163,7 @@ def test_a4_whoever_a_datagram_says_it_is_from_the_host_lives_and_prints_it_safe
     for who in (b"", b"\xff\xfe\x80", b"\x1b[2J\r\nplanar13: armed", b"x" * 65, b"x" * 60_000, "é".encode() * 64):
         datagrams.ask(robot.endpoint, datagrams.stop(who), 0.2)
     printed = robot.run.tell("status").said + robot.run.said()
-    assert not CONTROL_CHARACTERS.search(printed), printed
+    assert not steering(printed), printed
     assert "\nplanar13: armed" not in printed.partition("planar13: ")[2], printed
     assert datagrams.ask(robot.endpoint, datagrams.stop("after it"), 2.0) is not None, "no answer any more"
     robot.unharmed(before)

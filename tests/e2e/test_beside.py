@@ -5,45 +5,23 @@ from pathlib import Path
 
 import pytest
 
+from tests.attack.test_plugins import BAD
 from tests.e2e.command import run_to_summary, running, snakesim
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
+from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 
 BESIDE = ("--set", "services.control.place=host")
 # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
 REALTIME = ("triplet", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "60", *BESIDE)
-BAD = """
-import ctypes
-import os
-import time
-
-from snakesim_gnc.control.hold import Hold
-
-DEEDS = {
-    "raises": lambda: 1 / 0,
-    "hangs": lambda: time.sleep(1e6),
-    "spins": lambda: [None for _ in iter(int, 1)],
-    "holds the interpreter": lambda: ctypes.PyDLL(None).sleep(1000),
-    "ends the process": lambda: os._exit(0),
-}
-
-
-class Controller(Hold):
-    calls = 0
-
-    def update(self, view):
-        Controller.calls += 1
-        if Controller.calls == 30:
-            DEEDS["%s"]()
-        return super().update(view)
-"""
 
 
 def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
+    """As in a process of its own, and as in the one of all: test_in_process.py."""
     arguments = ("triplet", "--duration", "2", "--pace", "lockstep")
-    _, apart = run_to_summary(tmp_path / "apart", *arguments)
+    _, apart = command.run_to_summary(tmp_path / "apart", *arguments)
     ended, beside = run_to_summary(tmp_path / "beside", *arguments, *BESIDE)
     assert ended.code == 0 and beside.command_digest == apart.command_digest
 
@@ -52,9 +30,9 @@ def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
     ("backend", "deed", "words"),
     [
         pytest.param("sim", "raises", "update() raised ZeroDivisionError", marks=pytest.mark.slow),
-        ("can", "hangs", "lease of control expired"),
+        pytest.param("can", "hangs", "lease of control expired", marks=pytest.mark.slow),  # below, with --stay
         pytest.param("sim", "spins", "lease of control expired", marks=pytest.mark.slow),
-        ("can", "ends the process", "host ended with exit code 0"),
+        ("can", "dies", "host ended with exit code 0"),
     ],
 )
 def test_a_bad_controller_stops_its_robot(tmp_path: Path, backend: str, deed: str, words: str) -> None:

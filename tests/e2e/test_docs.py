@@ -18,19 +18,18 @@ from tests.e2e.documents import REPOSITORY, Section, sections
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
-TUTORIAL = [section for section in sections(REPOSITORY / "docs" / "tutorial.md") if section.has_commands]
+
+def typed_in(page: str) -> list[Section]:
+    """The sections of a page in which something is to be typed."""
+    return [section for section in sections(REPOSITORY / page) if section.has_commands]
+
+
+TUTORIAL, EVALUATION = typed_in("docs/tutorial.md"), typed_in("docs/evaluation.md")
 HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
-EVALUATION = [section for section in sections(REPOSITORY / "docs" / "evaluation.md") if section.has_commands]
-CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controllers.md") if section.has_commands]
-ROBOTS = [section for section in sections(REPOSITORY / "docs" / "robots.md") if section.has_commands]
-SCENES = [section for section in sections(REPOSITORY / "docs" / "scenes.md") if section.has_commands]
-LESSONS = [
-    section
-    for page in ("first-controller", "train", "your-robot", "your-sensor", "lab-tutorial")
-    for section in sections(REPOSITORY / "docs" / f"{page}.md")
-    if section.has_commands
-]
-README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
+CONTROLLERS, ROBOTS, SCENES = (typed_in(f"docs/{page}.md") for page in ("controllers", "robots", "scenes"))
+PAGES = ("first-controller", "train", "your-robot", "your-sensor", "lab-tutorial")
+LESSONS = [section for page in PAGES for section in typed_in(f"docs/{page}.md")]
+README = typed_in("README.md")
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
 needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")

@@ -49,17 +49,6 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
     assert told_later.code == 1 and "lease of control expired" in told_later.out
 
 
-def test_ctrl_c_ends_in_order_and_leaves_the_record(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
-        os.kill(run.process.pid, signal.SIGINT)
-        assert run.end() == 130
-        assert "report:" in run.said()
-    nothing_left(tmp_path / "run")
-    summary = msgspec.json.decode((tmp_path / "run" / SUMMARY).read_bytes(), type=RunSummary)
-    assert summary.ended == "interrupted" and summary.faults == [] and summary.ticks > 0
-
-
 @pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
 def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, pace: str) -> None:
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""

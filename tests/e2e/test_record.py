@@ -1,4 +1,4 @@
-"""What is on disk after anything: kills, full and read-only and slow disks, runs in one folder; and true exit codes."""
+"""What is on disk after anything: kills, full and read-only and slow disks; and true exit codes."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary, running, snakesim
+from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary, running
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -104,16 +104,6 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
     nothing_left(tmp_path / "run")
 
 
-def test_a_run_that_somebody_finishes_early_is_no_complete_run(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
-        with open_session(Link(run.endpoint, "planar13")) as stranger:
-            assert stranger.ask(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
-        assert run.end() == 1, run.said()
-    ended = summary_of(tmp_path / "run").ended
-    assert "finished on request" in ended and ended.endswith("of 30 s")
-
-
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
     with running(tmp_path / "run", *LONG, "--duration", "2") as run:
         run.wait_for(" s  ")
@@ -122,35 +112,6 @@ def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) ->
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
     assert "of 2 s" in ended and "the time was over before the requested armed time was reached" in ended
-
-
-# --- one folder, two runs --------------------------------------------------------------------------------------
-
-
-def test_a_second_run_in_the_folder_is_refused_and_the_first_keeps_its_stop(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--stay") as run:
-        run.wait_for(" s  ")
-        with open_session(Link(run.endpoint, "planar13")) as session:
-            assert session.ask(keys.ESTOP, EstopRequest(who="anna")).ok
-            before = {path.name for path in tmp_path.iterdir()}
-            second = snakesim("run", *SHORT, "--out", "run", "--endpoint", free_endpoint(), cwd=tmp_path)
-            assert second.code == 2 and f"process {run.process.pid}" in second.err, second.err
-            assert second.out == "" and second.err.count("\n") == 1
-            assert {path.name for path in tmp_path.iterdir()} == before
-            assert newest_status(session).lifecycle == "estop"
-        os.kill(run.process.pid, signal.SIGINT)
-        assert run.end() == 130
-    nothing_left(tmp_path / "run")
-
-
-def test_an_earlier_run_is_moved_aside_and_both_can_be_compared(tmp_path: Path) -> None:
-    runs = [command.run_to_summary(tmp_path / "run", *SHORT) for _ in range(2)]
-    assert all(ended.code == 0 for ended, _ in runs) and not (tmp_path / "run" / "run.lock").exists()
-    ended, summary = runs[-1]
-    assert ended.out.startswith(f"{tmp_path / 'run'} held an earlier run: moved to {tmp_path / 'run'}.")
-    folders = sorted(tmp_path.glob("run*"))
-    assert len(folders) == 2
-    assert [summary_of(folder).command_digest for folder in folders] == [summary.command_digest] * 2
 
 
 # --- the disk --------------------------------------------------------------------------------------------------
@@ -236,17 +197,6 @@ def test_a_read_only_folder_neither_ends_nor_changes_a_run(tmp_path: Path, diges
     ended, left = in_a_file_system(tmp_path, "size=1M", f"{prepare}; mount -o remount,ro .", *SHORT, *more)
     orderly(ended, left, code=3, warning="Read-only file system; the run goes on, but nothing of it is recorded")
     assert f"command digest        {digest[:16]}" in ended.out
-
-
-def test_a_limit_on_the_size_of_files_is_as_good_as_a_full_disk(tmp_path: Path, digest: str) -> None:
-    typed = [*SNAKESIM, "run", *SHORT, "--out", "run", "--endpoint", free_endpoint()]
-    limited = ["sh", "-c", 'ulimit -f 100; exec "$@"', "sh", *typed]  # blocks of 512 bytes
-    done = subprocess.run(
-        limited, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, timeout=90, check=False
-    )
-    orderly(Ended(done.returncode, done.stdout, done.stderr), tmp_path / "run", code=3, warning="File too large")
-    assert f"command digest        {digest[:16]}" in done.stdout
-    assert len(RunRecord.load(tmp_path / "run").time_s) > 20
 
 
 SLOW = '''

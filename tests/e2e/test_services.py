@@ -100,8 +100,7 @@ def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path
         assert said.startswith("sensor: waiting for the network")
 
 
-@pytest.mark.parametrize("way", ["recorded", "named", "flag", "other"])
-def test_a_service_that_a_recording_names_runs_only_when_its_user_says_so(home: Path, way: str) -> None:
+def test_a_service_that_a_recording_names_runs_only_when_its_user_says_so(home: Path) -> None:
     (home / "mine.py").write_text(
         "from pathlib import Path\n"
         "from snakesim_gnc.navigation.service import Navigation\n"
@@ -113,21 +112,20 @@ def test_a_service_that_a_recording_names_runs_only_when_its_user_says_so(home: 
     ended = in_process.snakesim(*begin, cwd=home)
     assert ended.code == 0, ended
     (home / "ran").unlink()
-    more = {
-        "recorded": ["--controller", "hold"],
-        "named": ["--set", f"{code}./mine.py:Mine"],
-        "flag": ["--run-recorded-code"],
-        "other": ["--set", f"{code}navigation"],
-    }[way]
     for other in (["info", "run"], ["report", "run"], ["export", "run", "--format", "csv"], ["compare", "run", "run"]):
         assert in_process.snakesim(*other, cwd=home).code == 0 and not (home / "ran").exists()
-    replayed = in_process.snakesim("replay", "run", "--control", *more, cwd=home)
-    assert (home / "ran").exists() == (way in ("named", "flag"))
-    if way == "recorded":
-        assert replayed.code == 2 and "the recording names './mine.py:Mine' as its service navigation" in replayed.err
-        assert "--run-recorded-code" in replayed.err and f"--set {code}./mine.py:Mine" in replayed.err
-    else:
+    refused = in_process.snakesim("replay", "run", "--control", "--controller", "hold", cwd=home)
+    assert refused.code == 2 and "the recording names './mine.py:Mine' as its service navigation" in refused.err
+    assert "--run-recorded-code" in refused.err and f"--set {code}./mine.py:Mine" in refused.err
+    for more, runs in (
+        (["--set", f"{code}navigation"], False),
+        (["--set", f"{code}./mine.py:Mine"], True),
+        (["--run-recorded-code"], True),
+    ):
+        replayed = in_process.snakesim("replay", "run", "--control", *more, cwd=home)
         assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+        assert (home / "ran").exists() == runs
+        (home / "ran").unlink(missing_ok=True)
 
 
 MALFORMED = {

@@ -170,31 +170,46 @@ def test_a_first_turn_keeps_nobody_waiting_on_a_busy_computer(tmp_path: Path) ->
     assert 0 < max(one.searched_nodes for one in seen) <= 0.2 * NODES_PER_S
 
 
-def test_an_operator_is_told_what_a_clock_that_stands_waits_for(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A robot on its way, whose processes wait for one another."""
+    out = tmp_path_factory.mktemp("lockstep") / "run"
+    with running(out, "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
+        run.wait_for("Locomoting")
+        yield run
+
+
+@contextlib.contextmanager
+def frozen(pid: int) -> Iterator[None]:
+    """A process, meanwhile."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def test_an_operator_is_told_what_a_clock_that_stands_waits_for(in_lockstep: Running, tmp_path: Path) -> None:
     """By the robot's own account; it has not gone."""
-    why = " waits for navigation's answer to tick "
-    with running(tmp_path / "run", "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
-        run.wait_for("Locomoting")
-        with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
-            operator.type(UP)
-            operator.shows("asked: +0.05 m/s")
-            states, found = session.reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
-            os.kill(run.part("navigation"), signal.SIGSTOP)
+    why, run = " waits for navigation's answer to tick ", in_lockstep
+    with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
+        operator.type(UP)
+        operator.shows("asked: +0.05 m/s")
+        states, found = session.reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
+
+        def told() -> bool:
+            found.extend(states.drain())
+            return any(one.state == "NotLocomoting" and why in one.reason for one in found)
+
+        with frozen(run.part("navigation")):
             operator.shows(why)
-
-            def told() -> bool:
-                found.extend(states.drain())
-                return any(one.state == "NotLocomoting" and why in one.reason for one in found)
-
             wait_until(told, "control to say so, too")
-            assert "PowerOff" not in {one.state for one in found}
+        assert "PowerOff" not in {one.state for one in found}
 
 
-def test_an_operator_is_told_that_the_robot_says_nothing_any_more(tmp_path: Path) -> None:
-    with running(tmp_path / "run", "peg_row", "--duration", "300") as run:
-        run.wait_for("Locomoting")
-        with at_the_keyboard(run, tmp_path) as operator:
-            operator.shows("armed: ")
-            os.kill(run.part("host"), signal.SIGSTOP)
+def test_an_operator_is_told_that_the_robot_says_nothing_any_more(in_lockstep: Running, tmp_path: Path) -> None:
+    with at_the_keyboard(in_lockstep, tmp_path) as operator:
+        operator.shows("armed: ")
+        with frozen(in_lockstep.part("host")):
             operator.shows("the robot has given no clock for ")
             operator.shows("s ago): ")  # before what may be cut off at the edge

@@ -12,9 +12,6 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import EstopRequest
 from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import SNAKESIM, Running, environment, run_to_summary, running, snakesim
 from tests.harness.endpoint import free_endpoint
@@ -35,29 +32,6 @@ def echoed(run: Running, folder: Path, key: str, count: int, *more: str) -> list
     lines = [json.loads(line) for line in ended.out.splitlines()]
     assert len(lines) == count and all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
     return lines
-
-
-NASTY = "\x1b[2J\x9b31mroot\u202e\r\nplanar13: disarmed\x07"
-
-
-def test_nothing_from_the_network_steers_the_terminal(tmp_path: Path) -> None:
-    """A stranger's name is part of what `status`, `echo` and the run itself print."""
-    arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--stay"]
-    with running(tmp_path / "run", *arguments) as run:
-        run.wait_for(" s  ")
-        with open_session(Link(run.endpoint, "planar13")) as session:
-            session.ask(keys.ESTOP, EstopRequest(who=NASTY[:64]))
-        run.wait_for("estop")
-        status = command.snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
-        assert "root" in status.out and "planar13: estop" in status.out
-        echo = command.snakesim("echo", "hal/status", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
-        assert "\x9b31mroot\u202e\r\n" in json.loads(echo.out)["message"]["why"]
-        os.kill(run.process.pid, signal.SIGINT)
-        assert run.end() == 130
-        for text in (status.out, echo.out, run.said()):
-            steering = [char for char in text if not char.isprintable() and char not in "\n"]
-            assert steering == [] and "\nplanar13: disarmed" not in text, text
-    nothing_left(tmp_path / "run")
 
 
 def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
@@ -180,11 +154,6 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         os.kill(run.process.pid, signal.SIGINT)
         assert run.end() == 130
     nothing_left(tmp_path / "run")
-
-
-def test_status_without_a_robot(tmp_path: Path) -> None:
-    ended = command.snakesim("status", "--endpoint", free_endpoint(), cwd=tmp_path)
-    assert ended.code == 1 and "no robot answers" in ended.out
 
 
 def test_run_over_a_router_of_ones_own(tmp_path: Path) -> None:

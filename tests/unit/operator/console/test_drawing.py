@@ -1,6 +1,7 @@
 """What is drawn is where the robot's kinematics put it."""
 
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,18 +12,29 @@ from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obs
 from snakesim_operator.console.drawing import LONGEST_M, M_PER_N, draw
 from snakesim_operator.console.polygon import force_polygon, push_point_table
 from snakesim_operator.console.snapshot import RobotSnapshot
-from tests.unit.hal.rig import description
+from tests.unit.hal.rig import description, state
 
 ROBOT = description()
 COUNT = len(ROBOT.joints)
 
 
 def joints(*angles_rad: float) -> JointState:
-    angles = [*angles_rad, *[0.0] * (COUNT - len(angles_rad))]
-    zero = [0.0] * COUNT
-    return JointState(
-        tick=1, stamp_ns=1, angle_rad=angles, velocity_rad_s=zero, torque_nm=zero, valid=[True] * COUNT,
-        age_ns=[0] * COUNT,
+    return state(ROBOT, [*angles_rad, *[0.0] * (COUNT - len(angles_rad))])
+
+
+def contact(
+    force_w: tuple[float, float, float], obstacle: str = "peg", *, x_m: float = 0.1, body_s_m: float = 0.1
+) -> WorldContact:
+    return WorldContact(
+        link=0, obstacle=obstacle, body_s_m=body_s_m, position_w=(x_m, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+        tangent_w=(1.0, 0.0, 0.0), force_w=force_w,
+    )  # fmt: skip
+
+
+def pushing(points: list[WorldContact], solved_n: list[float], **more: Any) -> ControlState:
+    return ControlState(
+        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
+        solved_force_n=solved_n, **more,
     )  # fmt: skip
 
 
@@ -51,15 +63,9 @@ def test_without_joints_there_is_nothing_to_draw():
 
 
 def test_forces_and_their_resultant():
-    contact = WorldContact(
-        link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-        tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 10.0, 0.0),
-    )  # fmt: skip
-    control = ControlState(
-        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", propulsion_joint=ROBOT.joints[-1].name,
-        push_points=[contact], solved_force_n=[20.0],
-    )  # fmt: skip
-    seen = world([contact, contact], [])
+    point = contact((0.0, 10.0, 0.0))
+    control = pushing([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
+    seen = world([point, point], [])
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=seen, control=control), None)
     assert drawing is not None and drawing.pushing == COUNT - 1 and drawing.pushed == {"peg"}
     spans = [arrows[:, 1] - arrows[:, 0] for arrows in (drawing.forces, drawing.resultant, drawing.solved)]
@@ -70,17 +76,8 @@ def test_forces_and_their_resultant():
 
 
 def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
-    points = [
-        WorldContact(
-            link=0, obstacle=peg, body_s_m=0.1, position_w=(x, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-            tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 10.0, 0.0),
-        )
-        for peg, x in (("felt", 0.1), ("clear", 0.3))
-    ]  # fmt: skip
-    control = ControlState(
-        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
-        solved_force_n=[20.0, 30.0], felt_force_n=[17.5, 0.0],
-    )  # fmt: skip
+    points = [contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))]
+    control = pushing(points, [20.0, 30.0], felt_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
     drawing = draw(snapshot, None)
     assert drawing is not None and drawing.pushed == {"felt"}
@@ -92,25 +89,17 @@ def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
 
 
 def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
-    contact = WorldContact(
-        link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-        tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 500.0, 0.0),
-    )  # fmt: skip
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([contact], [])), None)
+    point = contact((0.0, 500.0, 0.0))
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([point], [])), None)
     assert drawing is not None
     start, end = drawing.forces[0]
     assert end - start == pytest.approx([0.0, LONGEST_M, 0.0]) and start[2] > ROBOT.links[0].radius_m
-    assert drawing.contacts_w[0] == pytest.approx(contact.position_w)
+    assert drawing.contacts_w[0] == pytest.approx(point.position_w)
 
 
 def test_the_force_polygon_names_every_force_and_their_resultant():
-    def contact(body_s_m: float, x_n: float, y_n: float) -> WorldContact:
-        return WorldContact(
-            link=0, obstacle="<b>", body_s_m=body_s_m, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-            tangent_w=(1.0, 0.0, 0.0), force_w=(x_n, y_n, 0.0),
-        )  # fmt: skip
-
-    drawn = force_polygon(RobotSnapshot(robot=ROBOT, world=world([contact(0.3, 0.0, 4.0), contact(0.1, 3.0, 0.0)], [])))
+    later, first = (contact((*at_n, 0.0), "<b>", body_s_m=s_m) for s_m, at_n in ((0.3, (0.0, 4.0)), (0.1, (3.0, 0.0))))
+    drawn = force_polygon(RobotSnapshot(robot=ROBOT, world=world([later, first], [])))
     assert "resultant 5.0 N" in drawn
     assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
     assert "no contact force" in force_polygon(RobotSnapshot(robot=ROBOT, world=world([], [])))

@@ -2,24 +2,19 @@
 
 import pytest
 
-from snakesim_hal.wire.messages import ControlState, Obstacle, World, WorldContact
+from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.console.drawing import M_PER_N, draw
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
 from snakesim_operator.console_port import open_port
 from tests.unit.hal.rig import description
-from tests.unit.operator.console.test_drawing import joints, world
+from tests.unit.operator.console.test_drawing import contact, joints, pushing, world
 
 
 def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
-    point = WorldContact(
-        link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-        tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 10.0, 0.0),
-    )  # fmt: skip
-    control = ControlState(
-        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=[point], solved_force_n=[10.0]
-    )
+    point = contact((0.0, 10.0, 0.0))
+    control = pushing([point], [10.0])
     with page_server(open_port(None)) as (server, _):
         stage = Stage(server.scene, description(), None)
         for felt in ([], [point], []):
@@ -42,11 +37,7 @@ def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
     with page_server(open_port(None)) as (server, _):
         stage = Stage(server.scene, description(), None)
         for obstacles in (found, []):
-            world = World(
-                tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-                base_confidence=1.0, contacts=[], obstacles=obstacles,
-            )  # fmt: skip
-            drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world), None)
+            drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world([], obstacles)), None)
             assert drawing is not None
             stage.show(drawing)
             shown = [batch for name, batch in stage._shapes.items() if name.startswith("perceived")]

@@ -5,7 +5,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_operator.evaluate.card import card_of, compare, holm, mcnemar, text
+from snakesim_hal.errors import ConfigError
+from snakesim_operator.evaluate.card import CARD, card_of, compare, holm, mcnemar, read_card, text
 from snakesim_operator.evaluate.case import Outcome
 from snakesim_operator.evaluate.suite import Suite, cases_of
 
@@ -44,9 +45,6 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
 
 
 def test_a_card_on_disk_is_the_card(tmp_path: Path) -> None:
-    from snakesim_hal.errors import ConfigError
-    from snakesim_operator.evaluate.card import CARD, read_card
-
     suite = Suite(scenario="surveyed_clutter")
     cases = cases_of(suite, "here", ["hold"], 1, seed=1)
     card = card_of("mine", cases, {cases[0].id: Outcome(numbers={"crossed": False})})

@@ -1,6 +1,5 @@
 """Suite files: rows and cases that they stand for, and what a wrong one is told."""
 
-import sys
 from pathlib import Path
 
 import msgspec
@@ -11,7 +10,7 @@ from snakesim_hal.model.files import shipped
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
 from snakesim_operator.evaluate.case import Case
-from snakesim_operator.evaluate.suite import Suite, cases_of, read_suite, settings_of, spaced
+from snakesim_operator.evaluate.suite import Suite, cases_of, read_suite, settings_of
 
 ROWS = """
 scenario = "surveyed_clutter"
@@ -69,10 +68,6 @@ def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title
     assert len(cases_of(suite, source, suite.controllers[:1], 1, seed=1)) >= 1
-
-
-def test_a_range_has_both_its_ends() -> None:
-    assert spaced("0.05:0.2:4", "--vary") == [0.05, 0.1, 0.15, 0.2]
 
 
 @pytest.mark.parametrize(
@@ -138,14 +133,6 @@ def test_a_wrong_command_starts_nothing(
     assert main(arguments) in (1, 2)
     said = capsys.readouterr().err
     assert all(part in said for part in reported), said
-
-
-def test_without_the_extra_it_tells_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["evaluate", "clutter"]) == 2
-    assert "pip install 'snakesim[evaluate]'" in capsys.readouterr().err
 
 
 def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:

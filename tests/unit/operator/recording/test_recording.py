@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import random
 import resource
 import signal
 import subprocess
@@ -33,23 +32,12 @@ from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.tap import Tap
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.unit.hal.rig import description
-
-PERIOD_NS = 10_000_000
+from tests.unit.hal import rig
+from tests.unit.hal.rig import PERIOD_NS, description
 
 
 def clock(tick: int) -> Arrival:
-    message = Clock(
-        tick=tick,
-        stamp_ns=tick * PERIOD_NS,
-        period_ns=PERIOD_NS,
-        pace="lockstep",
-        lifecycle="armed",
-        arming=1,
-        lease_epoch=1,
-        newest={},
-    )
-    return Arrival(keys.CLOCK, encode(message), encoding_of(Clock), time.monotonic_ns())
+    return Arrival(keys.CLOCK, encode(rig.clock(tick)), encoding_of(Clock), time.monotonic_ns())
 
 
 class Whisker(OwnSample, frozen=True, kw_only=True):
@@ -134,20 +122,6 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
         assert len(stock) == kept
 
 
-@pytest.mark.parametrize("cut", [1, 20, 3000])
-def test_a_file_that_ends_in_the_middle_is_read_up_to_there(tmp_path: Path, cut: int) -> None:
-    recording = Recording(tmp_path / "a.mcap")
-    for tick in range(100):
-        recording.take(clock(tick))
-        if tick % 10 == 9:
-            recording.flush()
-    recording.close({})
-    whole = (tmp_path / "a.mcap").read_bytes()
-    (tmp_path / "a.mcap").write_bytes(whole[:-cut])
-    ticks = [one.time_ns // PERIOD_NS for one in RecordingReader(tmp_path / "a.mcap").messages()]
-    assert ticks == list(range(len(ticks))) and len(ticks) >= (100 if cut < 100 else 40)
-
-
 def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -166,31 +140,6 @@ def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: P
     reader = RecordingReader(tmp_path / "a.mcap")
     ticks = [one.time_ns // PERIOD_NS for one in reader.messages()]
     assert len(ticks) > 200 and ticks == list(range(len(ticks))) and not reader.losses.places and not reader.finished
-
-
-def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.mcap").write_text("nothing of the kind")
-    with pytest.raises(ConfigError, match=r"a\.mcap is not a recording"):
-        list(RecordingReader(tmp_path / "a.mcap").messages())
-
-
-def test_damage_anywhere_ends_the_reading_and_nothing_else(tmp_path: Path) -> None:
-    recording, chance = Recording(tmp_path / "a.mcap"), random.Random(1)
-    for tick in range(300):
-        recording.take(clock(tick))
-        if tick % 50 == 0:
-            recording.flush()
-    recording.close({"dropped": {}})
-    whole = (tmp_path / "a.mcap").read_bytes()
-    for _ in range(100):
-        corrupted = bytearray(whole)
-        for _ in range(chance.choice([1, 3, 20])):
-            corrupted[chance.randrange(len(corrupted))] = chance.randrange(256)
-        (tmp_path / "spoilt.mcap").write_bytes(corrupted)
-        with contextlib.suppress(ConfigError):
-            assert len(list(RecordingReader(tmp_path / "spoilt.mcap").messages())) <= 300
-            (tmp_path / "whole.mcap").unlink(missing_ok=True)
-            recover(tmp_path / "spoilt.mcap", tmp_path / "whole.mcap")
 
 
 def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,8 +169,9 @@ def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monk
 
 
 def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
+    """What is damaged: tests/whole/test_damaged_recordings.py."""
     (tmp_path / "bad.mcap").write_bytes(b"no recording at all")
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=r"bad\.mcap is not a recording"):
         recover(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
     assert not (tmp_path / "copy.mcap").exists()
 

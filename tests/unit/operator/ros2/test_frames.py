@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_of
-from snakesim_hal.wire.messages import JointState, Pose
 from snakesim_operator.ros2.frames import OPTICAL_IN_CAMERA, Frames, ros_name
 from snakesim_operator.ros2.messages import Transform
 from snakesim_operator.ros2.urdf import urdf_of
-from tests.unit.operator.ros2.rig import of_robot, resting
+from tests.unit.hal.rig import pose, state
+from tests.unit.operator.ros2.rig import of_robot
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -33,19 +33,11 @@ def test_the_tree_is_our_kinematics(name: str) -> None:
     frames = Frames(robot, "lab/")
     random = np.random.default_rng(3)
     angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
-    joints: JointState = resting(robot, angles)
     turned = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))
-    pose = Pose(
-        tick=0,
-        stamp_ns=0,
-        position_w=(1.0, 2.0, 0.05),
-        orientation_wxyz=turned,
-        velocity_w=(0, 0, 0),
-        angular_velocity_w=(0, 0, 0),
-    )
-    tree = [*frames.fixed, frames.of_base(pose), *frames.of_joints(joints)]
+    at = pose(position_w=(1.0, 2.0, 0.05), orientation_wxyz=turned)
+    tree = [*frames.fixed, frames.of_base(at), *frames.of_joints(state(robot, angles))]
     origins, rotations = link_frames(
-        pose.position_w,
+        at.position_w,
         rotation_from_quaternion(turned),
         angles,
         [joint.axis for joint in robot.joints],

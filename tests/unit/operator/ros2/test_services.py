@@ -2,18 +2,20 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from snakesim_hal.wire.messages import Clock, JointState, Mode
+from snakesim_hal.wire.messages import Clock, JointState, LifecycleState, Mode
 from snakesim_operator.ros2 import graph
 from snakesim_operator.ros2 import service_types as types
 from snakesim_operator.ros2.graph import NodeName, Topic, token_key
 from snakesim_operator.ros2.joint_commands import VALID_NS, JointTargets
 from snakesim_operator.ros2.parameters import NOT_SET, _descriptor, _value
 from snakesim_operator.tools.parameters import Parameter
-from tests.unit.operator.ros2.rig import of_robot, resting
+from tests.unit.hal import rig
+from tests.unit.operator.ros2.rig import of_robot
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 # From docs/design.md of ros2/rmw_zenoh.
@@ -81,19 +83,11 @@ class TestJointTargets:
         kind = "sensor_msgs/msg/JointState"
         return bytes(JAZZY.serialize_cdr(kinds[kind](header, names, *fields), kind))
 
-    def clock(self, stamp_ns: int, lifecycle: Any = "armed") -> Clock:
-        more: dict[str, Any] = {
-            "tick": 1,
-            "pace": "realtime",
-            "period_ns": 10_000_000,
-            "lease_epoch": 1,
-            "arming": 1,
-            "newest": {},
-        }
-        return Clock(stamp_ns=stamp_ns, lifecycle=lifecycle, **more)
+    def clock(self, stamp_ns: int, lifecycle: LifecycleState = "armed") -> Clock:
+        return msgspec.structs.replace(rig.clock(1), arming=1, stamp_ns=stamp_ns, lifecycle=lifecycle)
 
     def joints(self, angle_rad: float) -> JointState:
-        return resting(self.robot, [angle_rad] * len(self.robot.joints))
+        return rig.state(self.robot, angle_rad)
 
     def test_named_joints_follow_and_the_others_stay(self) -> None:
         targets = JointTargets(self.robot)

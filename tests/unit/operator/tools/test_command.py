@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.errors import RefusedError
-from snakesim_hal.network.session import Link, Question, open_session
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
 from snakesim_operator.tools import command, stop
@@ -37,20 +37,6 @@ def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
     imported = [line.rpartition("|")[2].strip() for line in ended.err.splitlines()]
     assert not {"numpy", "jinja2", "mujoco"} & set(imported)
     assert imported.index("snakesim_hal.network.stop_port") < imported.index("msgspec") < imported.index("zenoh")
-
-
-def test_an_impostor_that_answers_too_is_told() -> None:
-    with running(run_config()) as run, following(run.link, Follower()):
-        run.arm()
-        with open_session(run.link) as impostor:
-
-            def lie(question: Question) -> None:
-                question.reply(Answer(ok=True, reason="done", lifecycle="disarmed", host=run.host.description.host))
-
-            impostor.on_question(keys.LIFECYCLE, lie)
-            with pytest.raises(RefusedError, match="2 answered in its name"):
-                command.disarm(RobotSelection(run.link.endpoint))
-        assert run.status.lifecycle == "disarmed"
 
 
 def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:

@@ -14,26 +14,13 @@ from snakesim_operator.tools.targets import RobotSelection
 from snakesim_operator.tools.top import TopRequest, table_of, top
 from snakesim_operator.tools.traffic import KEPT, MAX_KEYS, Traffic
 from tests.harness.endpoint import free_endpoint
-from tests.unit.hal.rig import command, description, state
+from tests.unit.hal.rig import clock, command, description, state
 
 MS = 1_000_000
 
 
 def arrival(key: str, message: Message, at_ms: float) -> Arrival:
     return Arrival(key, encode(message), encoding_of(type(message)), round(at_ms * MS))
-
-
-def clock(tick: int) -> Clock:
-    return Clock(
-        tick=tick,
-        stamp_ns=tick * 10 * MS,
-        period_ns=10 * MS,
-        pace="realtime",
-        lifecycle="armed",
-        arming=1,
-        lease_epoch=1,
-        newest={},
-    )
 
 
 def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:

@@ -16,6 +16,7 @@ from snakesim_operator.tools.teleop.command import Teleop, TeleopRequest
 from snakesim_operator.tools.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
+from tests.unit.hal.rig import clock
 
 
 @pytest.fixture(autouse=True)
@@ -28,19 +29,6 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def clock(tick: int) -> Clock:
-    return Clock(
-        tick=tick,
-        stamp_ns=tick * 10_000_000,
-        period_ns=10_000_000,
-        pace="realtime",
-        lifecycle="armed",
-        arming=1,
-        lease_epoch=1,
-        newest={},
-    )
-
-
 def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFixture[str]) -> None:
     read, write = os.pipe()
     os.set_blocking(read, False)
@@ -51,7 +39,7 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
         def be_a_robot_and_a_hand() -> None:
             os.write(write, EVENT.pack(0, 0, EV_ABS, ABS_Y, 0))
             for tick in itertools.takewhile(lambda tick: tick < 60, itertools.count(1)):
-                clocks.put(clock(tick))
+                clocks.put(clock(tick, arming=1, pace="realtime"))
                 time.sleep(0.01)
             os.close(write)
 
