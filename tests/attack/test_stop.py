@@ -11,7 +11,7 @@ import pytest
 from tests.attack.command import snakesim, steering
 from tests.attack.effort import FULL, effort
 from tests.attack.means import datagrams
-from tests.attack.means.floods import Flooder, flood, half_open
+from tests.attack.means.floods import flood, half_open
 from tests.attack.robot import Robot
 from tests.attack.stranger import HostTime
 from tests.harness.endpoint import free_endpoint
@@ -187,11 +187,3 @@ def test_a4_a_stop_keeps_trying_while_the_network_is_shut(robot: Robot) -> None:
         ended = robot.run.tell("estop")
         opens.join()
     assert robot.operator.stopped_at(asked_s, 1.0) and ended.code == 0, ended.said
-
-
-def test_a4_flooders_are_at_work(robot: Robot) -> None:
-    flooder = Flooder(robot.folder / "trial.said", "noise", robot.endpoint, 1000)
-    try:
-        flooder.is_ready()
-    finally:
-        flooder.kill()

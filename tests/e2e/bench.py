@@ -6,9 +6,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from snakesim_hal.model.files import SHIPPED
-from tests.e2e.command import SNAKESIM, environment, snakesim
+from tests.e2e.command import SNAKESIM, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 
 def lab_folder(folder: Path, joints: int, scenario: str, files: Mapping[str, str]) -> Path:

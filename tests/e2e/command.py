@@ -1,5 +1,8 @@
 """Drives the real `snakesim` command, and reads what it leaves."""
 
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
@@ -16,11 +19,33 @@ __all__ = [
     "TOO_SLOW",
     "Ended",
     "Running",
+    "armed_run",
+    "background",
     "environment",
     "run_to_summary",
     "running",
     "snakesim",
 ]
+
+
+@contextmanager
+def background(home: Path, *arguments: str, stdin: int | None = None) -> Iterator[subprocess.Popen[str]]:
+    """A command in the background, killed at the end."""
+    with subprocess.Popen(
+        [*SNAKESIM, *arguments], cwd=home, env=environment(home), stdin=stdin, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@contextmanager
+def armed_run(out: Path, *arguments: str) -> Iterator[Running]:
+    """A run in the background, once its first line of progress tells that it is armed."""
+    with running(out, *arguments) as run:
+        run.wait_for(" s  ")
+        yield run
 
 
 def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:

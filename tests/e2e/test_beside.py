@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.attack.test_plugins import BAD
-from tests.e2e.command import run_to_summary, running, snakesim
+from tests.e2e.command import run_to_summary, running
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
 from tests.whole import command
@@ -47,9 +47,9 @@ def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "hangs"))
     with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
         run.wait_for("lease of control expired")
-        stopped = snakesim("estop", "--endpoint", run.endpoint, cwd=tmp_path)
+        stopped = command.snakesim("estop", "--endpoint", run.endpoint, cwd=tmp_path)
         assert stopped.code == 0 and "planar13: stopped" in stopped.out, stopped.out + stopped.err
-        shown = snakesim("status", "--json", "--endpoint", run.endpoint, cwd=tmp_path)
+        shown = command.snakesim("status", "--json", "--endpoint", run.endpoint, cwd=tmp_path)
         assert "estop" in json.dumps(shown.out)
 
 
@@ -60,7 +60,7 @@ def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) ->
 
         def armed() -> bool:
             asked = (("clear",), ("arm", "planar13", "sim"))
-            return [snakesim(*one, "--endpoint", run.endpoint, cwd=tmp_path).code for one in asked][-1] == 0
+            return [command.snakesim(*one, "--endpoint", run.endpoint, cwd=tmp_path).code for one in asked][-1] == 0
 
         wait_until(armed, "a robot that is armed again")
 
@@ -74,5 +74,5 @@ def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) ->
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path: Path, given: tuple[str, ...], why: str) -> None:
-    ended = snakesim("run", "triplet", *given, cwd=tmp_path)
+    ended = command.snakesim("run", "triplet", *given, cwd=tmp_path)
     assert ended.code == 2 and why in ended.err, ended.err

@@ -2,8 +2,8 @@
 
 import json
 import subprocess
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,9 @@ from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
 from tests.contract.workbench import text_of_the_example
 from tests.e2e.bench import host, lab_folder
-from tests.e2e.command import SNAKESIM, environment, running, snakesim
+from tests.e2e.command import background, running
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 JOINTS = 4
 BACKEND = "./held.py:Held"
@@ -68,21 +69,9 @@ def robot(home: Path) -> RobotFile:
     return decode(read_part(str(home / "snake.toml"), "robots"), RobotFile)
 
 
-@contextmanager
-def told(home: Path, endpoint: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+def told(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
     """A command that somebody answers by moving joints and pressing Enter."""
-    with subprocess.Popen(
-        [*SNAKESIM, "joints", *words, "--endpoint", endpoint],
-        cwd=home,
-        env=environment(home),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+    return background(home, "joints", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
 
 
 def line(process: subprocess.Popen[str]) -> str:

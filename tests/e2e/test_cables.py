@@ -8,8 +8,8 @@ import pytest
 
 from tests.contract.workbench import text_of_the_example
 from tests.e2e.bench import host, lab_folder
-from tests.e2e.command import snakesim
 from tests.e2e.test_by_hand import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 TURN = 2 * math.pi

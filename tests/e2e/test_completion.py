@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.plugins import CONTROLLERS, installed
-from tests.e2e.command import snakesim
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 

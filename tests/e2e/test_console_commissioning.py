@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.bench import host
-from tests.e2e.command import SNAKESIM, environment, running, snakesim
+from tests.e2e.command import SNAKESIM, environment, running
 from tests.e2e.test_by_hand import robot
 from tests.e2e.test_checked import home
 from tests.e2e.test_console_keys import LIMIT_S, until
 from tests.e2e.test_jog import BACKEND, stopped, told
 from tests.e2e.test_jog import home as bench
 from tests.viewer import Viewer, viewing
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 RUN = (

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.command import SNAKESIM, Running, environment, running, snakesim
+from tests.e2e.command import SNAKESIM, Running, armed_run, environment
 from tests.e2e.documents import REPOSITORY
 from tests.e2e.test_teleop import UP, at_the_keyboard
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 RUN = ("clutter", "--pace", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
@@ -68,8 +69,7 @@ class Recording:
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two episodes of four: one was dropped, and of one nobody said what became of it."""
     home = tmp_path_factory.mktemp("demos")
-    with running(home / "run", *RUN) as run:
-        run.wait_for(" s  ")
+    with armed_run(home / "run", *RUN) as run:
         _demonstrate(run, home)
     return home
 

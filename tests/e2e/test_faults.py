@@ -1,14 +1,12 @@
 """Faults on request in runs of real processes: planned with a flag, asked for with the command, and refused."""
 
-import os
-import signal
 from pathlib import Path
 
 import pytest
 
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import Running, run_to_summary, running, snakesim
+from tests.e2e.command import Running, armed_run, run_to_summary, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -50,8 +48,7 @@ def ask(run: Running, *words: str):
 @pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
 def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--backend", backend]
-    with running(tmp_path / "run", *arguments) as run:
-        run.wait_for(" s  ")  # the first line of progress: armed
+    with armed_run(tmp_path / "run", *arguments) as run:
         result = ask(run, "leak", "joint_3") if backend == "sim" else ask(run, "diverge", "simulator")
         assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
         result = ask(run, "mute", "joint_99")
@@ -81,8 +78,7 @@ def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
         wait_until(lambda: what in operator("status").out, f"{what!r} in the status")
 
     arguments = ["triplet", "--controller", "hold", "--duration", "3600", "--stay", *MAY_LOSE_ONE]
-    with running(tmp_path / "run", *arguments) as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *arguments) as run:
         assert ask(run, "mute", "joint_3", "--for", "1").code == 0
         result("isolated: joint_3; passive until a clear")
         assert "armed, without joint_3: no valid and fresh state of joint_3" in operator("status").out
@@ -99,8 +95,7 @@ def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
         assert operator("arm", "planar13", "sim").code == 0
         status = operator("status").out
         assert "planar13: armed" in status and "isolated:" not in status, status
-        os.kill(run.process.pid, signal.SIGINT)
-        assert run.end() == 130
+        assert run.interrupt() == 130
     nothing_left(tmp_path / "run")
 
 
@@ -135,8 +130,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
     arguments += ["--pace", "realtime", "--unchecked"]
     loaded = [tmp_path / part for part in ("host", "control")]
-    with running(tmp_path / "run", *arguments, "--duration", "600") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
             result = ask(run, *words)
             assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err

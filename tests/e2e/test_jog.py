@@ -14,9 +14,10 @@ import pytest
 
 from tests.contract.workbench import text_of_the_example
 from tests.e2e.bench import host, lab_folder
-from tests.e2e.command import SNAKESIM, environment, snakesim
+from tests.e2e.command import background
 from tests.e2e.test_by_hand import JOINTS, SCENARIO
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 REPEAT_S = 0.03  # of a key
 TRIES = 4
@@ -51,19 +52,15 @@ def home(tmp_path: Path) -> Path:
 @contextmanager
 def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The command, once it is armed, and the other end of its terminal."""
-    ours, theirs = pty.openpty()
-    words = [*SNAKESIM, "joints", "jog", "snake.toml", "joint_2", "--endpoint", endpoint]
-    with subprocess.Popen(
-        words, cwd=home, env=environment(home), stdin=theirs, stdout=subprocess.PIPE, text=True
-    ) as process:
-        try:
+    (ours, theirs), words = pty.openpty(), ("joints", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
+    try:
+        with background(home, *words, stdin=theirs) as process:
             assert process.stdout is not None
             process.stdout.readline()  # "joint_2: from ...", once it is armed
             yield process, ours
-        finally:
-            process.kill()
-            os.close(ours)
-            os.close(theirs)
+    finally:
+        os.close(ours)
+        os.close(theirs)
 
 
 def told(home: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.host.latch import ESTOP
-from tests.e2e.command import Ended, Running, running
+from tests.e2e.command import Ended, Running, armed_run
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
 from tests.whole import command
@@ -21,11 +21,9 @@ LONG = ("triplet", "--controller", "hold", "--duration", "600", "--pace", "realt
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     out = tmp_path_factory.mktemp("operator") / "run"
-    with running(out, *LONG) as started:
-        started.wait_for(" s  ")
+    with armed_run(out, *LONG) as started:
         yield started
-        os.kill(started.process.pid, signal.SIGINT)
-        assert started.end() == 130, started.said()
+        assert started.interrupt() == 130, started.said()
     nothing_left(out)
 
 

@@ -19,6 +19,7 @@ from tests.e2e.command import environment, running
 from tests.e2e.command import snakesim as command
 from tests.e2e.documents import REPOSITORY
 from tests.harness.wait import wait_until
+from tests.whole import command as in_process
 
 pytestmark = pytest.mark.e2e
 
@@ -123,5 +124,5 @@ def test_a_lying_whisker_stops_the_robot_and_is_named(tmp_path: Path, robot: str
     whisker = tmp_path / "docs" / "whisker.py"
     late = "bend_rad=7.0 if tick > 30 else 0.0"
     whisker.write_text(whisker.read_text().replace(BENT, late))
-    done = command("run", "peg_row", "--set", robot, "--duration", "5", "--out", "run", cwd=tmp_path)
+    done = in_process.snakesim("run", "peg_row", "--in-process", "--set", robot, "--duration", "5", cwd=tmp_path)
     assert done.code != 0 and "sensor/own/left cannot be published: Whisker.bend_rad is 7.0" in done.said, done.said

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.process import user_name
-from tests.e2e.command import Ended, Running, running, snakesim
+from tests.e2e.command import Ended, Running, armed_run
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -15,8 +16,7 @@ LONG = ("peg_row", "--duration", "600", "--set", "rate_hz=50", "--pace", "realti
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    with running(tmp_path_factory.mktemp("param") / "run", *LONG) as started:
-        started.wait_for(" s  ")
+    with armed_run(tmp_path_factory.mktemp("param") / "run", *LONG) as started:
         yield started
 
 

@@ -78,7 +78,7 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     first = lab.host("never-armed")
     waited = lab.folder / "service-control.log"
     wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
-    lab.start("router", str(lab.router_file))
+    router = lab.start("router", str(lab.router_file))
     wait_until(lambda: "DIFFERS: `mission` is " in lab.tell("status").out, "the difference")
     refused = lab.tell("arm", "planar13", "sim").err
     assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
@@ -95,6 +95,8 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     _, alone = command.run_to_summary(lab.folder / "alone", *SCENARIO)
     record = msgspec.json.decode((lab.folder / "second" / "host.json").read_bytes(), type=HostRecord)
     assert record.command_digest == alone.command_digest
+    router.send_signal(signal.SIGINT)
+    assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 
 
 def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

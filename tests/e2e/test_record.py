@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary, running
+from tests.e2e.command import SNAKESIM, Ended, armed_run, environment, run_to_summary, running
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -50,8 +50,7 @@ def newest_status(session: Session) -> Status:
 
 
 def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 100, "two seconds")
             host, tick = run.part("host"), newest_status(session).tick
@@ -69,8 +68,7 @@ def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Pat
 
 
 def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 75, "one and a half seconds")
             tick = newest_status(session).tick
@@ -88,7 +86,7 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
 # --- complete, or not ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("when", ["starting", "armed"])
+@pytest.mark.parametrize("when", [pytest.param("starting", marks=pytest.mark.slow), "armed"])
 def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) -> None:
     with running(tmp_path / "run", *LONG) as run:
         run.wait_for("network:")
@@ -105,8 +103,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
 
 
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--duration", "2") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
         result = command.snakesim("disarm", "--endpoint", run.endpoint, cwd=tmp_path)
         assert result.code == 0, result.err
         assert run.end() == 1, run.said()
@@ -250,8 +247,7 @@ def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Pat
 
 @pytest.mark.slow
 def test_a_disk_that_hangs_delays_neither_ticks_nor_a_stop_nor_the_end(tmp_path: Path, hangs: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--stay") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--stay") as run:
         wait_until(lambda: (tmp_path / "run" / "host.json").is_file(), "the first numbers on disk")
         hangs.touch()
         with open_session(Link(run.endpoint, "planar13")) as session:

@@ -22,7 +22,7 @@ from snakesim_operator.playback.play import PlayRequest, play
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import SNAKESIM, environment, running
+from tests.e2e.command import SNAKESIM, armed_run, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -53,8 +53,7 @@ def sighted_live(address: str, origin: str | None = None) -> list[str]:
 
 
 def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG) as run:
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)
         typed = [*SNAKESIM, "record", "--endpoint", run.endpoint, "--out", "beside.mcap"]

@@ -11,7 +11,7 @@ import pytest
 import snakesim
 from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_operator.playback.info import inspect_recording
-from tests.e2e.command import Running, environment, running
+from tests.e2e.command import Running, armed_run, environment, running
 from tests.e2e.documents import REPOSITORY, sections
 from tests.harness.wait import wait_until
 
@@ -32,8 +32,7 @@ def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A robot with a controller of its own."""
-    with running(tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime") as started:
-        started.wait_for(" s  ")
+    with armed_run(tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime") as started:
         yield started
 
 

@@ -7,10 +7,8 @@ import json
 import os
 import signal
 import struct
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +21,10 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 from snakesim_hal.network.session import Link, Reader, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent, Trajectory
-from tests.e2e.command import SNAKESIM, environment, running, snakesim
+from tests.e2e.command import background, running
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -64,18 +63,6 @@ for _name, _texts in DEFINED.items():
         STORE.register({f"{_name}{_part}": _fields})
 ROUTER = '{mode: "router", listen: {endpoints: ["%s"]}, scouting: {multicast: {enabled: false}}}'
 RUN = ("clutter", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "rate_hz=50")
-
-
-@contextmanager
-def command(home: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A command in the background, killed at the end."""
-    with subprocess.Popen(
-        [*SNAKESIM, *arguments], cwd=home, env=environment(home), stdout=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.send_signal(signal.SIGKILL)
 
 
 def session_at(endpoint: str) -> zenoh.Session:
@@ -175,14 +162,14 @@ class RosSide:
 def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
     at = free_endpoint()
     (tmp_path / "ros.json5").write_text(ROUTER % at)
-    with running(tmp_path / "run", *RUN) as run, command(tmp_path, "router", "ros.json5") as router:
+    with running(tmp_path / "run", *RUN) as run, background(tmp_path, "router", "ros.json5") as router:
         run.wait_for(" s  ")
         refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", run.endpoint, cwd=tmp_path)
         assert refused.code == 2 and "itself is on this endpoint" in refused.err
         refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", cwd=tmp_path)
         assert refused.code != 0 and "has a controller already, which holds the lease" in refused.err
         bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
-        with session_at(at) as session, command(tmp_path, *bridge):
+        with session_at(at) as session, background(tmp_path, *bridge):
             _sees(RosSide(session))
             _steers(RosSide(session), run.endpoint)
             _tunes(RosSide(session))
@@ -198,9 +185,13 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
     (tmp_path / "ros.json5").write_text(ROUTER % at)
     late = ("run", "triplet", "--pace", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
     bridge = ("ros2", "--endpoint", endpoint, "--ros-router", at)
-    with command(tmp_path, "router", "ros.json5"), session_at(at) as session, command(tmp_path, *bridge) as waiting:
+    with (
+        background(tmp_path, "router", "ros.json5"),
+        session_at(at) as session,
+        background(tmp_path, *bridge) as waiting,
+    ):
         assert waiting.stdout is not None and "Waiting for it up to 60 s" in waiting.stdout.readline()
-        with command(tmp_path, *late):
+        with background(tmp_path, *late):
             ros = RosSide(session)
             ros.first("joint_states", "sensor_msgs/msg/JointState")
             assert ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)) is None
@@ -212,9 +203,9 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
     at = free_endpoint()
     (tmp_path / "ros.json5").write_text(ROUTER % at)
     alone = ("triplet", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "services.control.external=true")
-    with running(tmp_path / "run", *alone) as run, command(tmp_path, "router", "ros.json5"):
+    with running(tmp_path / "run", *alone) as run, background(tmp_path, "router", "ros.json5"):
         bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
-        with session_at(at) as session, command(tmp_path, *bridge):
+        with session_at(at) as session, background(tmp_path, *bridge):
             ros = RosSide(session)
             limp = ros.first("joint_states", "sensor_msgs/msg/JointState")
             ros.trigger("arm")

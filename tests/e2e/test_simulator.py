@@ -12,9 +12,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest, Status
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
-from tests.e2e.command import running, snakesim
+from tests.e2e.command import running
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 

@@ -14,9 +14,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import Running, running, snakesim
+from tests.e2e.command import Running, armed_run, running
 from tests.harness.processes import nothing_left, processes_of
 from tests.harness.wait import wait_until
+from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -52,8 +53,10 @@ class Robot:
     def tell(self, action: Literal["arm", "clear"]) -> Answer:
         robot = self._session.latest(keys.DESCRIPTION, Description, BACK_S)
         assert robot is not None
-        named = {"robot": robot.robot, "backend": robot.backend, "config_hash": robot.config_hash}
-        return self._session.ask(keys.LIFECYCLE, LifecycleRequest(action=action, **named))
+        request = LifecycleRequest(
+            action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+        )
+        return self._session.ask(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
         wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
@@ -76,16 +79,14 @@ def pids(run: Running, *names: str) -> dict[str, int]:
 
 
 def interrupt(run: Running) -> RunSummary:
-    os.kill(run.process.pid, signal.SIGINT)
-    assert run.end() == 130 and "report:" in run.said(), run.said()
+    assert run.interrupt() == 130 and "report:" in run.said(), run.said()
     nothing_left(run.out)
     return msgspec.json.decode((run.out / SUMMARY).read_bytes(), type=RunSummary)
 
 
 @pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
 def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str) -> None:
-    with running(tmp_path / "run", *LONG, "--pace", pace, "--stay") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--pace", pace, "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             first, services = robot.reaches("armed"), pids(run, *SERVICES)
@@ -103,8 +104,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str)
 
 
 def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot, before = Robot(session), run.part("control")
             os.kill(before, signal.SIGKILL)
@@ -124,8 +124,7 @@ def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_pat
 
 
 def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--stay", "--with-router") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--pace", "realtime", "--stay", "--with-router") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -145,16 +144,14 @@ def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: 
 
 
 def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1 and "guidance was ended by SIGKILL" in run.said()
     nothing_left(tmp_path / "run")
 
 
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import SNAKESIM, Running, environment, run_to_summary, running, snakesim
+from tests.e2e.command import SNAKESIM, Running, armed_run, environment, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -128,8 +128,7 @@ def first_line_ran(pid: int) -> bool:
 
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime"]
-    with running(tmp_path / "run", *arguments) as run:
-        run.wait_for(" s  ")
+    with armed_run(tmp_path / "run", *arguments) as run:
         rate = command.snakesim(
             "echo", "sensor/joints", "--hz", "--count", "2", "--endpoint", run.endpoint, cwd=tmp_path
         )
@@ -151,31 +150,8 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         assert wrong.code == 2 and "is not a key" in wrong.err and wrong.err.count("\n") == 1
         status = command.snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
         assert status.code == 0 and "planar13: armed" in status.out and "control, guidance, navigation" in status.out
-        os.kill(run.process.pid, signal.SIGINT)
-        assert run.end() == 130
+        assert run.interrupt() == 130
     nothing_left(tmp_path / "run")
-
-
-def test_run_over_a_router_of_ones_own(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
-    (tmp_path / "router.json5").write_text(ROUTER.read_text().replace("tcp/127.0.0.1:7447", endpoint))
-    router = subprocess.Popen(
-        [*SNAKESIM, "router", "router.json5"],
-        cwd=tmp_path,
-        env=environment(tmp_path),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert router.stdout is not None and "router running" in router.stdout.readline()
-        ended, summary = run_to_summary(
-            tmp_path / "run", "triplet", "--controller", "hold", "--duration", "1", "--router", endpoint
-        )
-        assert ended.code == 0, ended.out + ended.err
-        assert summary.ticks == 100 and summary.answered_fraction == 1.0
-    finally:
-        router.send_signal(signal.SIGINT)
-        assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace, which needs root")

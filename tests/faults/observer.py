@@ -58,7 +58,6 @@ class Observer:
     def __init__(self, session: Session) -> None:
         self.session = session
         self.status: Status | None = None
-        self.unreadable = 0
         self.stumbles = 0  # armings that did not last, or were refused at the last moment
         self.statuses: list[Heard[Status]] = []
         self.applied: list[Heard[AppliedCommand]] = []
@@ -101,8 +100,7 @@ class Observer:
                 self.receive(arrival.monotonic_ns, message)
 
     def could_not_read(self, arrival: Arrival, error: WireError) -> None:
-        """Something came that is no message."""
-        self.unreadable += 1
+        """Something came that is no message: it is left out."""
 
     def receive(self, at_ns: int, message: Any) -> None:
         """A message came."""

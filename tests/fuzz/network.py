@@ -5,7 +5,6 @@ memory, overruns, commands that were taken, who commands, and every set-point th
 """
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -159,11 +158,10 @@ def fuzz(out: Path, request: Request) -> Verdict:
                 said, _ = stranger.communicate(timeout=LIMIT_S)
             if stranger.returncode == 0:
                 sent = msgspec.json.decode(said, type=Sent)
-        run.process.send_signal(signal.SIGINT)
-        run.end()
+        run.interrupt()
     wait_until(lambda: not processes_of(out), "all processes of the run gone")
     record = msgspec.json.decode((out / HOST_RECORD).read_bytes(), type=HostRecord)
-    failure = [*_complaints(out), *_foreign(out, record)]
+    failure = [*(f"in a log: {line}" for line in complaints(out)), *_foreign(out, record)]
     if quiet.failure:
         failure += [f"before anything was sent, {what}: is this machine too busy?" for what in quiet.failure]
     else:
@@ -193,10 +191,6 @@ def _stranger(endpoint: str, request: Request) -> Iterator[subprocess.Popen[byte
         if process.poll() is None:
             process.kill()
         process.wait()
-
-
-def _complaints(out: Path) -> list[str]:
-    return [f"in a log: {line}" for line in complaints(out)]
 
 
 def _foreign(out: Path, record: HostRecord) -> list[str]:

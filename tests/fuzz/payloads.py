@@ -11,6 +11,7 @@ from msgspec.msgpack import Ext
 
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, encode, encoding_of
 from snakesim_hal.wire.messages import VERSIONS, JointCommand, JointState, LeaseRequest, LifecycleRequest, Message
+from tests.fuzz.texts import flipped
 from tests.unit.hal.rig import LEASE_NS, command, description, state
 from tests.unit.hal.strategies import Place, places, plain_example, poisons, replaced
 
@@ -118,7 +119,7 @@ class Maker:
             "valid": lambda seed: seed.payload,
             "random": lambda seed: rng.randbytes(rng.randrange(200)),
             "truncated": lambda seed: seed.payload[: rng.randrange(len(seed.payload))],
-            "bit-flipped": self._flipped,
+            "bit-flipped": lambda seed: flipped(rng, seed.payload),
             "spliced": self._spliced,
             "type-confused": self._confused,
             "fields lost": self._lost,
@@ -138,12 +139,6 @@ class Maker:
             at = rng.randrange(len(encoding))
             encoding = rng.choice([encoding[:at], encoding + "0", encoding[:at] + chr(rng.randrange(1, 0xD800)), ""])
         return Sample(seed.message, kind, self._kinds[kind](seed), encoding)
-
-    def _flipped(self, seed: Seed) -> bytes:
-        payload = bytearray(seed.payload)
-        for _ in range(self._rng.choice((1, 1, 1, 2, 8))):
-            payload[self._rng.randrange(len(payload))] ^= 1 << self._rng.randrange(8)
-        return bytes(payload)
 
     def _spliced(self, seed: Seed) -> bytes:
         one, other = seed.payload, self._rng.choice(self._seeds).payload

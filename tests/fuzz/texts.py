@@ -35,6 +35,14 @@ RARE = 200  # one in so many is as large as a megabyte
 LARGE, LARGEST = 20_000, 1 << 20
 
 
+def flipped(rng: random.Random, payload: bytes) -> bytes:
+    """With some of its bits the other way."""
+    changed = bytearray(payload)
+    for _ in range(rng.choice((1, 1, 1, 2, 8))):
+        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
 class TextMaker:
     """Makes one payload after the other; the same ones for the same random numbers."""
 
@@ -45,7 +53,7 @@ class TextMaker:
             "valid": lambda seed: seed,
             "random": lambda seed: rng.randbytes(rng.randrange(300)),
             "truncated": lambda seed: seed[: rng.randrange(len(seed))],
-            "bit-flipped": self._flipped,
+            "bit-flipped": lambda seed: flipped(rng, seed),
             "spliced": self._spliced,
             "number": lambda seed: self._replaced(seed, NUMBER, NUMBERS),
             "word": lambda seed: self._replaced(seed, WORD, WORDS),
@@ -63,12 +71,6 @@ class TextMaker:
 
     def _at(self, seed: bytes) -> int:
         return self._rng.randrange(len(seed) + 1)
-
-    def _flipped(self, seed: bytes) -> bytes:
-        payload = bytearray(seed)
-        for _ in range(self._rng.choice((1, 1, 1, 2, 8))):
-            payload[self._rng.randrange(len(payload))] ^= 1 << self._rng.randrange(8)
-        return bytes(payload)
 
     def _spliced(self, seed: bytes) -> bytes:
         other, at = self._rng.choice(self._seeds), self._at(seed)

@@ -1,6 +1,5 @@
 """The soak itself: a run, one fault after the other, and the operator who gets the robot going again."""
 
-import signal
 import statistics
 import time
 from collections import Counter
@@ -74,7 +73,7 @@ class Operator:
             if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MAX_VIOLATIONS:
                 return
             self._spend(event.pause_s)
-            answer = self._ask(event)
+            answer = self._ask_until_answered(event.part, event.request)
             if not answer.ok:
                 if answer.refusal in ("cannot", "unknown_fault", "not_permitted"):
                     dice.rule_out(event)
@@ -189,9 +188,6 @@ class Operator:
         self._spend(0.1)
         return answer.reason
 
-    def _ask(self, event: Event) -> Answer:
-        return self._ask_until_answered(event.part, event.request)
-
     def _ask_until_answered(self, part: str, request: Any) -> Answer:
         """A part that was started a moment ago answers a little later."""
         give_up = time.monotonic() + RECOVERY_S
@@ -236,8 +232,7 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> Soak:
         Operator(watch, health, found, log).go(Dice(seed, joints), 60 * minutes)
         if run.process.poll() is not None:
             found.violations.append(f"the run has ended by itself: {run.said()[-500:]}")
-        run.process.send_signal(signal.SIGINT)
-        code = run.end()
+        code = run.interrupt()
         if code != 130:
             found.violations.append(f"an interrupted run ends with exit code {code}, not 130")
         found.violations += health.judge()

@@ -5,8 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack
-from pathlib import Path
+from contextlib import AbstractContextManager
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Mode
@@ -113,21 +112,12 @@ def second_run(request: Request) -> Iterator[Trial]:
             observer.watch(0.1)
             observer.forget()
             where = ["--router" if number % 2 else "--endpoint", made.endpoint]
-            with ExitStack() as stack:
-                said = stack.enter_context((made.folder / "second.said").open("w+"))
-                code = subprocess.run(
-                    [*command, *where, "--out", str(Path(made.folder, f"second{number}"))],
-                    stdout=said,
-                    stderr=subprocess.STDOUT,
-                    check=False,
-                    timeout=60,
-                ).returncode
-                said.seek(0)
-                words = said.read()
+            typed, output = [*command, *where, "--out", str(made.folder / f"second{number}")], subprocess.PIPE
+            second = subprocess.run(typed, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, timeout=60)
             observer.listen()
             failures: list[str] = []
-            if code not in (1, 2) or made.config.robot.name not in words:
-                failures.append(f"the second run ended with {code}: {words[-300:]}")
+            if second.returncode not in (1, 2) or made.config.robot.name not in second.stdout:
+                failures.append(f"the second run ended with {second.returncode}: {second.stdout[-300:]}")
             moving = sum(any(mode is not Mode.PASSIVE for mode in h.message.mode) for h in observer.applied)
             if observer.state() != "disarmed":
                 failures.append(f"the robot is {observer.in_words()}")

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import msgspec
+
 from tests.attack.means.floods import flood
 from tests.faults.consumer import STUCK
 from tests.faults.observer import Observer, TrialError
@@ -33,13 +35,9 @@ def cannot_keep_up(kind: str) -> Measure:
             with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
                 for _ in range(request.trials):
                     with_it.append(_missed(observer))
-                    failure = ""
-                    if observer.state() != "armed":
-                        failure = f"the robot stopped: {observer.in_words()}"
-                        observer.arm()
-                    elif process.poll() is not None:
-                        failure = "the consumer has ended"
-                    yield Trial(value=float(max(with_it[-1] - max(before), 0)), failure=failure)
+                    trial = _beside_it(observer, with_it[-1] - max(before))
+                    ended = process.poll() is not None and not trial.failure
+                    yield msgspec.structs.replace(trial, failure="the consumer has ended") if ended else trial
             request.note(
                 f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
                 f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
@@ -63,16 +61,21 @@ def frozen_readers(request: Request) -> Iterator[Trial]:
             observer.arm()
         for _ in range(request.trials):
             with_them.append(_missed(observer, FROZEN_WINDOW_S))
-            failure = ""
-            if observer.state() != "armed":
-                failure = f"the robot stopped: {observer.in_words()}"
-                observer.arm()
-            yield Trial(value=float(max(with_them[-1] - max(before), 0)), failure=failure)
+            yield _beside_it(observer, with_them[-1] - max(before))
         request.note(
             f"{FROZEN} readers at {rate_hz:g} Hz for {request.trials * FROZEN_WINDOW_S:g} s: {sum(before)} cycles "
             f"missed in {len(before)} windows of {FROZEN_WINDOW_S:g} s without them, {sum(with_them)} in "
             f"{request.trials} with them, worst {max(with_them)}"
         )
+
+
+def _beside_it(observer: Observer, more_missed: int) -> Trial:
+    """Of a window; a robot that has stopped in it is armed again."""
+    failure = ""
+    if observer.state() != "armed":
+        failure = f"the robot stopped: {observer.in_words()}"
+        observer.arm()
+    return Trial(value=float(max(more_missed, 0)), failure=failure)
 
 
 def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:

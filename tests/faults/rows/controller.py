@@ -1,13 +1,13 @@
 """The controller's process is killed, frozen, or busy with something else; the host restarts."""
 
-import signal
 import time
 from collections.abc import Callable, Iterator
+from signal import SIGCONT, SIGKILL, SIGSTOP
 
 from snakesim_hal.wire.messages import Mode
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, recovered, robot
-from tests.faults.row import Request, Trial
+from tests.faults.row import Measure, Request, Trial
 from tests.faults.stranger import send_raw
 
 HANG_S = 0.5
@@ -17,9 +17,11 @@ UNDER_WAY_S = 0.1  # until what a dead host has sent has come
 LATCHED_S = 0.15  # how long a fault must be seen to stay, with a controller that commands again
 
 
-def _trial(made: Robot, observer: Observer, fail: Callable[[], int], mend: Callable[[], None]) -> Trial:
+def _trial(
+    made: Robot, observer: Observer, fail: Callable[[Robot, Observer], int], mend: Callable[[Robot], object]
+) -> Trial:
     made.set_in_motion(observer)
-    failed_ns = fail()
+    failed_ns = fail(made, observer)
     value = observer.safe_after_ms(failed_ns)
     status = observer.first_fault(failed_ns)
     failures: list[str] = []
@@ -27,7 +29,7 @@ def _trial(made: Robot, observer: Observer, fail: Callable[[], int], mend: Calla
         failures.append(f"not because of the lease: {status.why}")
     if status.lease_holder is not None:
         failures.append(f"the lease is still {status.lease_holder}'s")
-    mend()
+    mend(made)
     observer.until(lambda: observer.status is not None and observer.status.lease_holder == "control", "control is back")
     observer.forget()
     observer.watch(LATCHED_S)
@@ -36,38 +38,27 @@ def _trial(made: Robot, observer: Observer, fail: Callable[[], int], mend: Calla
     return recovered(observer, value, "; ".join(failures))
 
 
-def killed(request: Request) -> Iterator[Trial]:
-    """SIGKILL; the operator clears when another one has been started."""
-    with robot(request) as (made, observer):
-        for _ in range(request.trials):
-            yield _trial(
-                made, observer, lambda: made.signal("control", signal.SIGKILL), lambda: void(made.start("control"))
-            )
+def _failing(fail: Callable[[Robot, Observer], int], mend: Callable[[Robot], object]) -> Measure:
+    """fail: when it began, by the monotonic clock; mend: before the operator clears."""
+
+    def measure(request: Request) -> Iterator[Trial]:
+        with robot(request) as (made, observer):
+            for _ in range(request.trials):
+                yield _trial(made, observer, fail, mend)
+
+    return measure
 
 
-def frozen(request: Request) -> Iterator[Trial]:
-    """SIGSTOP; later SIGCONT."""
-    with robot(request) as (made, observer):
-        for _ in range(request.trials):
-            yield _trial(
-                made,
-                observer,
-                lambda: made.signal("control", signal.SIGSTOP),
-                lambda: void(made.signal("control", signal.SIGCONT)),
-            )
-
-
-def hung(request: Request) -> Iterator[Trial]:
+def _hang(_made: Robot, observer: Observer) -> int:
     """Its interpreter is busy, by the injector."""
-    with robot(request) as (made, observer):
+    now_ns = time.monotonic_ns()
+    observer.inject("control", "hang", "control", for_s=HANG_S)
+    return now_ns
 
-        def hang() -> int:
-            now_ns = time.monotonic_ns()
-            observer.inject("control", "hang", "control", for_s=HANG_S)
-            return now_ns
 
-        for _ in range(request.trials):
-            yield _trial(made, observer, hang, lambda: None)
+killed = _failing(lambda made, _: made.signal("control", SIGKILL), lambda made: made.start("control"))
+frozen = _failing(lambda made, _: made.signal("control", SIGSTOP), lambda made: made.signal("control", SIGCONT))
+hung = _failing(_hang, lambda _: None)
 
 
 def host_restarts(request: Request) -> Iterator[Trial]:
@@ -81,7 +72,7 @@ def host_restarts(request: Request) -> Iterator[Trial]:
             observer.watch(0.1)
             streamed = [arrival.payload for arrival in observer.commands][-REPLAYED:]
             epoch = observer.status.lease_epoch if observer.status else 0
-            made.signal("host", signal.SIGKILL)
+            made.signal("host", SIGKILL)
             observer.watch(UNDER_WAY_S)
             observer.forget()
             made.start("host")
@@ -113,7 +104,3 @@ def _objections(observer: Observer, streamed: list[bytes]) -> list[str]:
     if {h.message.lifecycle for h in observer.statuses} != {"disarmed"}:
         failures.append(f"did not boot disarmed, and stay so: {observer.in_words()}")
     return failures
-
-
-def void(_: object) -> None:
-    """Let a result go."""

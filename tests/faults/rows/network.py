@@ -11,9 +11,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.faults.observer import Observer, TrialError
+from tests.faults.observer import Observer
 from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered
 from tests.faults.row import Request, Trial
+from tests.machines import Machine
 
 DOWN_S = 0.4  # how long there is no router
 RECONNECT_S = 5.0
@@ -117,30 +118,14 @@ def network_cut(request: Request) -> Iterator[Trial]:
 @contextlib.contextmanager
 def _far_side() -> Iterator[Path]:
     """A network namespace behind a veth pair; this process must be in one of its own."""
-    holder = subprocess.Popen(["unshare", "--net", "sleep", "infinity"])
-    far = Path(f"/proc/{holder.pid}/ns/net")
-    try:
-        _until_another(far)
+    with contextlib.ExitStack() as stack:
+        far = Machine(stack, "the far side")
         _ip("link", "set", "lo", "up")
-        _ip("link", "add", "ours", "type", "veth", "peer", "name", "theirs", "netns", str(holder.pid))
+        _ip("link", "add", "ours", "type", "veth", "peer", "name", "theirs", "netns", far.pid)
         _ip("address", "add", f"{OURS}/24", "dev", "ours")
         _ip("link", "set", "ours", "up")
-        with _inside(far):
-            _ip("link", "set", "lo", "up")
-            _ip("address", "add", f"{THEIRS}/24", "dev", "theirs")
-            _ip("link", "set", "theirs", "up")
-        yield far
-    finally:
-        holder.kill()
-        holder.wait()
-
-
-def _until_another(far: Path) -> None:
-    deadline = time.monotonic() + 5.0
-    while far.readlink() == Path("/proc/self/ns/net").readlink():
-        if time.monotonic() > deadline:
-            raise TrialError("no network namespace could be made; it needs root")
-        time.sleep(0.01)
+        far.address("theirs", f"{THEIRS}/24")
+        yield Path(f"/proc/{far.pid}/ns/net")
 
 
 @contextlib.contextmanager
