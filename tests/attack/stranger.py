@@ -211,9 +211,7 @@ class Stranger:
 
     def request(self, action: str, **more: Any) -> dict[str, Any]:
         """Ask for another lifecycle; arming names what the description tells."""
-        request: dict[str, Any] = {"action": action, **more}
-        if "who" in wire.fields("LifecycleRequest"):
-            request.setdefault("who", "stranger")
+        request: dict[str, Any] = {"action": action, "who": "stranger", **more}
         if action == "arm":
             about = self.newest("hal/description")
             named = {name: about[name] for name in ("robot", "backend", "config_hash")}

@@ -12,7 +12,6 @@ import pytest
 
 from tests.attack.effort import FULL, effort
 from tests.attack.limits import beyond_limits
-from tests.attack.means import wire
 from tests.attack.means.meanwhile import meanwhile
 from tests.attack.robot import Robot, standing
 from tests.attack.stranger import Stranger
@@ -82,16 +81,7 @@ def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: f
 
 def intent(operator: Stranger, stamp_ns: int, speed_m_s: float, valid_s: float | None = None) -> dict[str, Any]:
     said: dict[str, Any] = {"stamp_ns": stamp_ns, "who": "stranger", "speed_m_s": speed_m_s, "go": True}
-    if valid_s is not None:
-        said[how_long()] = round(valid_s * NS)
-    return said
-
-
-def how_long() -> str:
-    """The field of an intent that says for how long it holds."""
-    found = [name for name in wire.fields("Intent") if name.startswith(("valid_for", "expires"))]
-    assert found, "schemas/messages/Intent.json has no field that says how long an intent holds"
-    return found[0]
+    return said if valid_s is None else {**said, "valid_for_ns": round(valid_s * NS)}
 
 
 def speeds(operator: Stranger, seconds: float) -> set[float]:

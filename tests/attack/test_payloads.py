@@ -1,5 +1,6 @@
 """Queries and names that are too long, too deep, too many, or not for a terminal."""
 
+import itertools
 import json
 import random
 import time
@@ -19,6 +20,7 @@ from tests.harness.endpoint import free_endpoint
 
 EVIL = "\x1b[2J\x1b]0;evil\x07\r\nplanar13: armed - all is well\n\x9b31m\u202e"
 STATUS_S = 20.0
+MUCH_BYTES = 100_000
 
 
 def payloads() -> list[bytes]:
@@ -50,9 +52,11 @@ def test_no_payload_of_a_query_harms_the_robot(robot: Robot, key: str) -> None:
     before, operator = robot.health(), robot.operator
     operator.forget()
     targets = [key.replace("*", part) for part in ("run", "control", "hal")] if "*" in key else [key]
-    for target in targets:
-        for payload in payloads():
-            with Stranger(robot.endpoint) as stranger:  # one that sends too much may lose its connection
+    small = [payload for payload in payloads() if len(payload) < MUCH_BYTES]
+    large = [[payload] for payload in payloads() if len(payload) >= MUCH_BYTES]
+    for target, group in itertools.product(targets, [small, *large]):
+        with Stranger(robot.endpoint) as stranger:  # one that sends too much may lose its connection
+            for payload in group:
                 for answer in stranger.ask(target, payload, 0.3):
                     assert not answer["ok"], f"{payload[:40]!r} at {target}: {answer}"
     robot.stays("armed", 0.3)

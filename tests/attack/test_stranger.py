@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.attack.means import wire
-
 HERE = Path(__file__).parent
 FILES = sorted([*HERE.glob("*.py"), *HERE.glob("means/*.py"), *(HERE.parent / "harness").rglob("*.py")])
 ALLOWED = {"zenoh", "msgspec.msgpack", "pytest", "websockets", "zstandard"}
@@ -34,15 +32,6 @@ def test_nothing_of_ours_is_imported(path: Path) -> None:
         assert root in sys.stdlib_module_names or allowed or ours, f"{path.name} imports {name}"
     code = path.read_text(encoding="utf-8")
     assert path.name == Path(__file__).name or ("import_module" not in code and "__import__" not in code)
-
-
-def test_the_keys_are_read_from_the_schemas() -> None:
-    assert {"hal/estop", "hal/lifecycle", "hal/lease", "fault/*"} <= set(wire.QUERIES)
-    assert {"hal/clock", "hal/status", "hal/description", "actuator/joints"} <= set(wire.STREAMS)
-    assert wire.ROWS["hal/status"].kind == "latched"
-    assert wire.encoding_of("hal/estop").startswith("application/msgpack;snakesim.EstopRequest/")
-    assert wire.message_of("fault/run") == "FaultRequest"
-    assert {"tick", "arming", "sequence"} <= wire.fields("JointCommand")
 
 
 def test_every_test_that_the_safety_page_names_is_there() -> None:

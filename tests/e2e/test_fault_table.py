@@ -38,20 +38,18 @@ def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
 def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() -> None:
     row = Row("r", "fault", "stop", "50 ms", 50.0, "ms", {"sim": lambda _request: iter(())})
 
-    def judged(*trials: Trial, broken: str = "", why_over: str = "") -> tuple[bool, bool, str]:
+    def judged(*trials: Trial, broken: str = "") -> tuple[bool, str]:
         result = Result(
             row="r", backend="sim", when="2026-01-01 00:00", took_s=1.0, load=0.0, machine="", trials=list(trials),
             broken=broken,
         )  # fmt: skip
-        changed = Row(row.name, row.fault, row.expected, row.deadline, row.limit, row.unit, row.on, why_over=why_over)
-        verdict = judge(changed, result)
-        return verdict.met, verdict.explained, verdict.why
+        verdict = judge(row, result)
+        return verdict.met, verdict.why
 
     good, late = Trial(value=40.0, recovered=True), Trial(value=50.1)
-    assert judged(good, good) == (True, False, "")
-    assert judged(good, late) == (False, False, "1 of 2 trials over 50 ms")
-    assert judged(late, why_over="it is so") == (False, True, "1 of 1 trials over 50 ms, because it is so")
-    assert judged(late, Trial(value=None), why_over="it is so")[:2] == (False, False)
-    assert "no recovery" in judged(Trial(value=1.0, recovered=False))[2]
-    assert "odd" in judged(good, Trial(value=1.0, failure="odd"))[2]
+    assert judged(good, good) == (True, "")
+    assert judged(good, late) == (False, "1 of 2 trials over 50 ms")
+    assert judged(good, Trial(value=None)) == (False, "nothing measured in 1 of 2 trials")
+    assert "no recovery" in judged(Trial(value=1.0, recovered=False))[1]
+    assert "odd" in judged(good, Trial(value=1.0, failure="odd"))[1]
     assert judged(good, broken="it broke")[0] is False and judged()[0] is False

@@ -69,11 +69,10 @@ class Row:
     fault: str
     expected: str
     deadline: str  # in words, with how it is counted
-    limit: float | None  # the worst value allowed; None: the row says nothing of time
+    limit: float  # the worst value allowed
     unit: str
     on: Mapping[Backend, Measure | str]  # how it is measured, or why it does not apply
     place: Place = "here"
-    why_over: str = ""  # why a limit cannot be met, where that is known
     least: int = 0  # trials in a whole table of 20; fewer where fewer are asked for
 
 
@@ -85,7 +84,6 @@ class Verdict:
     why: str
     median: float | None = None
     worst: float | None = None
-    explained: bool = False  # all that is against it is a limit of which the row says why
 
 
 def judge(row: Row, result: Result) -> Verdict:
@@ -94,11 +92,9 @@ def judge(row: Row, result: Result) -> Verdict:
     median = statistics.median(values) if values else None
     worst = max(values) if values else None
     against: list[str] = []
-    over = [value for value in values if row.limit is not None and value > row.limit]
+    over = [value for value in values if value > row.limit]
     if over:
-        why = f", because {row.why_over}" if row.why_over else ""
-        against.append(f"{len(over)} of {len(values)} trials over {row.limit:g} {row.unit}{why}")
-    only_over = len(against)
+        against.append(f"{len(over)} of {len(values)} trials over {row.limit:g} {row.unit}")
     if result.broken:
         against.append(result.broken)
     missing = sum(trial.value is None for trial in result.trials)
@@ -112,5 +108,4 @@ def judge(row: Row, result: Result) -> Verdict:
         against.append(f"no recovery in {stuck} trials")
     if not result.trials and not result.broken:
         against.append("no trial")
-    explained = bool(row.why_over) and len(against) == only_over == 1
-    return Verdict(not against, "; ".join(against), median, worst, explained)
+    return Verdict(not against, "; ".join(against), median, worst)

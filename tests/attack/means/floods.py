@@ -42,10 +42,6 @@ class Flooder:
                 stderr=subprocess.STDOUT,
             )
 
-    def says(self) -> str:
-        """The newest of what it says of itself."""
-        return self._said.read_text(errors="replace").strip().rpartition("\n")[2]
-
     def is_ready(self) -> None:
         """Wait until it is at work."""
         wait_until(
@@ -64,10 +60,9 @@ class Flooder:
 
 
 @contextmanager
-def half_open(endpoint: str, count: int) -> Iterator[int]:
-    """TCP connections on which nothing is ever said. How many there are."""
+def half_open(endpoint: str, count: int) -> Iterator[None]:
+    """TCP connections on which nothing is ever said, as many as there may be."""
     with contextlib.ExitStack() as stack:
-        opened = 0
         for _ in range(count):
             connection = stack.enter_context(socket.socket())
             connection.settimeout(0.5)
@@ -75,5 +70,4 @@ def half_open(endpoint: str, count: int) -> Iterator[int]:
                 connection.connect(address(endpoint))
             except OSError:
                 break
-            opened += 1
-        yield opened
+        yield

@@ -46,11 +46,6 @@ def schema(message: str) -> dict[str, Any]:
     return json.loads((SCHEMAS / "messages" / f"{message}.json").read_text(encoding="utf-8"))
 
 
-def fields(message: str) -> set[str]:
-    """What a message may carry."""
-    return set(schema(message)["$defs"][message]["properties"])
-
-
 def required(message: str) -> set[str]:
     """What a message must carry."""
     return set(schema(message)["$defs"][message]["required"])

@@ -33,9 +33,9 @@ from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
-from tests.harness.command import snakesim
 from tests.unit.hal.rig import description
 from tests.unit.hal.rig import state as joint_state
+from tests.whole.command import run_to_summary
 
 ROBOT = "/planar13_camera"
 LAYOUT = Path(__file__).parents[4] / "docs" / "foxglove-layout.json"
@@ -137,8 +137,7 @@ def test_joints_forces_and_state_come_as_often_as_the_robot_tells_them(run: Path
 
 
 def test_raw_only_leaves_out_what_is_for_viewers(tmp_path: Path) -> None:
-    given = ["run", "triplet", "--in-process", "--duration", "0.2", "--raw-only", "--out", "raw"]
-    assert snakesim(*given, cwd=tmp_path).code == 0
+    run_to_summary(tmp_path / "raw", "triplet", "--duration", "0.2", "--raw-only")
     with (tmp_path / "raw" / RECORDING).open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
