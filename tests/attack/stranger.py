@@ -238,6 +238,8 @@ class Stranger:
     def recover(self, limit_s: float = LONG_S) -> None:
         """Have the robot armed and following its controller, whatever happened to it."""
         self.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
+        if self.lifecycle() == "armed" and self.follows():  # the next status may take a fifth of a second
+            return
         deadline = time.monotonic() + limit_s
         last: Any = None
         while time.monotonic() < deadline:

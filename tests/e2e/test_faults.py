@@ -66,39 +66,6 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     nothing_left(tmp_path / "run")
 
 
-MAY_LOSE_ONE = ("--set", "robot.safety.may_lose_joints=1")
-
-
-@pytest.mark.slow
-def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
-    def operator(*words: str):
-        return command.snakesim(*words, "--endpoint", run.endpoint, cwd=tmp_path)
-
-    def result(what: str) -> None:
-        wait_until(lambda: what in operator("status").out, f"{what!r} in the status")
-
-    arguments = ["triplet", "--controller", "hold", "--duration", "3600", "--stay", *MAY_LOSE_ONE]
-    with armed_run(tmp_path / "run", *arguments) as run:
-        assert ask(run, "mute", "joint_3", "--for", "1").code == 0
-        result("isolated: joint_3; passive until a clear")
-        assert "armed, without joint_3: no valid and fresh state of joint_3" in operator("status").out
-        refused = operator("clear")
-        assert (
-            refused.code == 1
-            and "disarm first, then a clear ends the isolation of joint_3" in refused.err + refused.out
-        )
-        assert operator("disarm").code == 0
-        result("or, without: `snakesim arm planar13 sim")
-        assert operator("arm", "planar13", "sim").code == 0
-        assert "isolated: joint_3" in operator("status").out
-        assert operator("disarm").code == 0 and operator("clear").code == 0
-        assert operator("arm", "planar13", "sim").code == 0
-        status = operator("status").out
-        assert "planar13: armed" in status and "isolated:" not in status, status
-        assert run.interrupt() == 130
-    nothing_left(tmp_path / "run")
-
-
 def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
     flags = ["--pace", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.record.host_record import HostRecord
 from tests.e2e.command import SNAKESIM, Ended, environment
@@ -30,7 +31,7 @@ class Lab:
         endpoint = free_endpoint()
         quiet = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
         self.router_file, self.session = folder / "router.json5", folder / "session.json5"
-        self.router_file.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {quiet}}}')
+        self.router_file.write_text(ROUTER.read_text().replace("tcp/127.0.0.1:7447", endpoint))
         self.session.write_text(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {quiet}}}')
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:

@@ -1,14 +1,12 @@
 """The main job, with real processes: it runs, it moves, and it repeats itself, however busy the machine is."""
 
 import json
-import multiprocessing
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import msgspec
@@ -18,7 +16,6 @@ from snakesim_operator.results.record import REPORT, SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import TOO_SLOW, armed_run, run_to_summary, snakesim
 from tests.harness.processes import nothing_left
-from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 
@@ -35,37 +32,6 @@ def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
     assert (tmp_path / "run" / REPORT).stat().st_size > 20_000
     assert str(tmp_path / "run" / REPORT) in ended.out
     nothing_left(tmp_path / "run")
-
-
-def _burn(stop: Event) -> None:
-    while not stop.is_set():
-        sum(range(1000))
-
-
-@contextmanager
-def busy_machine() -> Iterator[None]:
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    load = [context.Process(target=_burn, args=(stop,), daemon=True) for _ in range(2)]
-    for process in load:
-        process.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        for process in load:
-            process.join(10)
-
-
-@pytest.mark.slow
-def test_a_busy_machine_and_a_host_that_is_held_up_cost_no_determinism(tmp_path: Path) -> None:
-    """Control hears nothing for more than a second of wall-clock time; in lockstep no robot time passes meanwhile."""
-    arguments = ["triplet", "--duration", "3", "--pace", "lockstep", "--seed", "7"]
-    _, alone = command.run_to_summary(tmp_path / "alone", *arguments)
-    with busy_machine():
-        ended, loaded = run_to_summary(tmp_path / "loaded", *arguments, "--fault", "freeze:host@1-2.4")
-    assert ended.code == 0, ended.out + ended.err
-    assert loaded.command_digest == alone.command_digest
 
 
 @contextmanager

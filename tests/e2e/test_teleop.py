@@ -1,7 +1,6 @@
 """`snakesim teleop` in a pseudo-terminal, with a run: keys move the robot, and whoever loses the operator stops."""
 
 import contextlib
-import itertools
 import math
 import os
 import pty
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_gnc.navigation.clutter import NODES_PER_S
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
@@ -131,43 +129,6 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 wait_until(lambda: lifecycle(session) == "estop", "the emergency stop", 5.0)
                 stops.process.send_signal(signal.SIGTERM)
                 assert stops.process.wait(10) == 0 and stops.given_back
-
-
-@contextlib.contextmanager
-def busy_computer(hogs: int = 12) -> Iterator[None]:
-    """Processes that want every core for themselves."""
-    started = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(hogs)]
-    try:
-        yield
-    finally:
-        for hog in started:
-            hog.kill()
-            hog.wait(10)
-
-
-@pytest.mark.slow
-def test_a_first_turn_keeps_nobody_waiting_on_a_busy_computer(tmp_path: Path) -> None:
-    """Up, up, left: navigation answers each turn with a bounded share of the search, and the old path in between."""
-    with running(tmp_path / "run", "peg_row", "--duration", "60", "--set", "stall_limit_s=10") as run:
-        run.wait_for("Locomoting")
-        seen: list[Trajectory] = []
-        with open_session(Link(run.endpoint, "planar13")) as session:
-            trajectories = session.reader(keys.TRAJECTORY, Trajectory)
-            with at_the_keyboard(run, tmp_path) as operator, busy_computer():
-                operator.type(2 * UP)
-                operator.shows("asked: +0.10 m/s")
-                operator.type(LEFT)
-
-                def turned() -> bool:
-                    seen.extend(trajectories.drain())
-                    return any(one.path_id > 0 for one in seen)
-
-                wait_until(turned, "navigation to have found a path in the new direction")
-            status = session.latest(keys.STATUS, Status, 5.0)
-        assert status is not None and [fault.what for fault in status.faults] == []
-    assert {one.path_id for one in seen if one.searching == "the direction has changed"} <= {0}
-    assert {later.tick - one.tick for one, later in itertools.pairwise(seen)} == {20}
-    assert 0 < max(one.searched_nodes for one in seen) <= 0.2 * NODES_PER_S
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The other commands: config, scenarios, echo, status, router, and controllers from outside."""
+"""The other commands: config, scenarios, echo, status, and controllers from outside."""
 
 import json
 import os
@@ -22,7 +22,6 @@ from tests.whole import command
 pytestmark = pytest.mark.e2e
 
 TUTORIAL = Path("docs/tutorial.md").resolve()
-ROUTER = Path("snakesim_hal/shipped/router.json5").resolve()
 
 
 def echoed(run: Running, folder: Path, key: str, count: int, *more: str) -> list[dict[str, Any]]:
@@ -171,12 +170,6 @@ def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) ->
             timeout=120,
         )
         assert ended.returncode == code, ended.stdout + ended.stderr
-
-
-def test_a_router_file_that_zenoh_refuses(tmp_path: Path) -> None:
-    (tmp_path / "router.json5").write_text('{ mode: "peer" }')
-    ended = snakesim("router", "router.json5", cwd=tmp_path)
-    assert ended.code == 2 and "router" in ended.err
 
 
 def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:

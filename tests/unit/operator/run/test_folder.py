@@ -108,7 +108,7 @@ def test_many_that_want_one_folder_at_once(tmp_path: Path) -> None:
         for _ in range(5)
     ]
     try:
-        wait_until(lambda: sum(one.poll() is None for one in several) == 1, "all but one refused", 30.0)
+        wait_until(lambda: sum(one.poll() is None for one in several) == 1, "all but one refused")
         (winner,) = (one for one in several if one.poll() is None)
         wait_until(lambda: content(out) == {LOCK: str(winner.pid)}, "the winner's folder")
         assert [content(path) for path in tmp_path.iterdir() if path != out] == [{"config.json": "earlier"}]

@@ -1,4 +1,4 @@
-"""`--json`: one line that a script can read, with the same content and exit code as the table."""
+"""What `status`, `scenarios` and `config` tell: `--json` is one line for scripts, with the table's content and code."""
 
 import json
 
@@ -31,3 +31,14 @@ def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixtu
         assert main(["status", "--json", "--endpoint", endpoint]) == 0
     (robot,) = json.loads(capsys.readouterr().out)["robots"]
     assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == ("worm", False, "disarmed")
+
+
+def test_a_joint_that_is_let_go_is_told_with_the_way_back(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as session:
+        lost = status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
+        session.latched_publisher(keys.STATUS, Status).put(lost)
+        assert main(["status", "--endpoint", endpoint]) == 0
+    said = capsys.readouterr().out
+    assert "isolated: joint_3; passive until a clear" in said and "to end the isolation of joint_3" in said
+    assert "or, without: `snakesim arm worm lag" in said
