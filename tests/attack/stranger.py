@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -277,21 +276,6 @@ class Stranger:
             wait_until(enough, "commands are applied", limit_s)
             return self.lifecycle() == "armed"
         return False
-
-    def stop(self) -> tuple[float, list[Any]]:
-        """Ask for an emergency stop. Seconds until it is seen in what the host publishes, and the answers."""
-        self.receive("hal/status", "hal/clock", "hal/applied")
-        answers: list[Any] = []
-        asked_s = time.monotonic()
-
-        def ask() -> None:
-            answers.extend(self.ask("hal/estop", {"who": "operator"}, 10.0))
-
-        thread = threading.Thread(target=ask, daemon=True)
-        thread.start()
-        seen_s = self.stopped_at(asked_s, 10.0)
-        thread.join(10.0)
-        return seen_s - asked_s, answers
 
     def stopped_at(self, since_s: float, limit_s: float) -> float:
         """When an emergency stop was first seen: in the status, in the clock, or in what the motors get."""

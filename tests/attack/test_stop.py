@@ -70,19 +70,6 @@ def test_a4_the_command_stops_the_robot_under(
 
 
 @pytest.mark.parametrize("_time", TIMES)
-@pytest.mark.parametrize("name", FLOODS if FULL else ("lease_queries",))
-def test_a4_a_query_stops_the_robot_at_once_under(
-    robot: Robot, name: str, _time: int, record_property: Callable[[str, object], None]
-) -> None:
-    with FLOODS[name](robot):
-        time.sleep(FLOODED_S)
-        took_s, answers = robot.operator.stop()
-    record_property("stopped after", f"{1000 * took_s:.0f} ms from the query")
-    assert took_s < QUERY_S
-    assert answers and all(answer["ok"] for answer in answers), answers
-
-
-@pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("by", ["query", pytest.param("datagram", marks=pytest.mark.slow)])
 def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
     robot: Robot, by: str, _time: int, record_property: Callable[[str, object], None]

@@ -88,12 +88,18 @@ def into_a_folder(what: Path, home: Path) -> Installed:
     return home / "lib" / "bin" / "snakesim", home / "lib", home / "lib"
 
 
-def into_an_environment(what: Path, home: Path) -> Installed:
+def empty_environment(home: Path) -> tuple[Path, Path]:
+    """Its Python, and the folder of its packages."""
     run(UV, "venv", "--python", sys.executable, home / "env", cwd=home)
     python = home / "env" / "bin" / "python"
-    run(UV, "pip", "install", *NO_DEPS[:-2], "--python", python, what, cwd=home)
     library = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=home).strip()
-    return home / "env" / "bin" / "snakesim", Path(library), None
+    return python, Path(library)
+
+
+def into_an_environment(what: Path, home: Path) -> Installed:
+    python, library = empty_environment(home)
+    run(UV, "pip", "install", *NO_DEPS[:-2], "--python", python, what, cwd=home)
+    return python.with_name("snakesim"), library, None
 
 
 def into_a_home(what: Path, home: Path) -> Installed:
@@ -185,16 +191,14 @@ def lent(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
 
 def fetched(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
     """As `pip install` does it, from a package index."""
-    run(UV, "venv", "--python", sys.executable, home / "env", cwd=home)
-    python = home / "env" / "bin" / "python"
+    python, library = empty_environment(home)
     what = f"{wheel}[{extra}]" if extra else wheel
     install = (UV, "pip", "install", "--quiet", "--python", python, "--constraint", REPOSITORY / "requirements.lock")
     done = ended(*install, what, cwd=home, UV_OFFLINE="0")
     if done.code != 0 and ("error sending request" in done.err or "Failed to fetch" in done.err):
         pytest.skip("no package index can be reached")
     assert done.code == 0, done.err
-    library = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=home).strip()
-    return at_work(home / "env" / "bin" / "snakesim", home), Path(library)
+    return at_work(python.with_name("snakesim"), home), library
 
 
 def at_work(command: Path, home: Path, **more: str) -> Run:

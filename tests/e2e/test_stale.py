@@ -46,16 +46,9 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
     nothing_left(tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("key", "limit_s"),
-    [
-        pytest.param("sensor/pose", 0.24, marks=pytest.mark.slow),
-        pytest.param("sensor/contacts", 0.24, marks=pytest.mark.slow),
-        ("guidance/world", 0.22),
-        pytest.param("navigation/trajectory", 0.84, marks=pytest.mark.slow),
-    ],
-)
-def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path, key: str, limit_s: float) -> None:
+def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path) -> None:
+    """The others, one by one, are rows of the fault table."""
+    key, limit_s = "guidance/world", 0.22
     ended, summary = undisturbed(tmp_path / "run", f"drop:{key}@{FROM_S}-{TO_S}")
     assert ended.code == 0 and summary.faults == [] and summary.ended == "complete", ended.out
     record = RunRecord.load(tmp_path / "run")
