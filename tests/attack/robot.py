@@ -10,8 +10,10 @@ from pathlib import Path
 import zenoh
 
 from tests.attack.command import STANDING, Run, running
-from tests.attack.stranger import LONG_S, Stranger
-from tests.harness.wait import wait_until
+from tests.attack.stranger import Stranger
+from tests.harness.wait import LIMIT_S, wait_until
+
+BACK_S = 20.0  # until a robot that was attacked is replaced
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Robot:
         assert seen == {lifecycle}, f"{seen}: {self.operator.status()['why']}"
 
 
-def joined(run: Run, limit_s: float = LONG_S) -> Stranger:
+def joined(run: Run, limit_s: float = LIMIT_S) -> Stranger:
     """Somebody on a run's network, as soon as there is one."""
     found: list[Stranger] = []
 
@@ -102,7 +104,7 @@ class Victim:
         """It, armed and following its controller."""
         if self._robot is not None:
             with contextlib.suppress(AssertionError):
-                self._robot.operator.recover()
+                self._robot.operator.recover(BACK_S)
                 self._robot.operator.forget()
                 return self._robot
         self.close()

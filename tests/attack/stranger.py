@@ -12,10 +12,9 @@ import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
 from tests.attack.means import wire
-from tests.harness.wait import wait_until
+from tests.harness.wait import LIMIT_S, wait_until
 
 KEPT = 2000
-LONG_S = 20.0
 NAMESPACE = "planar13"  # a robot's namespace is its name
 FIRST = 10**9  # sequences from here on are a stranger's: no controller counts so far
 NUDGE_RAD = 0.02
@@ -121,20 +120,20 @@ class Stranger:
             if wire.ROWS[key].kind == "stream":
                 kept.clear()
 
-    def newest(self, key: str, limit_s: float = LONG_S) -> Any:
+    def newest(self, key: str, limit_s: float = LIMIT_S) -> Any:
         """The newest message at a key; waits for the first one."""
         self.receive(key)
         self.until(lambda: self._heard[key], f"something on {key}", limit_s)
         return self._heard[key][-1].message
 
-    def next(self, key: str, limit_s: float = LONG_S) -> Any:
+    def next(self, key: str, limit_s: float = LIMIT_S) -> Any:
         """A message at a key that comes from now on."""
         self.receive(key)
         now = time.monotonic()
         self.until(lambda: self._heard[key] and self._heard[key][-1].at_s > now, f"something new on {key}", limit_s)
         return self._heard[key][-1].message
 
-    def until(self, condition: Callable[[], Any], what: str, limit_s: float = LONG_S) -> None:
+    def until(self, condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> None:
         """Poll a condition until a deadline."""
         wait_until(condition, what, limit_s)
 
@@ -234,7 +233,7 @@ class Stranger:
             **changes,
         }
 
-    def recover(self, limit_s: float = LONG_S) -> None:
+    def recover(self, limit_s: float = LIMIT_S) -> None:
         """Have the robot armed and following its controller, whatever happened to it."""
         self.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
         if self.lifecycle() == "armed" and self.follows():  # the next status may take a fifth of a second
@@ -253,7 +252,7 @@ class Stranger:
             time.sleep(0.05)
         raise AssertionError(f"not armed within {limit_s:g} s: {self.status()['why']}; {last}")
 
-    def stand_by(self, limit_s: float = LONG_S) -> None:
+    def stand_by(self, limit_s: float = LIMIT_S) -> None:
         """Have the robot disarmed and ready to arm; a busy machine may have stopped it meanwhile."""
         deadline = time.monotonic() + limit_s
         while time.monotonic() < deadline:

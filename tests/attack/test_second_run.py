@@ -11,7 +11,7 @@ from tests.attack.command import STANDING, Run, running, snakesim
 from tests.attack.effort import effort
 from tests.attack.machine import Machine, machine_of_its_own
 from tests.attack.robot import Robot, joined
-from tests.attack.stranger import LONG_S, Stranger, settings
+from tests.attack.stranger import Stranger, settings
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
@@ -116,4 +116,4 @@ def named(run: Run, said: str) -> bool:
 
 
 def is_armed(machine: Machine, run: Run) -> None:
-    wait_until(lambda: machine.lifecycles(run.endpoint) == ["armed"], f"{run.out.name} armed", LONG_S)
+    wait_until(lambda: machine.lifecycles(run.endpoint) == ["armed"], f"{run.out.name} armed")

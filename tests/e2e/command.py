@@ -1,7 +1,7 @@
 """Drives the real `snakesim` command, and reads what it leaves."""
 
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,11 +21,19 @@ __all__ = [
     "Running",
     "armed_run",
     "background",
+    "call",
     "environment",
     "run_to_summary",
     "running",
     "snakesim",
 ]
+
+
+def call(typed: Sequence[object], cwd: Path, env: Mapping[str, str] | None = None, limit_s: float = LIMIT_S) -> Ended:
+    """Any program to its end. env: all of its environment."""
+    words, env = [str(word) for word in typed], environment(cwd) if env is None else env
+    done = subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, timeout=limit_s, check=False)
+    return Ended(done.returncode, done.stdout, done.stderr)
 
 
 @contextmanager

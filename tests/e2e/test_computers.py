@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal import arithmetic
-from tests.e2e.command import SNAKESIM, Ended, environment
+from tests.e2e.command import SNAKESIM, Ended, call, environment
 from tests.golden import GOLDEN, SECONDS
 from tests.harness.endpoint import free_endpoint
 
@@ -49,11 +49,6 @@ def on(computer: Mapping[str, str], folder: Path) -> dict[str, str]:
     """The environment of a user there, who has heard nothing of ours."""
     ours = environment(folder)
     return {name: value for name, value in ours.items() if name not in arithmetic.environment()} | dict(computer)
-
-
-def call(typed: list[str], folder: Path, env: Mapping[str, str]) -> Ended:
-    done = subprocess.run(typed, cwd=folder, env=env, capture_output=True, text=True, timeout=90, check=False)
-    return Ended(done.returncode, done.stdout, done.stderr)
 
 
 def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None) -> Ended:

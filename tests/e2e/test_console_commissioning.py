@@ -1,7 +1,6 @@
 """Commissioning in the console of a real robot, by what a page says and is shown: without a browser."""
 
 import asyncio
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.bench import host
-from tests.e2e.command import SNAKESIM, environment, running
+from tests.e2e.command import background, running
 from tests.e2e.test_by_hand import robot
 from tests.e2e.test_checked import home
 from tests.e2e.test_console_keys import LIMIT_S, until
@@ -19,18 +18,8 @@ from tests.viewer import Viewer, viewing
 from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
-RUN = (
-    "bench.toml",
-    "--backend",
-    "./real.py:Real",
-    "--unchecked",
-    "--stay",
-    "--duration",
-    "36000",
-    "--console",
-    "--no-record",
-)
-
+REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
+RUN = (*REAL, "--stay", "--duration", "36000", "--console", "--no-record")
 FORWARDS, HOLD_HZ = "Hold: forwards (+)", 20.0
 __all__ = ["bench", "home"]
 
@@ -63,13 +52,9 @@ async def arm_unchecked(address: str) -> None:
 @contextmanager
 def console(home: Path, endpoint: str) -> Iterator[str]:
     """The address of one that may write into the robot file."""
-    words = [*SNAKESIM, "console", "--endpoint", endpoint, "--commission", "snake.toml"]
-    with subprocess.Popen(words, cwd=home, env=environment(home), stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            yield process.stdout.readline().split()[1]
-        finally:
-            process.terminate()
+    with background(home, "console", "--endpoint", endpoint, "--commission", "snake.toml") as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().split()[1]
 
 
 def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench: Path) -> None:

@@ -22,7 +22,7 @@ from packaging.requirements import Requirement
 from snakesim_operator.extras import BRINGS
 from tests.contract.workbench import text_of_the_example
 from tests.distributions import required
-from tests.e2e.command import Ended, environment
+from tests.e2e.command import Ended, call, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
@@ -43,16 +43,7 @@ def run(*command: object, cwd: Path, **more: str) -> str:
 
 
 def ended(*command: object, cwd: Path, **more: str) -> Ended:
-    done = subprocess.run(
-        [str(word) for word in command],
-        cwd=cwd,
-        env={**environment(cwd), "UV_OFFLINE": "1", **more},
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-    return Ended(done.returncode, done.stdout, done.stderr)
+    return call(command, cwd, {**environment(cwd), "UV_OFFLINE": "1", **more}, 100.0)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from snakesim_hal.wire import keys
 from snakesim_operator.console.own_sensors import sensor_table
 from snakesim_operator.console.watch import Watch
 from snakesim_operator.recording.decoder import DecoderFactory
-from tests.e2e.command import environment, running
+from tests.e2e.command import Ended, call, environment, running
 from tests.e2e.command import snakesim as command
 from tests.e2e.documents import REPOSITORY
 from tests.harness.wait import wait_until
@@ -92,23 +91,16 @@ SAID = {
 }
 
 
-def suite(folder: Path, robot: str, clause: str) -> subprocess.CompletedProcess[str]:
+def suite(folder: Path, robot: str, clause: str) -> Ended:
     """The contract suite, as docs/backends.md has it, on the simulator with the whiskers."""
-    return subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", *PYTEST, "--snakesim-set", robot, "-k", clause],
-        cwd=folder,
-        env=environment(folder, PYTHONPATH=str(REPOSITORY)),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    typed = [sys.executable, "-m", "pytest", "-q", *PYTEST, "--snakesim-set", robot, "-k", clause]
+    return call(typed, folder, environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
 
 
 def test_the_contract_suite_accepts_it_and_refuses_it_when_it_lies(tmp_path: Path, robot: str) -> None:
     clauses = " or ".join([*SAID, "sensor_listed", "description"])
     honest = suite(tmp_path, robot, clauses)
-    assert honest.returncode == 0, honest.stdout[-3000:]
+    assert honest.code == 0, honest.out[-3000:]
     whisker = tmp_path / "docs" / "whisker.py"
     told = whisker.read_text()
     for truth, lie in LIES.items():
@@ -116,8 +108,8 @@ def test_the_contract_suite_accepts_it_and_refuses_it_when_it_lies(tmp_path: Pat
         told = told.replace(truth, lie)
     whisker.write_text(told)
     refused = suite(tmp_path, robot, clauses)
-    assert refused.returncode == 1 and f"{len(SAID)} failed" in refused.stdout, refused.stdout[-3000:]
-    assert not [said for said in SAID.values() if said not in refused.stdout], refused.stdout[-5000:]
+    assert refused.code == 1 and f"{len(SAID)} failed" in refused.out, refused.out[-3000:]
+    assert not [said for said in SAID.values() if said not in refused.out], refused.out[-5000:]
 
 
 def test_a_lying_whisker_stops_the_robot_and_is_named(tmp_path: Path, robot: str) -> None:

@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM, Ended, armed_run, environment, run_to_summary, running
+from tests.e2e.command import SNAKESIM, Ended, armed_run, call, run_to_summary, running
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -126,17 +126,11 @@ def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str
     )
     network = [] if "--in-process" in arguments else ["--endpoint", free_endpoint()]
     typed = [*SNAKESIM, "run", *arguments, "--out", str(disk / "run"), *network]
-    done = subprocess.run(
-        ["unshare", "-rm", "sh", "-c", script, "sh", str(disk), str(left), options, prepare, *typed],
-        env=environment(tmp_path),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    apart = ["unshare", "-rm", "sh", "-c", script, "sh", disk, left, options, prepare]
+    done = call([*apart, *typed], tmp_path, limit_s=120.0)
     nothing_left(disk / "run")
-    assert done.returncode != 99, done.stderr
-    return Ended(done.returncode, done.stdout, done.stderr), left / "run"
+    assert done.code != 99, done.err
+    return done, left / "run"
 
 
 def orderly(ended: Ended, left: Path, *, code: int, warning: str) -> None:

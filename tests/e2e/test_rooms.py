@@ -1,7 +1,6 @@
 """Rooms of the operator's tools that nothing imports can be left out, all or one: the rest starts, lists and runs."""
 
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -9,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.command import environment
+from tests.e2e.command import Ended, call, environment
 
 pytestmark = pytest.mark.e2e
 
@@ -57,29 +56,21 @@ def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
     library, work = without(rooms, tmp_path / "library"), tmp_path / "work"
     work.mkdir()
 
-    def run(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, *words],
-            cwd=work,
-            env={**environment(work), "PYTHONPATH": str(library)},
-            capture_output=True,
-            text=True,
-            timeout=100,
-            check=False,
-        )
+    def run(*words: str) -> Ended:
+        return call([sys.executable, *words], work, {**environment(work), "PYTHONPATH": str(library)}, 100.0)
 
     imported = run("-c", IMPORT_ALL)
-    assert imported.returncode == 0 and str(library) in imported.stdout, imported.stdout + imported.stderr
+    assert imported.code == 0 and str(library) in imported.out, imported.out + imported.err
     shown = run("-m", "snakesim_operator", "--help")
-    assert shown.returncode == 0 and not shown.stderr, shown.stderr
-    listed = {words[0] for line in shown.stdout.splitlines() if (words := line.split())}
+    assert shown.code == 0 and not shown.err, shown.err
+    listed = {words[0] for line in shown.out.splitlines() if (words := line.split())}
     left = {name for other, names in COMMANDS.items() if other not in rooms for name in names}
     assert left | {"run", "estop"} <= listed
     assert not listed & {name for room in rooms for name in COMMANDS[room]}
     refused = run("-m", "snakesim_operator", COMMANDS[rooms[0]][0])
-    assert refused.returncode == 2 and "no command" in refused.stderr, refused.stderr
+    assert refused.code == 2 and "no command" in refused.err, refused.err
     if "console" in rooms:
         beside = run("-m", "snakesim_operator", "run", "triplet", "--console")
-        assert beside.returncode == 2 and "without the console" in beside.stderr, beside.stderr
+        assert beside.code == 2 and "without the console" in beside.err, beside.err
     ran = run("-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2")
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert ran.code == 0, ran.out + ran.err

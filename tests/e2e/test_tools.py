@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import SNAKESIM, Running, armed_run, environment, snakesim
+from tests.e2e.command import SNAKESIM, Running, armed_run, call, environment, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -160,16 +160,9 @@ def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) ->
         [*SNAKESIM, "run", "triplet", "--controller", "hold", "--duration", "1", "--out", "run"]
     )
     for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
-        ended = subprocess.run(
-            ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"],
-            cwd=tmp_path,
-            env=environment(tmp_path),
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=120,
-        )
-        assert ended.returncode == code, ended.stdout + ended.stderr
+        typed = ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"]
+        ended = call(typed, tmp_path, limit_s=120.0)
+        assert ended.code == code, ended.said
 
 
 def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
