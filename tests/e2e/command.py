@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from tests.harness.command import LIMIT_S, SNAKESIM, Ended, Running, environment, running, snakesim
@@ -29,10 +30,28 @@ __all__ = [
 ]
 
 
-def call(typed: Sequence[object], cwd: Path, env: Mapping[str, str] | None = None, limit_s: float = LIMIT_S) -> Ended:
-    """Any program to its end. env: all of its environment."""
-    words, env = [str(word) for word in typed], environment(cwd) if env is None else env
-    done = subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, timeout=limit_s, check=False)
+def call(
+    typed: Sequence[object],
+    cwd: Path,
+    env: Mapping[str, str] | None = None,
+    limit_s: float = LIMIT_S,
+    *,
+    urgent: bool = False,
+) -> Ended:
+    """Any program to its end. env: all of its environment.
+
+    urgent: as a run's own control, where that is allowed: a busy computer holds it up otherwise.
+    """
+    done = subprocess.run(
+        [str(word) for word in typed],
+        cwd=cwd,
+        env=environment(cwd) if env is None else env,
+        capture_output=True,
+        text=True,
+        timeout=limit_s,
+        check=False,
+        preexec_fn=(lambda: set_realtime_priority(SERVICE_PRIORITY)) if urgent else None,
+    )
     return Ended(done.returncode, done.stdout, done.stderr)
 
 

@@ -35,10 +35,9 @@ def machine() -> Iterator[Machine]:
 
 @contextmanager
 def drives(machine: Machine, folder: Path, ready: str, *command: str) -> Iterator[None]:
-    """Emulated drives of another program on the bus, that send the pose."""
-    log = folder / "drives.log"
-    where = ("triplet", "--channel", CHANNEL)
-    process = machine.start(SNAKESIM, command[0], *where, *command[1:], log=log, hurried=True)
+    """Emulated drives of another program on the bus."""
+    log, typed = folder / "drives.log", (command[0], "triplet", "--channel", CHANNEL, *command[1:])
+    process = machine.start(SNAKESIM, *typed, log=log, hurried=True)
     try:
         wait_until(lambda: f"{ready} ready: 13" in log.read_text(), f"the {ready}")
         yield

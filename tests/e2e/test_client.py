@@ -1,7 +1,6 @@
 """The clients that docs/client.md shows: few lines, nothing of ours in them, and a robot that does what they ask."""
 
 import ast
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, Status
-from tests.e2e.command import Ended, Running, running
+from tests.e2e.command import Running, call, running
 from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
@@ -29,19 +27,6 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     with running(tmp_path_factory.mktemp("client") / "run", *EXTERNAL, "--pace", request.param) as started:
         started.wait_for("a client that takes the lease")
         yield started
-
-
-def call(script: Path, *arguments: str) -> Ended:
-    """Run it, as urgent as a run's own control where that is allowed: a busy machine holds it up otherwise."""
-    with subprocess.Popen(
-        [sys.executable, str(script), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: set_realtime_priority(SERVICE_PRIORITY),
-    ) as process:
-        out, err = process.communicate(timeout=30)
-    return Ended(process.returncode, out, err)
 
 
 def status(session: Session) -> Status:
@@ -70,7 +55,7 @@ def test_a_client_leases_arms_moves_and_disarms(run: Running) -> None:
     with open_session(Link(run.endpoint, "planar13")) as session:
         wait_until(lambda: status(session).waiting_for == ["control"], "a run that waits for control alone")
         joints = session.reader(keys.JOINTS, JointState, depth=DEPTH)
-        ended = call(CLIENT, run.endpoint, "planar13")
+        ended = call([sys.executable, CLIENT, run.endpoint, "planar13"], run.home, urgent=True)
         assert ended.code == 0, ended.out + ended.err
         angles = [state.angle_rad for state in joints.drain()]
         furthest = [max(abs(angle - joint[0]) for angle in joint) for joint in zip(*angles, strict=True)]
@@ -84,7 +69,7 @@ def test_a_client_leases_arms_moves_and_disarms(run: Running) -> None:
 
 def test_a_stop_by_udp_stops_the_robot(run: Running) -> None:
     host, _, port = run.endpoint.removeprefix("tcp/").partition(":")
-    ended = call(STOP, host, port)
+    ended = call([sys.executable, STOP, host, port], run.home)
     assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, ended.out + ended.err
     with open_session(Link(run.endpoint, "planar13")) as session:
         assert status(session).lifecycle == "estop"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.command import SNAKESIM, Running, armed_run, environment
+from tests.e2e.command import SNAKESIM, Running, armed_run, call, environment
 from tests.e2e.documents import REPOSITORY
 from tests.e2e.test_teleop import UP, at_the_keyboard
 from tests.harness.wait import wait_until
@@ -141,11 +141,9 @@ def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
     given = ("export", str(demos / "demos"), "--format", "lerobot", "--images", "--fps", "10", "--out", "set")
     assert "2 episodes" in snakesim(*given, cwd=tmp_path).out
     offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "PATH": "/usr/bin:/bin"}
-    loaded = subprocess.run(
-        [python, "-c", LOADED], cwd=tmp_path, env=offline, capture_output=True, text=True, check=False
-    )
-    assert loaded.returncode == 0, loaded.stderr[-3000:]
-    seen = json.loads(loaded.stdout.splitlines()[-1])
+    loaded = call([python, "-c", LOADED], tmp_path, offline, 600.0)
+    assert loaded.code == 0, loaded.err[-3000:]
+    seen = json.loads(loaded.out.splitlines()[-1])
     assert (seen["episodes"], seen["fps"], seen["task"]) == (2, 10, "through the field")
     assert seen["image"] == [3, 120, 160] and 0 < seen["brightest"] <= 1 and seen["mean"] == [3, 1, 1]
     assert seen["done"] and seen["success"] == [False, False]

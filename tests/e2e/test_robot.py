@@ -1,6 +1,5 @@
 """`snakesim.Robot`: scripts on a robot that runs, as docs/python.md has them."""
 
-import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -9,9 +8,8 @@ from pathlib import Path
 import pytest
 
 import snakesim
-from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_operator.playback.info import inspect_recording
-from tests.e2e.command import Running, armed_run, environment, running
+from tests.e2e.command import Ended, Running, armed_run, call, environment, running
 from tests.e2e.documents import REPOSITORY, sections
 from tests.harness.wait import wait_until
 
@@ -40,12 +38,12 @@ STUMBLED = "lease of control expired: no accepted command", "nothing commands th
 TRIES = 4
 
 
-def script(text: str, run: Running, folder: Path) -> subprocess.CompletedProcess[str]:
+def script(text: str, run: Running, folder: Path) -> Ended:
     """Run a script; again, where this machine has held it up for longer than a lease."""
     for _ in range(TRIES - 1):
         settled(run)
         done = called(text, run, folder)
-        if not any(words in done.stdout + done.stderr for words in STUMBLED):
+        if not any(words in done.said for words in STUMBLED):
             return done
         for left in folder.glob("*.mcap"):
             left.unlink()
@@ -53,19 +51,11 @@ def script(text: str, run: Running, folder: Path) -> subprocess.CompletedProcess
     return called(text, run, folder)
 
 
-def called(text: str, run: Running, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a script once, as urgent as a run's own control where that is allowed."""
+def called(text: str, run: Running, folder: Path) -> Ended:
+    """Run a script once."""
     (folder / "script.py").write_text(textwrap.dedent(text))
-    return subprocess.run(
-        [sys.executable, "script.py", run.endpoint],
-        cwd=folder,
-        env=environment(folder, PYTHONPATH=str(REPOSITORY)),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        preexec_fn=lambda: set_realtime_priority(SERVICE_PRIORITY),
-    )
+    env = environment(folder, PYTHONPATH=str(REPOSITORY))
+    return call([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgent=True)
 
 
 def settled(run: Running) -> None:
@@ -78,9 +68,9 @@ def settled(run: Running) -> None:
 def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running, tmp_path: Path) -> None:
     nod = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "nod.py" in s.files).files["nod.py"]
     ended = script(nod, waiting, tmp_path)
-    assert ended.returncode == 0, ended.stderr
-    assert "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.stdout or "turned by +0.1" in ended.stdout
-    assert ended.stdout.endswith("the robot is disarmed\n")
+    assert ended.code == 0, ended.err
+    assert "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.out or "turned by +0.1" in ended.out
+    assert ended.out.endswith("the robot is disarmed\n")
     with snakesim.Robot.connect(waiting.endpoint) as robot:
         assert robot.status.lifecycle == "disarmed"
     held = inspect_recording(tmp_path / "nod.mcap").keys
@@ -96,7 +86,7 @@ def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -
             raise ValueError("no idea")
     """
     ended = script(failing, waiting, tmp_path)
-    assert ended.stdout == "armed\n" and "no idea" in ended.stderr
+    assert ended.out == "armed\n" and "no idea" in ended.err
     with snakesim.Robot.connect(waiting.endpoint) as robot:
         assert robot.status.lifecycle == "disarmed", robot.status.why
 
@@ -115,7 +105,7 @@ def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path)
                 print(error)
     """
     ended = script(stopped, waiting, tmp_path)
-    assert ended.stdout.startswith("planar13 is no longer armed, but estop: "), ended.stdout + ended.stderr
+    assert ended.out.startswith("planar13 is no longer armed, but estop: "), ended.said
     settled(waiting)
 
 
