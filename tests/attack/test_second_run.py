@@ -24,7 +24,7 @@ def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
     armings = operator.next("hal/clock")["arming"]
     operator.forget()
     out = str(home / "second")
-    second = snakesim(home, "run", *SHORT, "--backend", "sim", "--out", out, *network, limit_s=20.0)
+    second = snakesim(home, "run", *SHORT, "--backend", "sim", "--out", out, *network)
     seen = {heard.message["lifecycle"] for heard in operator.heard("hal/clock")}
     assert "armed" not in seen and operator.next("hal/clock")["arming"] == armings, second.said
     assert second.code in (1, 2), second.said
@@ -69,7 +69,6 @@ def test_a1_a_robot_that_only_seems_to_be_there_keeps_a_run_from_starting_and_no
         second = snakesim(
             *(tmp_path, "run", *SHORT, "--set", 'robot="mamba"', "--router", routed.endpoint),
             *("--out", str(tmp_path / "second")),
-            limit_s=20.0,
         )
     assert second.code in (1, 2) and "mamba" in second.said, second.said
     operator.recover()
