@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from snakesim_gnc.control.controller import positions
@@ -36,7 +35,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.own_sample import message_of
 from snakesim_operator.recording.process import record
-from snakesim_operator.tools.command import ask_host
+from snakesim_operator.tools.command import ask_meanwhile
 from snakesim_operator.tools.parameters import Parameter, change, in_force, parameters_of
 from snakesim_operator.tools.robot_selection import RobotSelection
 from snakesim_operator.tools.stop import estop
@@ -107,9 +106,7 @@ class Robot:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -254,13 +251,7 @@ class Robot:
         return self._control
 
     def _ask(self, request: LifecycleRequest, done: str) -> None:
-        """Ask the host; commands go on meanwhile, without which an armed robot would be in a fault."""
-        with ThreadPoolExecutor(1) as beside:
-            told = (self._session, keys.LIFECYCLE, request, done, self._link, lambda _line: None)
-            answer = beside.submit(ask_host, *told)
-            while not answer.done():
-                self._pass()
-            answer.result()
+        ask_meanwhile(self._session, request, done, self._link, self._pass)
 
     def _pass(self) -> None:
         """Let some time pass."""

@@ -1,6 +1,7 @@
 """Arguments of `snakesim train`. Importable without the extra that it needs."""
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def _train(arguments: argparse.Namespace) -> int:
     for extra in ("train", "gym", "plot", "policy", *(["evaluate"] if arguments.cluster else [])):
         extras.check(extra, "`snakesim train`")
     from snakesim.training.search import Effort
-    from snakesim.training.trained import Request, train
+    from snakesim.training.trained import train
     from snakesim_hal.model.drawn import parse_draw
     from snakesim_hal.model.scenario import parse_set
 
@@ -64,29 +65,22 @@ def _train(arguments: argparse.Namespace) -> int:
         chosen += [f"--{flag.replace('_', '-')}", str(getattr(arguments, flag))]
     chosen += ["--from", arguments.begin] if arguments.begin else []
     chosen += ["--spread", f"{arguments.spread:g}"] if arguments.spread != 1.0 else []
-    chosen += [word for value in arguments.reward for word in ("--reward", value)]
-    chosen += [word for value in arguments.set for word in ("--set", value)]
-    chosen += [word for value in arguments.draw for word in ("--draw", value)]
+    for flag in ("reward", "set", "draw"):
+        chosen += [word for value in getattr(arguments, flag) for word in (f"--{flag}", value)]
+    environment = {
+        "scenario": arguments.scenario,
+        "duration": arguments.duration,
+        "reward": {one.key: one.value for one in map(parse_set, arguments.reward)},
+        "set": {one.key: one.value for one in map(parse_set, arguments.set)},
+        "draw": dict(map(parse_draw, arguments.draw)),
+    }
     return train(
-        Request(
-            scenario=arguments.scenario,
-            duration_s=arguments.duration,
-            reward={one.key: one.value for one in map(parse_set, arguments.reward)},
-            set={one.key: one.value for one in map(parse_set, arguments.set)},
-            draw=dict(map(parse_draw, arguments.draw)),
-            form=arguments.form,
-            begin=arguments.begin,
-            effort=Effort(
-                arguments.generations,
-                arguments.population,
-                arguments.fields,
-                arguments.check_fields,
-                arguments.seed,
-                arguments.spread,
-            ),
-            workers=arguments.workers,
-            cluster=arguments.cluster,
-            out=arguments.out,
-            again=["snakesim", "train", arguments.scenario, *chosen],
-        )
+        environment,
+        arguments.form,
+        arguments.begin,
+        Effort(**{one.name: getattr(arguments, one.name) for one in fields(Effort)}),
+        arguments.out,
+        workers=arguments.workers,
+        cluster=arguments.cluster,
+        again=["snakesim", "train", arguments.scenario, *chosen],
     )

@@ -7,7 +7,6 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -48,9 +47,7 @@ class Episodes:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._opened.close()
 
     def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[Episode]]:

@@ -122,7 +122,7 @@ def direction(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
     values: dict[str, dict[str, Any]] = {}
     wrong: list[str] = []
     with _hand(path, where, "joints direction") as hand:
-        for joint in _chosen(hand.joints, names, path):
+        for joint in chosen(hand.joints, names, path):
             before_rad, turn = hand.angle_now_rad(), None
             say(f"{joint.name}: turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more; Enter skips it")
             for angles_rad in hand.angles_rad(_entered):
@@ -151,7 +151,7 @@ def direction(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
 def limits(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
     """Watch how far each joint is moved, until Enter, and write that as its limits. names: joints; none: all."""
     with _hand(path, where, "joints limits") as hand:
-        chosen = _chosen(hand.joints, names, path)
+        watched = chosen(hand.joints, names, path)
         say("Move each joint by hand from end to end, slowly; then press Enter.")
         travel, drawn, due_s = None, 0, 0.0
         for angles_rad in hand.angles_rad(_entered):
@@ -162,11 +162,11 @@ def limits(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
                 drawn = overwrite_lines(_shown(hand.joints, travel, angles_rad), drawn)
     values: dict[str, dict[str, Any]] = {}
     for i, joint in enumerate(hand.joints):
-        found = None if travel is None or joint not in chosen else travel.limits(i)
+        found = None if travel is None or joint not in watched else travel.limits(i)
         if found is not None:
             values[joint.name] = {"angle_min_rad": found[0], "angle_max_rad": found[1]}
             say(f"{joint.name:<10} {found[0]:+.3f} to {found[1]:+.3f} rad")
-        elif joint in chosen:
+        elif joint in watched:
             say(f"{joint.name:<10} was not moved from end to end: left as it is")
     return _write(path, values, "end to end by hand")
 
@@ -183,7 +183,8 @@ def _hand(path: Path, where: RobotSelection, command: str) -> Iterator[Hand]:
         yield Hand(session, path)
 
 
-def _chosen(joints: Sequence[Joint], names: Sequence[str], path: Path) -> Sequence[Joint]:
+def chosen(joints: Sequence[Joint], names: Sequence[str], path: Path) -> Sequence[Joint]:
+    """Those of some names; all without any. Raises ConfigError."""
     known = {joint.name: joint for joint in joints}
     if unknown := [name for name in names if name not in known]:
         raise ConfigError(f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}")

@@ -8,7 +8,6 @@ ends the motion: the host's lease runs out within 100 ms.
 import signal
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,8 +30,8 @@ from snakesim_hal.wire.messages import (
     Status,
     request_to_arm,
 )
-from snakesim_operator.commissioning.by_hand import running_joints
-from snakesim_operator.tools.command import ask_host
+from snakesim_operator.commissioning.by_hand import chosen, running_joints
+from snakesim_operator.tools.command import ask_meanwhile
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.tools.teleop.keyboard import Keyboard
 
@@ -101,9 +100,8 @@ def jog(path: Path, where: RobotSelection, request: JogRequest) -> int:
     link = only_robot(where, "joints jog")
     set_realtime_priority(SERVICE_PRIORITY)  # where it is allowed: a command that is late ends the lease
     with open_session(link, CONNECT_S) as session:
-        names = [joint.name for joint in running_joints(session, path)]
-        if request.joint not in names:
-            raise ConfigError(f"{path}: has no {request.joint}; it has {names[0]} to {names[-1]}")
+        joints = running_joints(session, path)
+        (joint,) = chosen(joints, [request.joint], path)
         robot = session.latest(keys.DESCRIPTION, Description, CONNECT_S)
         status = session.latest(keys.STATUS, Status, CONNECT_S)
         if robot is None or status is None:
@@ -111,7 +109,7 @@ def jog(path: Path, where: RobotSelection, request: JogRequest) -> int:
         if status.lifecycle != "disarmed":
             raise RefusedError(f"the robot is {status.lifecycle}; it must be disarmed to jog: see `snakesim status`")
         with keyboard:
-            _Jogging(session, link, robot, status, request, names.index(request.joint)).go(keyboard)
+            _Jogging(session, link, robot, status, request, joints.index(joint)).go(keyboard)
     return 0
 
 
@@ -189,13 +187,7 @@ class _Jogging:
                 raise RefusedError(f"not armed: {self._status.why}")
 
     def _ask(self, request: LifecycleRequest, done: str) -> None:
-        """Ask the host; commands go on meanwhile."""
-        with ThreadPoolExecutor(1) as beside:
-            told = (self._session, keys.LIFECYCLE, request, done, self._link, lambda _line: None)
-            answer = beside.submit(ask_host, *told)
-            while not answer.done():
-                self._turn()
-            answer.result()
+        ask_meanwhile(self._session, request, done, self._link, self._turn)
 
     def _end(self) -> None:
         self._over = True

@@ -15,13 +15,12 @@ from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
-from snakesim_hal.terminal import Say, say
 from snakesim_operator import extras
 from snakesim_operator.console_port import open_port
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 
-def console(where: RobotSelection, port: int | None, commission: Path | None = None, say: Say = say) -> int:
+def console(where: RobotSelection, port: int | None, commission: Path | None = None) -> int:
     """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none, ConfigError.
 
     commission: its robot file, into which pages may write what was found by hand.
@@ -33,16 +32,16 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
     from snakesim_operator.console.console import show_live
 
     link = only_robot(where, "console")
-    show_live(link, _surroundings(link), open_port(port), _until_signal(), say, commission=commission)
+    show_live(link, _surroundings(link), open_port(port), _until_signal(), commission=commission)
     return 0
 
 
-def show_record(folder: Path, at_s: float, port: int | None, say: Say = say) -> int:
+def show_record(folder: Path, at_s: float, port: int | None) -> int:
     """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
     extras.check("console", "the console")
     from snakesim_operator.console.console import show_recorded
 
-    return show_recorded(folder, at_s, open_port(port), _until_signal(), say)
+    return show_recorded(folder, at_s, open_port(port), _until_signal())
 
 
 def _surroundings(link: Link):
@@ -79,5 +78,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     listening = socket.socket(fileno=given.arguments.listening)
     expected = expected_of(given.config)
-    show_live(given.link, Surroundings(given.config), listening, _until_signal(), say, expected)
+    show_live(given.link, Surroundings(given.config), listening, _until_signal(), expected)
     return 0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import Say
+from snakesim_hal.terminal import say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.console.changes import Changes
 from snakesim_operator.console.drawing import Surroundings
@@ -30,7 +30,6 @@ def show_live(
     around: Surroundings | None,
     listening: socket.socket,
     stop: threading.Event,
-    say: Say,
     expected: RobotSnapshot | None = None,
     commission: Path | None = None,
 ) -> None:
@@ -70,7 +69,7 @@ def show_live(
                 page.show(snapshot)
 
 
-def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event, say: Say) -> int:
+def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event) -> int:
     """Show a run's record until `stop` is set. Returns the exit code. Raises ConfigError when the folder has none."""
     # What only recordings need would delay the page of a run that starts.
     from snakesim_operator.console.recorded import RecordedRun

@@ -13,9 +13,8 @@ from snakesim_hal.errors import NotConnectedError, RefusedError, SnakesimError
 from snakesim_hal.network.session import Link, Publisher, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Intent, Message, SettingsRequest
-from snakesim_operator.tools.command import ANSWER_S, arm, clear, disarm
+from snakesim_operator.tools.command import ANSWER_S, arm, clear, disarm, simulator
 from snakesim_operator.tools.fault import FaultOrder, fault
-from snakesim_operator.tools.simulator import simulator
 from snakesim_operator.tools.simulator_order import SimulatorOrder
 from snakesim_operator.tools.stop import estop
 from snakesim_operator.tools.targets import RobotSelection

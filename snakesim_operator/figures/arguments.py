@@ -1,11 +1,11 @@
 """Arguments of `snakesim plot`. Importable without the extra that it needs."""
 
 import argparse
-from math import inf
 from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import number
+from snakesim_operator.playback.arguments import add_span
 
 TASK = "results"  # under which `snakesim --help` lists it
 
@@ -28,10 +28,7 @@ def add_commands(commands: Any) -> None:
     )
     plot.add_argument("--width", type=number(1.0, 40.0, "inches"), default=3.5, help="in inches (3.5: one column)")
     plot.add_argument("--dark", action="store_true", help="on black, for slides")
-    for flag, name, default, verb in (("--from", "from_s", 0.0, "begin"), ("--to", "to_s", inf, "end")):
-        plot.add_argument(
-            flag, dest=name, type=number(0.0, inf, "s"), default=default, metavar="S", help=f"{verb} S seconds in"
-        )
+    add_span(plot)
     plot.set_defaults(act=_plot)
 
 
@@ -39,16 +36,8 @@ def _plot(arguments: argparse.Namespace) -> int:
     from snakesim_operator import extras
 
     extras.check("plot", "`snakesim plot`")
-    from snakesim_operator.figures.drawn import Request, plot
+    from snakesim_operator.figures.drawn import plot
 
-    return plot(
-        Request(
-            run=arguments.run,
-            signals=arguments.signals,
-            paper=arguments.paper,
-            out=arguments.out,
-            width_in=arguments.width,
-            span_s=(arguments.from_s, arguments.to_s),
-            dark=arguments.dark,
-        )
-    )
+    span_s = (arguments.from_s, arguments.to_s)
+    look = {"paper": arguments.paper, "width_in": arguments.width, "span_s": span_s, "dark": arguments.dark}
+    return plot(arguments.run, arguments.signals, arguments.out, **look)

@@ -1,7 +1,6 @@
 """Signals of a run over time, as a figure for a paper; and the files that figures are written to."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.style
@@ -26,33 +25,33 @@ MODE_OF = {"rad": Mode.POSITION, "rad/s": Mode.VELOCITY, "N·m": Mode.TORQUE}  #
 MANY = 6  # lines, from which on the legend stands beside the axes
 
 
-@dataclass(frozen=True)
-class Request:
-    """What the command line asks for."""
-
-    run: Path
-    signals: Sequence[str]
-    paper: bool
-    out: Path | None
-    width_in: float
-    span_s: tuple[float, float]
-    dark: bool
-
-
-def plot(request: Request) -> int:
-    """Draw and write it. Returns 0, or 3 when the recording lacks something. Raises ConfigError."""
-    record = RunRecord.load(request.run)
+def plot(
+    run: Path,
+    names: Sequence[str],
+    out: Path | None,
+    *,
+    paper: bool,
+    width_in: float,
+    span_s: tuple[float, float],
+    dark: bool,
+) -> int:
+    """Draw signals, or the paper's figures. Returns 0, or 3 when the recording lacks something. Raises ConfigError."""
+    record = RunRecord.load(run)
     if not len(record.time_s):
-        raise ConfigError(f"{request.run}: nothing was recorded in it; the robot was never armed")
-    with matplotlib.style.context(["dark_background", STYLE] if request.dark else STYLE):
-        if request.paper:
-            _write_paper(request, record)
+        raise ConfigError(f"{run}: nothing was recorded in it; the robot was never armed")
+    within = run if run.is_dir() else run.parent
+    path = out or (within if paper else within / "plot.pdf")
+    with matplotlib.style.context(["dark_background", STYLE] if dark else STYLE):
+        if paper:
+            if path.suffix in FORMATS:
+                raise ConfigError(f"--out {path}: the paper's figures are several files; give a folder")
+            for name, figure in figures(record, width_in, span_s).items():
+                written(figure, path / f"{name}.pdf")
         else:
-            out = request.out or _within(request.run) / "plot.pdf"
-            if out.suffix not in FORMATS:
-                raise ConfigError(f"--out {out}: give a file that ends in {', '.join(FORMATS)}")
-            written(signals(record, request.signals, request.width_in, request.span_s), out)
-    return exit_code(request.run, record.lacks)
+            if path.suffix not in FORMATS:
+                raise ConfigError(f"--out {path}: give a file that ends in {', '.join(FORMATS)}")
+            written(signals(record, names, width_in, span_s), path)
+    return exit_code(run, record.lacks)
 
 
 def signals(record: RunRecord, names: Sequence[str], width_in: float, span_s: tuple[float, float]) -> Figure:
@@ -122,15 +121,3 @@ def _limit(axes: Axes, record: RunRecord, span_s: tuple[float, float]) -> None:
         raise ConfigError(f"{asked}: give a span, its begin first, within the 0 to {last_s:g} s of this run")
     axes.set_xlim(span_s[0], min(span_s[1], last_s))
     axes.set_xlabel("time [s]")
-
-
-def _write_paper(request: Request, record: RunRecord) -> None:
-    folder = request.out or _within(request.run)
-    if folder.suffix in FORMATS:
-        raise ConfigError(f"--out {folder}: the paper's figures are several files; give a folder")
-    for name, figure in figures(record, request.width_in, request.span_s).items():
-        written(figure, folder / f"{name}.pdf")
-
-
-def _within(run: Path) -> Path:
-    return run if run.is_dir() else run.parent

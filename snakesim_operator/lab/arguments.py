@@ -2,9 +2,12 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.terminal import say
+
+if TYPE_CHECKING:
+    from snakesim_operator.lab.lab_file import Lab
 
 AUTHORITY = "authority"
 TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
@@ -52,22 +55,18 @@ def _example(_arguments: argparse.Namespace) -> int:
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    _need_extra()
-    from snakesim_operator.lab.lab_file import load_lab
+    lab = _lab(arguments)
     from snakesim_operator.lab.render import render
 
-    for path in render(load_lab(arguments.lab), arguments.out):
+    for path in render(lab, arguments.out):
         say(str(path))
     return 0
 
 
 def _certs(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.lab.identities import identities
-    from snakesim_operator.lab.lab_file import load_lab
-
-    lab = load_lab(arguments.lab)
-    _need_extra()
+    lab = _lab(arguments)
     from snakesim_operator.lab.certificates import write_certificates
+    from snakesim_operator.lab.identities import identities
 
     authority = arguments.authority or arguments.out / AUTHORITY
     done = write_certificates(lab, arguments.out, authority, rotate=arguments.rotate)
@@ -79,16 +78,16 @@ def _certs(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.lab.lab_file import load_lab
-
-    lab = load_lab(arguments.lab)
-    _need_extra()
+    lab = _lab(arguments)
     from snakesim_operator.lab.check import check
 
     return check(lab, arguments.out)
 
 
-def _need_extra() -> None:
+def _lab(arguments: argparse.Namespace) -> "Lab":
     from snakesim_operator import extras
+    from snakesim_operator.lab.lab_file import load_lab
 
+    lab = load_lab(arguments.lab)
     extras.check("lab", "`snakesim deploy`")
+    return lab

@@ -88,9 +88,9 @@ class Lab:
     file: LabFile
     path: Path
 
-    def endpoints(self, *, besides: str | None = None) -> list[str]:
+    def endpoints(self) -> list[str]:
         """Where the routers listen, in the file's order."""
-        return [self.endpoint(name) for name in self.file.routers if name != besides]
+        return [self.endpoint(name) for name in self.file.routers]
 
     def endpoint(self, router: str) -> str:
         """Where a router listens: `tls/ADDRESS:PORT`."""

@@ -89,13 +89,15 @@ def add_commands(commands: Any) -> None:
     video.add_argument(
         "--speed", type=number(0.01, 100.0), default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)"
     )
-    video.add_argument(
-        "--from", dest="from_s", type=number(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds in"
-    )
-    video.add_argument(
-        "--to", dest="to_s", type=number(0.0, inf, "s"), default=inf, metavar="S", help="end S seconds in"
-    )
+    add_span(video)
     video.set_defaults(act=_video)
+
+
+def add_span(parser: argparse.ArgumentParser) -> None:
+    """Add `--from` and `--to`, of a part of a run."""
+    for flag, name, default, verb in (("--from", "from_s", 0.0, "begin"), ("--to", "to_s", inf, "end")):
+        about = f"{verb} S seconds in"
+        parser.add_argument(flag, dest=name, type=number(0.0, inf, "s"), default=default, metavar="S", help=about)
 
 
 def _add_recording(parser: argparse.ArgumentParser) -> None:
@@ -161,7 +163,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     from snakesim_hal.model.scenario import Override, parse_set
     from snakesim_operator.playback.control import replay_control
     from snakesim_operator.playback.info import recording_of
-    from snakesim_operator.playback.play import PlayRequest, play
+    from snakesim_operator.playback.play import play
 
     path = recording_of(arguments.recording)
     if arguments.control:
@@ -179,8 +181,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         check_endpoint(arguments.endpoint, "--endpoint")
     if arguments.namespace is not None:
         check_namespace(arguments.namespace, "--namespace")
-    request = PlayRequest(path, arguments.endpoint, arguments.namespace, arguments.rate, arguments.step)
+    where = {"endpoint": arguments.endpoint, "namespace": arguments.namespace}
     try:
-        return play(request, iter(sys.stdin), say)
+        return play(path, iter(sys.stdin), say, **where, rate=arguments.rate, step=arguments.step)
     except KeyboardInterrupt:
         return 130

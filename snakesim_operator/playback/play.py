@@ -5,12 +5,10 @@ It is no robot: no host answers, nothing can be armed. So it listens on an endpo
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Publisher, Session, open_session
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
@@ -24,43 +22,35 @@ from snakesim_operator.results.recorded import read_recording
 LONGEST_PAUSE_S = 10.0  # between two messages, whatever their times are
 
 
-@dataclass(frozen=True)
-class PlayRequest:
-    """The command's options. rate: of robot time to wall time; step: one tick at each line of input."""
+def play(
+    path: Path, lines: Iterator[str], say: Say, *, endpoint: str | None, namespace: str | None, rate: float, step: bool
+) -> int:
+    """Play it once. Raises ConfigError, NotConnectedError.
 
-    path: Path
-    endpoint: str | None = None
-    namespace: str | None = None
-    rate: float = 1.0
-    step: bool = False
-
-
-def play(request: PlayRequest, lines: Iterator[str], say: Say) -> int:
-    """Play it once. lines: what the user types. Raises ConfigError, NotConnectedError."""
-    if not request.rate > 0:
-        raise ConfigError(f"--rate {request.rate:g}: give a number above 0; 2 is twice as fast")
-    robot = read_recording(request.path, (keys.DESCRIPTION,)).description
-    namespace = request.namespace or (robot.robot if robot is not None else "recording")
-    link = Link(request.endpoint or DEFAULT_ENDPOINT, namespace, listen=True, largest_bytes=MAX_IMAGE_BYTES)
-    reader = RecordingReader(request.path)
+    lines: what the user types. rate: of robot time to wall time; step: one tick at each line of input.
+    """
+    robot = read_recording(path, (keys.DESCRIPTION,)).description
+    namespace = namespace or (robot.robot if robot is not None else "recording")
+    link = Link(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, largest_bytes=MAX_IMAGE_BYTES)
+    reader = RecordingReader(path)
     messages = in_robot_order(reader)
     with open_session(link) as session:
-        how = "Enter plays a tick" if request.step else f"{request.rate:g} x real time"
-        say(f"playing {request.path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
+        how = "Enter plays a tick" if step else f"{rate:g} x real time"
+        say(f"playing {path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
         player = _Player(session)
         began: tuple[float, int] | None = None
         for time_ns, together in groupby(messages, lambda recorded: recorded.time_ns):
-            if request.step:
+            if step:
                 say(f"{time_ns * 1e-9:.3f} s")
                 if next(lines, None) is None:
                     break
             else:
                 began = began or (time.monotonic(), time_ns)
-                began = _waited(began, time_ns, request.rate)
+                began = _waited(began, time_ns, rate)
             for recorded in together:
                 player.put(recorded)
         say(f"{player.count} messages played")
-    return exit_code(request.path, reader.lacks)
+    return exit_code(path, reader.lacks)
 
 
 def _waited(began: tuple[float, int], time_ns: int, rate: float) -> tuple[float, int]:

@@ -27,20 +27,10 @@ def add_commands(commands: Any) -> None:
         "--ros-router", default=ROS_ROUTER, metavar="ENDPOINT", help=f"router of the ROS nodes ({ROS_ROUTER})"
     )
     made.add_argument("--ros-namespace", metavar="NAME", help="of topics and frames, for several robots in one graph")
-    made.add_argument(
-        "--hz",
-        type=number(0.1, MAX_HZ, "Hz"),
-        default=50.0,
-        metavar="HZ",
-        help="most messages a second of a topic (50)",
-    )
-    made.add_argument(
-        "--image-hz",
-        type=number(0.1, MAX_HZ, "Hz"),
-        default=5.0,
-        metavar="HZ",
-        help="most images a second of a camera (5)",
-    )
+    most = (("--hz", 50.0, "messages a second of a topic"), ("--image-hz", 5.0, "images a second of a camera"))
+    for flag, default, what in most:
+        about = f"most {what} ({default:g})"
+        made.add_argument(flag, type=number(0.1, MAX_HZ, "Hz"), default=default, metavar="HZ", help=about)
     made.add_argument("--cmd-vel", action="store_true", help="let ROS ask for speed and direction, on cmd_vel")
     made.add_argument(
         "--joint-commands",

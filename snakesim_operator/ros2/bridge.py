@@ -16,7 +16,7 @@ import numpy as np
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Session
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
 from snakesim_hal.wire.own_sample import message_of, own_kinds
@@ -52,8 +52,8 @@ def is_consistent(robot: m.Description) -> bool:
 class Bridge:
     """One robot as one ROS node."""
 
-    def __init__(self, session: Session, node: Node, robot: m.Description, options: Options, say: Say = say) -> None:
-        self._session, self._node, self._options, self._say = session, node, options, say
+    def __init__(self, session: Session, node: Node, robot: m.Description, options: Options) -> None:
+        self._session, self._node, self._options = session, node, options
         self.prefix = f"{options.namespace.strip('/')}/" if options.namespace else ""
         self._ros_time = RosTime(wall_time=options.wall_time)
         self._clocks = session.reader(keys.CLOCK, m.Clock)
@@ -241,16 +241,16 @@ class Bridge:
         if clock is not None:
             if self._clock is not None and clock.tick < self._clock.tick:
                 self._ros_time.start_over()
-                self._say("the robot's host has restarted: its time starts over")
+                say("the robot's host has restarted: its time starts over")
             self._ros_time.heard(clock.stamp_ns)
             self._clock = clock
             if self._ros_clock is not None:
                 self._ros_clock.put(ros.clock(clock.stamp_ns))
             if self._heard_s is None:
-                self._say("the robot is back")
+                say("the robot is back")
             self._heard_s = now_s
         elif self._heard_s is not None and now_s - self._heard_s > SILENT_S:
-            self._say(f"no clock from the robot for {SILENT_S:g} s; waiting for it")
+            say(f"no clock from the robot for {SILENT_S:g} s; waiting for it")
             self._heard_s = None
         described = self._descriptions.newest(is_consistent)
         if described is not None and described != self._robot:

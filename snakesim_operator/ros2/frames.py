@@ -31,10 +31,8 @@ class Frames:
     def __init__(self, robot: Description, prefix: str = "") -> None:
         self._robot, self._prefix = robot, prefix
         self.odom, self.base = f"{prefix}odom", f"{prefix}base_link"
-        self.fixed = [Transform(MAP, self.odom, NOWHERE, UNTURNED), self._at_base()]
-
-    def _at_base(self) -> Transform:
-        return Transform(self.base, self.link(0), NOWHERE, UNTURNED)
+        at_base = Transform(self.base, self.link(0), NOWHERE, UNTURNED)
+        self.fixed = [Transform(MAP, self.odom, NOWHERE, UNTURNED), at_base]
 
     def link(self, index: int) -> str:
         """Frame of a link."""

@@ -34,10 +34,6 @@ STRING = _type("std_msgs/msg/String")
 CLOCK = _type("rosgraph_msgs/msg/Clock")
 TWIST = _type("geometry_msgs/msg/Twist")
 DIAGNOSTICS = _type("diagnostic_msgs/msg/DiagnosticArray")
-TYPES = (
-    *(JOINT_STATE, TRANSFORMS, MARKERS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU, LASER_SCAN, NUMBERS, STRING, CLOCK),
-    *(TWIST, DIAGNOSTICS),
-)
 
 Triple = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]

@@ -11,9 +11,8 @@ from snakesim_hal.network.local_registry import LocalRobot
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.stop_port import open_stop_port, stop_address
 from snakesim_hal.wire import keys
-from snakesim_operator.tools.targets import robots_on
+from snakesim_operator.tools.targets import CONNECT_S, robots_on
 
-CONNECT_S = 1.0
 LOOPBACK = "127.0.0.1"
 TRIES = 10
 

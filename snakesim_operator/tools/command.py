@@ -1,11 +1,12 @@
-"""Commands to a robot: `snakesim arm`, `disarm`, `clear`.
+"""Commands to a robot: `snakesim arm`, `disarm`, `clear`, `sim`.
 
 A name is not an identity: any client on the network can answer in a robot's name. So all hosts are queried, two answers
 are an error, and an answer is accepted once the robot's host publishes the new state itself.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.host.latch import forget_stop, stops_kept
@@ -14,11 +15,13 @@ from snakesim_hal.process import user_name
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, request_to_arm
+from snakesim_operator.tools.simulator_order import SimulatorOrder
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
 ANSWER_S = 5.0
 DESCRIPTION_S = 3.0
 SHOWN_S = 1.5  # until the host's status must show what its answer says
+DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
 
 
 def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unchecked: bool = False) -> int:
@@ -45,11 +48,8 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unch
 
 def disarm(where: RobotSelection, say: Say = say) -> int:
     """Make the joints passive; later commands do not move them."""
-    link = only_robot(where, "disarm")
-    with open_session(link, CONNECT_S) as session:
-        return ask_host(
-            session, keys.LIFECYCLE, LifecycleRequest(action="disarm", who=user_name()), "disarmed", link, say
-        )
+    request = LifecycleRequest(action="disarm", who=user_name())
+    return _ask_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
 
 
 def clear(where: RobotSelection, say: Say = say) -> int:
@@ -66,10 +66,18 @@ def clear(where: RobotSelection, say: Say = say) -> int:
         for path in kept:
             say(f"{path.parent.name}: {forget_stop(path)}; cleared by {user_name()}. No robot of that name runs here")
         return 0
+    return _ask_robot(link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", say)
+
+
+def simulator(order: SimulatorOrder, where: RobotSelection, say: Say = say) -> int:
+    """Pause, step, speed and reset of a simulator; a robot that moves something real refuses, with its reason."""
+    request = SimulatorRequest(action=order.action, who=order.who or user_name(), ticks=order.ticks, speed=order.speed)
+    return _ask_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
+
+
+def _ask_robot(link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: Say) -> int:
     with open_session(link, CONNECT_S) as session:
-        return ask_host(
-            session, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", link, say
-        )
+        return ask_host(session, key, request, done, link, say)
 
 
 def ask_host(
@@ -92,6 +100,17 @@ def ask_host(
         raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
     say(f"{name}: {done}: {answers[0].reason}")
     return 0
+
+
+def ask_meanwhile(
+    session: Session, request: LifecycleRequest, done: str, link: Link, turn: Callable[[], object]
+) -> None:
+    """Query the host, as `ask_host`; commands go on meanwhile, without which an armed robot would be in a fault."""
+    with ThreadPoolExecutor(1) as beside:
+        answer = beside.submit(ask_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
+        while not answer.done():
+            turn()
+        answer.result()
 
 
 def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:

@@ -54,15 +54,11 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
 def python() -> Iterator[Finding]:
     """The interpreter."""
     detail = f"{sys.version.split()[0]} at {sys.executable}"
-    if sys.version_info < MIN_PYTHON:
-        yield Finding(
-            what="Python",
-            state="fail",
-            detail=f"{detail}; 3.11 or newer is needed",
-            fix=["make setup PYTHON=python3.11"],
-        )
-        return
-    yield Finding(what="Python", state="ok", detail=detail)
+    if sys.version_info >= MIN_PYTHON:
+        yield Finding(what="Python", state="ok", detail=detail)
+    else:
+        detail, fix = f"{detail}; 3.11 or newer is needed", ["make setup PYTHON=python3.11"]
+        yield Finding(what="Python", state="fail", detail=detail, fix=fix)
 
 
 def packages() -> Iterator[Finding]:

@@ -18,7 +18,7 @@ import msgspec
 
 from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal, stop_signals, user_name
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.terminal import say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.recording.process import record
 from snakesim_operator.tools.targets import RobotSelection, only_robot
@@ -70,13 +70,13 @@ class _Keyboard:
         return not self._queue.empty() and self.line() is not None
 
 
-def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines: Iterator[str], say: Say = say) -> int:
+def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
     """Until q, or the end of the input. Exit code 1 when the disk took no more. Raises SnakesimError."""
     link = replace(only_robot(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
     folder.mkdir(parents=True, exist_ok=True)
     keyboard = _Keyboard(lines)
     on_stop_signal(keyboard.interrupt)
-    demonstrations = _Demonstrations(link, folder, task, keyboard, say)
+    demonstrations = _Demonstrations(link, folder, task, keyboard)
     say(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {HELP}")
     try:
         while not demonstrations.failure:
@@ -94,8 +94,8 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
 class _Demonstrations:
     """The episodes of one sitting."""
 
-    def __init__(self, link: Link, folder: Path, task: str, keyboard: _Keyboard, say: Say) -> None:
-        self._link, self._folder, self._task, self._keyboard, self._say = link, folder, task, keyboard, say
+    def __init__(self, link: Link, folder: Path, task: str, keyboard: _Keyboard) -> None:
+        self._link, self._folder, self._task, self._keyboard = link, folder, task, keyboard
         self.kept = 0
         self.failure = ""
 
@@ -103,28 +103,28 @@ class _Demonstrations:
         """From now to Enter, and what became of it. Raises _Ended."""
         path = next(p for i in count() if not (p := self._folder / f"episode-{i:03d}.mcap").exists())
         began = datetime.now(UTC).isoformat(timespec="seconds")
-        self._say(f"{path.name}: recording; Enter ends it")
+        say(f"{path.name}: recording; Enter ends it")
         success = None
         try:
             recorder = record(self._link, path, lambda: not self._keyboard.pressed())
             self.failure = recorder.recording.failure
             if not self.failure:
-                self._say(f"{path.name}: {recorder.recording.counts.total()} messages. s, f or d?")
+                say(f"{path.name}: {recorder.recording.counts.total()} messages. s, f or d?")
                 success = self._judgement()
         finally:
             if success is None:
                 path.unlink(missing_ok=True)
-                self._say(f"{path.name}: dropped")
+                say(f"{path.name}: dropped")
         if success is not None:
             self._keep(EpisodeLabel(file=path.name, task=self._task, success=success, who=user_name(), began=began))
 
     def _judgement(self) -> bool | None:
         while (word := self._keyboard.line()) not in WORDS:
-            self._say(f"{word!r}: s if it succeeded, f if it failed, d to drop it")
+            say(f"{word!r}: s if it succeeded, f if it failed, d to drop it")
         return WORDS[word]
 
     def _keep(self, label: EpisodeLabel) -> None:
         with (self._folder / EPISODES).open("ab") as file:
             file.write(msgspec.json.encode(label) + b"\n")
         self.kept += 1
-        self._say(f"{label.file}: {'succeeded' if label.success else 'failed'}. Enter begins the next one")
+        say(f"{label.file}: {'succeeded' if label.success else 'failed'}. Enter begins the next one")

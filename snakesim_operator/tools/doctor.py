@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from snakesim_hal.terminal import Say, say, say_json
+from snakesim_hal.terminal import say, say_json
 from snakesim_operator.tools import computer
 from snakesim_operator.tools.computer import Finding
 from snakesim_operator.tools.kernel import kernel
@@ -24,24 +24,24 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 )
 
 
-def doctor(where: RobotSelection, *, as_json: bool, say: Say = say) -> int:
+def doctor(where: RobotSelection, *, as_json: bool) -> int:
     """Check everything. Returns 1 when something fails without which no run is possible, else 0."""
     found: list[Finding] = []
     for check in (*CHECKS, ports, lambda: routers(where)):
         for finding in check():
             found.append(finding)
             if not as_json:
-                _print(finding, say)
+                _print(finding)
     failed = [finding.what for finding in found if finding.state == "fail"]
     if as_json:
-        say_json({"ok": not failed, "findings": msgspec.to_builtins(found)}, say)
+        say_json({"ok": not failed, "findings": msgspec.to_builtins(found)})
     else:
         warned = sum(finding.state == "warn" for finding in found)
         say(f"{len(found)} checked; fail: {', '.join(failed) or 'none'}; warnings: {warned}")
     return 1 if failed else 0
 
 
-def _print(finding: Finding, say: Say) -> None:
+def _print(finding: Finding) -> None:
     say(f"{finding.state:<5}{finding.what:<21}{finding.detail}")
     for fix in finding.fix:
         say(f"     {'':<21}$ {fix}")

@@ -7,79 +7,55 @@ import statistics
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache
 from queue import Empty
 from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, WireError, did_you_mean, short
+from snakesim_hal.errors import ConfigError, WireError, did_you_mean, short
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, Session, intersects, key_expression, open_session
-from snakesim_hal.terminal import Say, print_stderr, say
+from snakesim_hal.network.session import Arrival, intersects, key_expression
+from snakesim_hal.terminal import print_stderr, say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, Decoder
 from snakesim_hal.wire.messages import OwnSample
-from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
+from snakesim_operator.tools.targets import RobotSelection, sessions_on
+from snakesim_operator.tools.traffic import decoder_of
 
 RATE_PERIOD_S = 1.0
 MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network
 
 
-@dataclass(frozen=True)
-class EchoRequest:
-    """The command's options. key: relative to the robot, wildcards allowed; None: list the keys."""
+def echo(key: str | None, where: RobotSelection, *, rate_only: bool, count: int | None) -> int:
+    """Print messages on a key, from every addressed robot. Raises NotConnectedError, ConfigError.
 
-    key: str | None
-    rate_only: bool = False
-    count: int | None = None
-
-
-def echo(request: EchoRequest, where: RobotSelection, say: Say = say) -> int:
-    """Print messages on a key, from every addressed robot. Raises NotConnectedError, ConfigError."""
-    if request.key is None:
+    key: relative to the robot, wildcards allowed; None: list the keys. count: after which it ends; None: never.
+    """
+    if key is None:
         for line in _key_lines():
             say(line)
         print_stderr("`snakesim echo KEY` prints the messages, --hz their rate; `snakesim top` shows all rates at once")
         return 0
-    relative = key_expression(request.key.strip("/"))
+    relative = key_expression(key.strip("/"))
     rows = [row for row in _echoed() if intersects(relative, row.key)]
     if not rows:
-        meant = did_you_mean(request.key, [row.key for row in _echoed()]).strip()
+        meant = did_you_mean(key, [row.key for row in _echoed()]).strip()
         lines = [*_key_lines(), meant] if meant else _key_lines()
-        raise ConfigError(f"there is no key {short(request.key)!r}; available keys:", *lines)
+        raise ConfigError(f"there is no key {short(key)!r}; available keys:", *lines)
     latched = tuple(row.key for row in rows if row.kind == "latched")
     within = "" if where.namespace is not None else "**/"
-    pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{key}" for key in latched)
+    pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{one}" for one in latched)
     waiting = OutputQueue()
     with contextlib.ExitStack() as stack:
-        for session in _sessions(where, stack):
+        for _, session in sessions_on(where, stack):
             # A latched value is older than the streams: a subscriber to both would drop it as too old.
-            for key in latched_keys:
-                session.on_latched_arrival(key, waiting.only(lambda found: intersects(pattern, found)))
+            for one in latched_keys:
+                session.on_latched_arrival(one, waiting.only(lambda found: intersects(pattern, found)))
             if len(latched) < len(rows):
                 session.on_arrival(
-                    pattern, waiting.only(lambda found: not any(intersects(key, found) for key in latched_keys))
+                    pattern, waiting.only(lambda found: not any(intersects(one, found) for one in latched_keys))
                 )
-        if request.rate_only:
-            _print_rates(waiting, request.count, say)
-        else:
-            _print_messages(waiting, request.count, say)
+        (_print_rates if rate_only else _print_messages)(waiting, count)
     return 0
-
-
-def _sessions(where: RobotSelection, stack: contextlib.ExitStack) -> list[Session]:
-    """One on every network that answers."""
-    found: list[Session] = []
-    for link in where.networks():
-        with contextlib.suppress(NotConnectedError):
-            found.append(stack.enter_context(open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES), CONNECT_S)))
-    if not found:
-        raise NotConnectedError(
-            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
-        )
-    return found
 
 
 def _echoed() -> list[keys.Row]:
@@ -129,7 +105,7 @@ class OutputQueue:
         return arrival
 
 
-def _print_messages(waiting: OutputQueue, count: int | None, say: Say) -> None:
+def _print_messages(waiting: OutputQueue, count: int | None) -> None:
     for _ in itertools.count() if count is None else range(count):
         arrival = waiting.get()
         content = {"key": arrival.key, **_content(arrival)}
@@ -143,7 +119,7 @@ def _content(arrival: Arrival) -> dict[str, Any]:
     if message is None:
         return {"error": "no message is known on this key"}
     try:
-        decoded = _decoder(message).decode(arrival.payload, arrival.encoding)
+        decoded = decoder_of(message).decode(arrival.payload, arrival.encoding)
         if message is OwnSample:  # with the fields that only its robot describes, as they were sent
             return {"message": msgspec.msgpack.decode(arrival.payload)}
         return {"message": msgspec.to_builtins(decoded)}
@@ -151,10 +127,7 @@ def _content(arrival: Arrival) -> dict[str, Any]:
         return {"error": str(error)}
 
 
-_decoder = cache(Decoder)
-
-
-def _print_rates(waiting: OutputQueue, count: int | None, say: Say) -> None:
+def _print_rates(waiting: OutputQueue, count: int | None) -> None:
     for _ in itertools.count() if count is None else range(count):
         stamps: dict[str, list[int]] = {}
         until = time.monotonic() + RATE_PERIOD_S

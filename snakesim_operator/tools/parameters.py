@@ -17,7 +17,7 @@ from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, di
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.network.session import Session, open_session
 from snakesim_hal.process import user_name
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, SettingsRequest
 from snakesim_operator.tools.command import ANSWER_S, SHOWN_S
@@ -152,7 +152,7 @@ def known_name(name: str, settings: ControlSettings) -> str:
     return name.removeprefix(PREFIX)
 
 
-def list_parameters(where: RobotSelection, say: Say = say) -> int:
+def list_parameters(where: RobotSelection) -> int:
     """`snakesim param list`."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
         settings = in_force(session)
@@ -168,7 +168,7 @@ def list_parameters(where: RobotSelection, say: Say = say) -> int:
     return 0
 
 
-def get_parameter(name: str, where: RobotSelection, say: Say = say) -> int:
+def get_parameter(name: str, where: RobotSelection) -> int:
     """`snakesim param get`: the value alone, for scripts."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
         settings = in_force(session)
@@ -177,7 +177,7 @@ def get_parameter(name: str, where: RobotSelection, say: Say = say) -> int:
     return 0
 
 
-def set_parameters(texts: list[str], where: RobotSelection, say: Say = say) -> int:
+def set_parameters(texts: list[str], where: RobotSelection) -> int:
     """`snakesim param set`. Raises ConfigError, RefusedError."""
     changes = {override.key: override.value for override in map(parse_set, texts)}
     with open_session(only_robot(where, "param set"), CONNECT_S) as session:

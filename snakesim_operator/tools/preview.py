@@ -17,7 +17,7 @@ import numpy as np
 from snakesim_hal.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Publisher, Reader, Session, open_session
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, Preview
@@ -32,7 +32,7 @@ DESCRIBED_S = 5.0
 KEPT = 4  # images: a few of noise do not displace the valid one
 
 
-def preview(where: RobotSelection, hz: float, width: int, say: Say = say) -> int:
+def preview(where: RobotSelection, hz: float, width: int) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
     _check(hz, width)
     link = only_robot(where, "preview")

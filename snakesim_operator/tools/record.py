@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from snakesim_hal.process import on_stop_signal, stop_signals
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.terminal import say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.recording.live import LiveServer
 from snakesim_operator.recording.process import record
@@ -22,7 +22,6 @@ def record_robot(
     duration_s: float | None,
     foxglove_port: int | None = None,
     foxglove_origins: Sequence[str] = (),
-    say: Say = say,
     *,
     raw_only: bool = False,
 ) -> int:

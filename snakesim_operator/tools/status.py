@@ -14,33 +14,31 @@ from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, differences
 from snakesim_hal.network.session import Arrival, Link, open_session
-from snakesim_hal.terminal import Say, say, say_json
+from snakesim_hal.terminal import say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Process, Status
 from snakesim_operator.results import last_run
-from snakesim_operator.tools.targets import RobotSelection, flags_of, namespace_of
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, flags_of, namespace_of
 
 STATUS_WAIT_S = 1.0
-CONNECT_S = 1.0
+Robot = tuple[Link, list[Status], list[Process]]  # the newest status of each of its hosts, and its live processes
 
 
-def show_status(where: RobotSelection, say: Say = say, *, as_json: bool = False) -> int:
+def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
-    found: list[tuple[Link, list[Status]]] = []
-    processes: dict[tuple[str, str | None], list[Process]] = {}
+    found: list[Robot] = []
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            found += _statuses(link, processes)
+            found += _robots(link)
     silent = [
         robot
         for robot in where.local()
-        if not any(link.endpoint == robot.endpoint and link.namespace == robot.namespace for link, _ in found)
+        if not any(link.endpoint == robot.endpoint and link.namespace == robot.namespace for link, *_ in found)
     ]
-    well = bool(found) and all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
+    well = bool(found) and all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses, _ in found)
     if as_json:
-        robots = [_for_scripts(link, said, processes) for link, said in found]
-        say_json({"robots": robots, "silent": silent}, say)
+        say_json({"robots": [_for_scripts(*robot) for robot in found], "silent": silent})
         return 0 if well and not silent else 1
     for robot in silent:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
@@ -50,23 +48,21 @@ def show_status(where: RobotSelection, say: Say = say, *, as_json: bool = False)
         say(f"no robot answers on {', '.join(where.endpoints())}{last}")
         say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
         return 1
-    for link, statuses in found:
-        for line in _in_words(link, statuses[-1]):
-            say(line)
-        for line in processes_in_words(processes.get((link.endpoint, link.namespace), [])):
-            say(line)
+    for link, statuses, processes in found:
+        lines = [*_in_words(link, statuses[-1]), *processes_in_words(processes)]
         if len({status.host for status in statuses}) > 1:
-            say("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
-        for line in _what_to_type(link, statuses[-1]):
+            lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
+        for line in [*lines, *_what_to_type(link, statuses[-1])]:
             say(line)
     return 0 if well and not silent else 1
 
 
-def _statuses(link: Link, processes: dict[tuple[str, str | None], list[Process]]) -> list[tuple[Link, list[Status]]]:
-    """The newest status of each host of each robot on a network; and its live processes, put into `processes`."""
+def _robots(link: Link) -> list[Robot]:
+    """Those on a network."""
     arrivals: Mailbox[Arrival] = Mailbox()
     decoders = {keys.STATUS: Decoder(Status), keys.PROCESS_ALL: Decoder(Process)}
     found: dict[str, dict[str | None, Status]] = {}
+    processes: dict[str, list[Process]] = {}
     prefix = "" if link.namespace is not None else "**/"
     with open_session(link, CONNECT_S) as session:
         for key in decoders:
@@ -86,17 +82,20 @@ def _statuses(link: Link, processes: dict[tuple[str, str | None], list[Process]]
             if isinstance(message, Status):
                 found.setdefault(name, {})[message.host] = message
             elif arrival.key in live:
-                processes.setdefault((link.endpoint, name), []).append(message)
-    return [(replace(link, namespace=name), list(of_host.values())) for name, of_host in sorted(found.items())]
+                processes.setdefault(name, []).append(message)
+    return [
+        (replace(link, namespace=name), list(of_host.values()), processes.get(name, []))
+        for name, of_host in sorted(found.items())
+    ]
 
 
-def _for_scripts(link: Link, statuses: list[Status], processes: dict[tuple[str, str | None], list[Process]]):
+def _for_scripts(link: Link, statuses: list[Status], processes: list[Process]):
     """One robot, as JSON."""
     return {
         "namespace": link.namespace,
         "endpoint": link.endpoint,
         "impostor": len({status.host for status in statuses}) > 1,  # more than one host has this name
-        "processes": processes.get((link.endpoint, link.namespace), []),
+        "processes": processes,
         "status": statuses[-1],
     }
 

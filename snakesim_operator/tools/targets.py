@@ -1,11 +1,13 @@
 """Searching the robots that a command addresses."""
 
+import contextlib
 import shlex
 from dataclasses import replace
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Session, open_session
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.tools.robot_selection import RobotSelection
 
 CONNECT_S = 1.0
@@ -44,6 +46,20 @@ def find_robots(where: RobotSelection) -> list[Link]:
                     found += [replace(link, namespace=name) for name in robots_on(session)]
         except NotConnectedError:
             continue
+    return found
+
+
+def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tuple[Link, Session]]:
+    """One on every network that answers, for whatever is published there. Raises NotConnectedError."""
+    found: list[tuple[Link, Session]] = []
+    for link in where.networks():
+        with contextlib.suppress(NotConnectedError):
+            whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
+            found.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
+    if not found:
+        raise NotConnectedError(
+            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
+        )
     return found
 
 

@@ -3,17 +3,14 @@
 import contextlib
 import sys
 import time
-from dataclasses import dataclass, replace
 
 import msgspec
 
-from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.terminal import Say, overwrite_lines, say, say_json
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import TICK_TIMES, Timing
-from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
+from snakesim_operator.tools.targets import RobotSelection, sessions_on
 from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
@@ -26,52 +23,38 @@ TIMES_HEAD = (
 BARS = "▁▂▃▄▅▆▇█"
 
 
-@dataclass(frozen=True)
-class TopRequest:
-    """The command's options."""
+def top(where: RobotSelection, say: Say = say, *, once: bool, as_json: bool) -> int:
+    """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError.
 
-    once: bool = False  # listen for a moment, print one table, end
-    as_json: bool = False  # a line of JSON for each table
-
-
-def top(request: TopRequest, where: RobotSelection, say: Say = say) -> int:
-    """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError."""
+    once: listen for a moment, print one table, end. as_json: a line of JSON for each table.
+    """
     with contextlib.ExitStack() as stack:
-        heard = [_listen(link, stack) for link in where.networks()]
-        traffics = [traffic for traffic in heard if traffic is not None]
-        if not traffics:
-            raise NotConnectedError(
-                f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
-            )
+        traffics = [_listen(link.namespace, session) for link, session in sessions_on(where, stack)]
         drawn = 0
         while True:
-            time.sleep(ONCE_S if request.once else PERIOD_S)
+            time.sleep(ONCE_S if once else PERIOD_S)
             now_ns = time.monotonic_ns()
             lines = [line for traffic in traffics for line in traffic.lines(now_ns)]
             latencies = [latency for traffic in traffics for latency in traffic.latencies()]
             times = {robot: found for traffic in traffics for robot, found in traffic.tick_times().items() if found}
             left_out = sum(traffic.keys_left_out for traffic in traffics)
-            if request.as_json:
+            if as_json:
                 content = {"keys": lines, "latencies": latencies, "tick_times": times, "left_out": left_out}
                 say_json(msgspec.to_builtins(content), say)
             else:
                 table = table_of(lines, latencies, times, left_out)
-                if sys.stdout.isatty() and not request.once:
+                if sys.stdout.isatty() and not once:
                     drawn = overwrite_lines(table, drawn)
                 else:
                     for line in table:
                         say(line)
-            if request.once:
+            if once:
                 return 0 if lines else 1
 
 
-def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
-    """Subscribe to everything on a network; None when there is no answer."""
-    try:
-        session: Session = stack.enter_context(open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES), CONNECT_S))
-    except NotConnectedError:
-        return None
-    traffic = Traffic(link.namespace)
+def _listen(namespace: str | None, session: Session) -> Traffic:
+    """Subscribe to everything on a network."""
+    traffic = Traffic(namespace)
 
     def take_strange(arrival: Arrival) -> None:
         if not traffic.is_known(arrival.key):
@@ -79,7 +62,7 @@ def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
 
     # Key by key, because a lab's router may grant no wildcard; the last value of those that are latched, too.
     for row in keys.SPACE:
-        key = row.key if link.namespace is not None else f"**/{row.key}"
+        key = row.key if namespace is not None else f"**/{row.key}"
         if row.kind == "latched":
             session.on_latched_arrival(key, traffic.take)
         elif row.kind == "stream":

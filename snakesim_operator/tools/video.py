@@ -44,9 +44,7 @@ class Film(Protocol):
 Span = tuple[float, float]  # from and to in seconds, since the first tick
 
 
-def video(
-    run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: Say = say
-) -> int:
+def video(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span) -> int:
     """Film a run. Raises ConfigError for one without poses, and when something that it needs is not installed."""
     record = RunRecord.load(run)
     film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=say)

@@ -81,15 +81,15 @@ def _status(arguments: argparse.Namespace) -> int:
 
 
 def _top(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.tools.top import TopRequest, top
+    from snakesim_operator.tools.top import top
 
-    return top(TopRequest(arguments.once, arguments.json), selection_of(arguments))
+    return top(selection_of(arguments), once=arguments.once, as_json=arguments.json)
 
 
 def _echo(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.tools.echo import EchoRequest, echo
+    from snakesim_operator.tools.echo import echo
 
-    return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), selection_of(arguments))
+    return echo(arguments.key, selection_of(arguments), rate_only=arguments.hz, count=arguments.count)
 
 
 def _record(arguments: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ from websockets.typing import Origin, Subprotocol
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description
-from snakesim_operator.playback.play import PlayRequest, play
+from snakesim_operator.playback.play import play
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
@@ -93,8 +93,8 @@ def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
     assert ended.code == 0 and not (tmp_path / "bare" / RECORDING).exists()
     command.snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", "run", cwd=tmp_path)
     endpoint, said = free_endpoint(), list[str]()
-    request = PlayRequest(tmp_path / "run" / RECORDING, endpoint, "again", rate=0.5)
-    player = threading.Thread(target=play, args=(request, iter(()), said.append))
+    how = {"endpoint": endpoint, "namespace": "again", "rate": 0.5, "step": False}
+    player = threading.Thread(target=play, args=(tmp_path / "run" / RECORDING, iter(()), said.append), kwargs=how)
     player.start()
     wait_until(lambda: bool(said), "the player")
     with open_session(Link(endpoint, "again"), 5.0) as session:

@@ -7,7 +7,6 @@ import signal
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError
@@ -30,21 +29,15 @@ SILENT_S = 1.0  # without a clock
 HELP = "up, down: speed   left, right: direction   s: stop   SPACE: EMERGENCY STOP   q: quit"
 
 
-@dataclass(frozen=True)
-class TeleopRequest:
-    """The command's options."""
+def teleop(where: RobotSelection, fastest_m_s: float, joystick: Path | None) -> int:
+    """Until q, Ctrl-C, or the terminal or the joystick is gone. Returns 1 for the latter. Raises SnakesimError.
 
-    fastest_m_s: float = 0.3
-    joystick: bool = False
-    device: Path | None = None
-
-
-def teleop(request: TeleopRequest, where: RobotSelection) -> int:
-    """Until q, Ctrl-C, or the terminal or the joystick is gone. Returns 1 for the latter. Raises SnakesimError."""
-    if not 0 < request.fastest_m_s <= 10:
-        raise ConfigError(f"--fastest {request.fastest_m_s:g}: give a speed above 0, and at most 10 m/s")
+    joystick: its device, or an empty path for the first one; None: keys alone.
+    """
+    if not 0 < fastest_m_s <= 10:
+        raise ConfigError(f"--fastest {fastest_m_s:g}: give a speed above 0, and at most 10 m/s")
     with contextlib.ExitStack() as opened:
-        stick = open_joystick(request.device) if request.joystick else None
+        stick = None if joystick is None else open_joystick(None if joystick == Path() else joystick)
         if stick is not None:
             opened.callback(stick.close)
         keyboard = Keyboard() if stick is None or sys.stdin.isatty() else None
@@ -52,18 +45,18 @@ def teleop(request: TeleopRequest, where: RobotSelection) -> int:
         session = opened.enter_context(open_session(link, CONNECT_S))
         if keyboard is not None:
             opened.enter_context(keyboard)
-        return Teleop(session, link, request, keyboard, stick).go()
+        return Teleop(session, link, fastest_m_s, keyboard, stick).go()
 
 
 class Teleop:
     """One operator, one robot."""
 
     def __init__(
-        self, session: Session, link: Link, request: TeleopRequest, keyboard: Keyboard | None, stick: Joystick | None
+        self, session: Session, link: Link, fastest_m_s: float, keyboard: Keyboard | None, stick: Joystick | None
     ) -> None:
         self._link, self._keyboard, self._stick = link, keyboard, stick
         self._me = f"{user_name()[:40]}, teleop {os.getpid()}"  # two may steer
-        self._steering = Steering(self._me, request.fastest_m_s)
+        self._steering = Steering(self._me, fastest_m_s)
         self._intents = session.publisher(keys.INTENT, Intent)
         self._clocks = session.reader(keys.CLOCK, Clock)
         self._worlds = session.reader(keys.WORLD, World)

@@ -4,7 +4,6 @@ import os
 import select
 import sys
 import termios
-from types import TracebackType
 from typing import Self
 
 from snakesim_hal.errors import ConfigError
@@ -34,9 +33,7 @@ class Keyboard:
         termios.tcsetattr(self._handle, termios.TCSADRAIN, mode)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             termios.tcsetattr(self._handle, termios.TCSADRAIN, self._before)
         except termios.error:  # it was closed

@@ -11,7 +11,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, encoding_of
 from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.tools.targets import RobotSelection
-from snakesim_operator.tools.top import TopRequest, table_of, top
+from snakesim_operator.tools.top import table_of, top
 from snakesim_operator.tools.traffic import KEPT, MAX_KEYS, Traffic
 from tests.harness.endpoint import free_endpoint
 from tests.unit.hal.rig import clock, command, description, state
@@ -68,7 +68,7 @@ def test_a_table_for_scripts_from_a_real_network() -> None:
         teller = threading.Thread(target=tell_time, args=(session,))
         teller.start()
         try:
-            assert top(TopRequest(once=True, as_json=True), RobotSelection(endpoint), lines.append) == 0
+            assert top(RobotSelection(endpoint), lines.append, once=True, as_json=True) == 0
         finally:
             over.set()
             teller.join()

@@ -12,7 +12,7 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent
-from snakesim_operator.tools.teleop.command import Teleop, TeleopRequest
+from snakesim_operator.tools.teleop.command import Teleop
 from snakesim_operator.tools.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
@@ -46,7 +46,7 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
         hand = threading.Thread(target=be_a_robot_and_a_hand)
         hand.start()
         stick = Joystick(read, Axis(0, 255), Axis(0, 255))
-        assert Teleop(session, link, TeleopRequest(fastest_m_s=0.2), None, stick).go() == 1
+        assert Teleop(session, link, 0.2, None, stick).go() == 1
         hand.join()
         stick.close()
         intents = heard.drain()
