@@ -32,7 +32,7 @@ class Chart:
         return framed(self._page(), sum(heights) + PADDING_PX)
 
     def _page(self) -> str:
-        return render(PAGE, self.joints, styles=[], scripts=[], title=self.title, figures=self.figures)
+        return render(PAGE, self.joints, title=self.title, figures=self.figures)
 
 
 def framed(page: str, height_px: int) -> str:

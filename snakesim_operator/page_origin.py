@@ -23,5 +23,12 @@ def why_refused(host: str | None, origin: str | None, also: Collection[str] = ()
     return f"the page is of the origin {_shown(origin)}; only pages of http://{host} may connect"
 
 
+def why_head_refused(head: bytes, also: Collection[str] = ()) -> str | None:
+    """As `why_refused`, of the head of an HTTP request."""
+    pairs = (line.partition(":") for line in head.decode("latin-1").split("\r\n")[1:])
+    headers = {name.strip().lower(): value.strip() for name, _, value in pairs}
+    return why_refused(headers.get("host"), headers.get("origin"), also)
+
+
 def _shown(text: str | None) -> str:
     return "missing" if text is None else repr(text[:LONGEST_SHOWN])

@@ -15,7 +15,7 @@ from snakesim.configuration import checked, overrides_of
 from snakesim.environments.actions import Commands, controller_of
 from snakesim.environments.assisted import AssistedRobot
 from snakesim.environments.rewards import weights_of
-from snakesim.environments.stepped import Robot, SteppedRobot
+from snakesim.environments.stepped import SteppedRobot
 from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.observations import Observer, chosen
 from snakesim_hal.errors import ConfigError
@@ -26,6 +26,7 @@ from snakesim_hal.wire.messages import JointState
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 MAX_SEED = 2**31
+Robot = SteppedRobot | AssistedRobot
 FIELD_TRIES = 20  # random fields that do not fit, until a reset gives up
 
 

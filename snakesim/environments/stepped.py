@@ -3,8 +3,6 @@
 Lifecycle, lease, limits and the latency of commands are those of a run in lockstep, and so is the digest.
 """
 
-from typing import Protocol
-
 import msgspec
 
 from snakesim_hal.allowed_faults import Faults, faults_of_host
@@ -21,7 +19,6 @@ from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.safety.authority import Authority, Decision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
-    Description,
     Fault,
     JointCommand,
     JointState,
@@ -35,42 +32,6 @@ from snakesim_hal.wire.messages import (
 
 WHO = "an environment"
 INJECTED = ("joint", "bus", "simulator")  # faults that need neither services nor processes
-
-
-class Robot(Protocol):
-    """What an environment needs of a robot, from its arming on."""
-
-    description: Description
-    newest: dict[str, Message]  # of every sensor besides the joints that has had a sample, by key
-    limited: dict[int, str]  # joint -> which limit changed its target in the last tick
-
-    @property
-    def joints(self) -> JointState:
-        """Of this tick."""
-        ...
-
-    @property
-    def lifecycle(self) -> LifecycleState:
-        """As a host would publish it."""
-        ...
-
-    @property
-    def why(self) -> str:
-        """Why it is in this state."""
-        ...
-
-    @property
-    def digest(self) -> str:
-        """Hash of every set-point as applied."""
-        ...
-
-    def step(self, mode: Mode, target: list[float]) -> None:
-        """One tick under these targets."""
-        ...
-
-    def close(self) -> None:
-        """Release everything."""
-        ...
 
 
 class SteppedRobot:
@@ -105,8 +66,8 @@ class SteppedRobot:
         self._failed = ""
         self._tick = self._sequence = 0
         self._full_nm = [joint.torque_limit_nm for joint in self.description.joints]
-        self.newest: dict[str, Message] = {}
-        self.limited: dict[int, str] = {}
+        self.newest: dict[str, Message] = {}  # of every sensor besides the joints that has had a sample, by key
+        self.limited: dict[int, str] = {}  # joint -> which limit changed its target in the last tick
         self._samples = self._sample()
         if self._authority is not None:
             self._arm(self._authority)

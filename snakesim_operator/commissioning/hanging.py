@@ -11,8 +11,8 @@ import numpy as np
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.solids import GRAVITY_M_S2
 
-GRAVITY_M_S2 = 9.81
 AXES = {"yaw": (0.0, 0.0, 1.0), "pitch": (0.0, 1.0, 0.0)}
 
 

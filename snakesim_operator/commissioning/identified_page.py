@@ -20,8 +20,6 @@ def page(record: RunRecord, found: Sequence[Identified]) -> str:
     return render(
         Path(__file__).parent / "identified.html",
         len(found),
-        styles=[],
-        scripts=[],
         title=f"Joints of {record.config.robot.name}, identified from {record.folder.name}",
         emulated=record.description.emulated,
         backend=record.description.backend,

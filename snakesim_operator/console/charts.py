@@ -1,7 +1,7 @@
 """Live charts: every joint now, and the last seconds of all joints."""
 
 from collections import deque
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import viser
@@ -17,6 +17,17 @@ HISTORY_S = 10.0
 SAMPLES_MOST = 400
 ANGLE, REFERENCE, LIMIT = "#0067b0", "#c8321f", "#8b95a1"
 PUSH = "#" + bytes(PROPELS).hex()
+
+
+SampleT = TypeVar("SampleT", bound=tuple[Any, ...])
+
+
+def keep(history: deque[SampleT], sample: SampleT) -> None:
+    """Add a sample, of a time and values, if it is later by enough; after going back history begins with it."""
+    if history and sample[0] < history[-1][0]:
+        history.clear()
+    if not history or sample[0] - history[-1][0] >= HISTORY_S / SAMPLES_MOST:
+        history.append(sample)
 
 
 class JointCharts:
@@ -76,12 +87,8 @@ class JointCharts:
     def take(self, snapshot: RobotSnapshot) -> None:
         """Keep a sample for the charts over time; each frame."""
         joints, time_s = snapshot.joints, snapshot.time_s
-        if joints is None or time_s is None:
-            return
-        if self._history and time_s < self._history[-1][0]:
-            self._history.clear()
-        if not self._history or time_s - self._history[-1][0] >= HISTORY_S / SAMPLES_MOST:
-            self._history.append((time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
+        if joints is not None and time_s is not None:
+            keep(self._history, (time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
 
     def show(self, snapshot: RobotSnapshot) -> None:
         """Redraw them; a few times a second."""

@@ -10,11 +10,10 @@ import numpy as np
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_all
-from snakesim_hal.model.scene import route_of
 from snakesim_hal.physics.hills import hills
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.console.snapshot import RobotSnapshot
-from snakesim_operator.results.felt import is_felt
+from snakesim_operator.results.came_true import is_felt
 
 M_PER_N, LONGEST_M = 0.02, 0.5  # of a force arrow
 ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts
@@ -43,12 +42,6 @@ class Surroundings:
     def obstacles(self) -> list[Obstacle]:
         """Obstacles, steps too."""
         return [placed.obstacle for placed in place_all(self.config)]
-
-    @cached_property
-    def route_w(self) -> Floats:
-        """The scene's route, (n, 2); without one (0, 2)."""
-        route = route_of(self.config.scene)
-        return np.zeros((0, 2)) if route is None else route.position_w(np.arange(0.0, route.length_m, 0.02))
 
     @cached_property
     def heights_m(self) -> tuple[Floats, Floats] | None:

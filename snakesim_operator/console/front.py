@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_operator.page_origin import why_refused
+from snakesim_operator.page_origin import why_head_refused
 
 PATH = "/stop"
 OURS = tuple(f"{method} {PATH} ".encode() for method in ("GET", "POST"))
@@ -149,16 +149,13 @@ class Front:
             self._forget(connection).close()
 
     def _answer(self, connection: socket.socket, request: bytes) -> None:
-        first, *lines = request.partition(b"\r\n\r\n")[0].decode("latin-1").split("\r\n")
-        pairs = (line.partition(":") for line in lines)
-        headers = {name.strip().lower(): value.strip() for name, _, value in pairs}
-        why = why_refused(headers.get("host"), headers.get("origin"))
+        why = why_head_refused(request.partition(b"\r\n\r\n")[0])
         if why is not None:
             self._refused(why)
             _respond(connection, 403, why)
         elif self._stop is None:
             _respond(connection, 503, "a recording has nothing to stop")
-        elif first.startswith("GET "):
+        elif request.startswith(b"GET "):
             _respond(connection, 200, "ready")
         else:
             self._ask(connection)

@@ -7,7 +7,7 @@ import numpy as np
 import viser
 
 from snakesim_hal.wire.own_sample import OwnKind, own_kinds
-from snakesim_operator.console.charts import HISTORY_S, SAMPLES_MOST, line
+from snakesim_operator.console.charts import HISTORY_S, SAMPLES_MOST, keep, line
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.texts import plain, table
 from snakesim_operator.results.page.palette import joint_colours
@@ -61,11 +61,7 @@ class OwnSensors:
         if time_s is None:
             return
         for what, lines in numbers(snapshot).items():
-            kept = self._history.setdefault(what, deque(maxlen=SAMPLES_MOST))
-            if kept and time_s < kept[-1][0]:
-                kept.clear()
-            if not kept or time_s - kept[-1][0] >= HISTORY_S / SAMPLES_MOST:
-                kept.append((time_s, lines))
+            keep(self._history.setdefault(what, deque(maxlen=SAMPLES_MOST)), (time_s, lines))
 
     def show(self, snapshot: RobotSnapshot) -> None:
         """Redraw; a few times a second."""

@@ -18,7 +18,7 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Description, Obstacle
 from snakesim_operator.console.drawing import Camera, Drawing, Surroundings
 from snakesim_operator.console.meshes import Mesh, box, capsule, circle, cylinder, hoops, sphere
-from snakesim_operator.results.page.palette import DARK, LIGHT
+from snakesim_operator.results.page.palette import LIGHT
 
 Colour = tuple[int, int, int]
 
@@ -39,9 +39,9 @@ SHAPES: dict[str, dict[str, Mesh]] = {
 }
 
 
-def colour(name: str, *, dark: bool = False) -> Colour:
+def colour(name: str) -> Colour:
     """A colour of the palette that reports use."""
-    text = (DARK if dark else LIGHT)[name]
+    text = LIGHT[name]
     return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
 
 

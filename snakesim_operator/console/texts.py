@@ -53,17 +53,9 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
     if snapshot.silent_s > SILENT_S:
         lines.append(_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
     if status is not None:
-        lines.append(
-            f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:.45em'>"
-            f"{badge(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle])}"
-            f"<span>{plain(status.why)}</span></div>"
-        )
-    if snapshot.control is not None:
-        state = snapshot.control
-        lines.append(
-            f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:.35em'>"
-            f"{badge(state.state, STATE_COLOURS[state.state])}<span>{plain(state.reason)}</span></div>"
-        )
+        lines.append(_state(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle], status.why, ".45em"))
+    if (said := snapshot.control) is not None:
+        lines.append(_state(said.state, STATE_COLOURS[said.state], said.reason, ".35em"))
     if control:
         lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{plain(control)}</div>")
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
@@ -74,6 +66,13 @@ def badge(text: str, colour: str) -> str:
     return (
         f"<span style='background:{colour};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
         f"white-space:nowrap'>{plain(text)}</span>"
+    )
+
+
+def _state(word: str, colour: str, why: str, above: str) -> str:
+    return (
+        f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{above}'>"
+        f"{badge(word, colour)}<span>{plain(why)}</span></div>"
     )
 
 

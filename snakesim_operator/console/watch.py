@@ -6,7 +6,7 @@ its good messages.
 
 import time
 from collections import Counter, deque
-from typing import Any, TypeVar, cast
+from typing import Any
 
 from snakesim_hal.errors import WireError
 from snakesim_hal.network.robot_mismatch import mismatch
@@ -14,23 +14,14 @@ from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (
-    AppliedCommand,
     Clock,
     ColourImage,
     Configuration,
-    Contacts,
-    ControlSettings,
-    ControlState,
     DepthImage,
     Description,
-    Imu,
     JointState,
-    Message,
     OwnSample,
     Pose,
-    Power,
-    Status,
-    Trajectory,
     World,
 )
 from snakesim_hal.wire.own_sample import own_kinds
@@ -42,32 +33,18 @@ BODIES_KEPT = 128  # joint states, to find that of the instant of a pose
 RATE_PERIOD_S = 1.0
 STATUS_LIMIT_S = 2.0  # a host that has been silent for longer is no impostor, only gone
 
-LATCHED: dict[str, type[Message]] = {
-    keys.DESCRIPTION: Description,
-    keys.STATUS: Status,
-    keys.SETTINGS_IN_FORCE: ControlSettings,
-    keys.CONFIG: Configuration,
-}
-STREAMS: dict[str, type[Message]] = {
-    keys.CLOCK: Clock,
-    keys.JOINTS: JointState,
-    keys.POSE: Pose,
-    keys.POWER: Power,
-    keys.IMU: Imu,
-    keys.CONTACTS: Contacts,
-    keys.APPLIED: AppliedCommand,
-    keys.WORLD: World,
-    keys.TRAJECTORY: Trajectory,
-    keys.CONTROL_STATE: ControlState,
-}
-IMAGES: dict[str, type[Message]] = {keys.DEPTH_ALL: DepthImage, keys.COLOUR_ALL: ColourImage}
-MessageT = TypeVar("MessageT", bound=Message)
+LATCHED = (keys.DESCRIPTION, keys.STATUS, keys.SETTINGS_IN_FORCE, keys.CONFIG)
+STREAMS = (
+    *(keys.CLOCK, keys.JOINTS, keys.POSE, keys.POWER, keys.IMU, keys.CONTACTS, keys.APPLIED),
+    *(keys.WORLD, keys.TRAJECTORY, keys.CONTROL_STATE),
+)
+IMAGES = (keys.DEPTH_ALL, keys.COLOUR_ALL)
 
 
 class KeyBuffer:
     """The arrivals of one key."""
 
-    def __init__(self, message: type[Message], kept: int) -> None:
+    def __init__(self, message: type[Any], kept: int) -> None:
         self.arrivals: deque[Arrival] = deque(maxlen=kept)
         self.count = 0
         self._decoder: Decoder[Any] = Decoder(message)
@@ -101,31 +78,24 @@ class Watch:
         self._rates: dict[str, float] = {}
         self._counted: tuple[float, dict[str, int]] = (self._heard_s, {})
         self.rejected = session.rejected
-        for key, message in LATCHED.items():
-            session.on_latched_arrival(key, self._inlet(key, message, KEPT).put)
-        for key, message in STREAMS.items():
-            session.on_arrival(key, self._inlet(key, message, KEPT).put)
-        for key in IMAGES:
-            session.on_arrival(key, self._take_image)
-        session.on_arrival(keys.OWN_ALL, self._take_own)
+        for key in LATCHED:
+            session.on_latched_arrival(key, self._inlet(key, keys.message_at(key), KEPT).put)
+        for key in STREAMS:
+            session.on_arrival(key, self._inlet(key, keys.message_at(key), KEPT).put)
+        for key in (*IMAGES, keys.OWN_ALL):
+            session.on_arrival(key, self._take)
 
-    def _inlet(self, key: str, message: type[Message], kept: int) -> KeyBuffer:
+    def _inlet(self, key: str, message: Any, kept: int) -> KeyBuffer:
         buffer = self._buffers[key] = KeyBuffer(message, kept)
         return buffer
 
-    def _take_image(self, arrival: Arrival) -> None:
-        """In Zenoh's threads: each camera has a key of its own."""
+    def _take(self, arrival: Arrival) -> None:
+        """In Zenoh's threads: of a camera, each of which has a key of its own, or a sensor that the robot describes."""
         buffer = self._buffers.get(arrival.key)
-        if buffer is None:
-            message = keys.message_at(arrival.key)
-            if message is None or len(self._buffers) >= len(LATCHED) + len(STREAMS) + MAX_CAMERAS:
-                return
-            buffer = self._inlet(arrival.key, message, IMAGES_KEPT)
-        buffer.put(arrival)
-
-    def _take_own(self, arrival: Arrival) -> None:
-        """In Zenoh's threads: of a sensor that the robot has described."""
-        if (buffer := self._buffers.get(arrival.key)) is not None:
+        has_room = len(self._buffers) < len(LATCHED) + len(STREAMS) + MAX_CAMERAS
+        if buffer is None and has_room and keys.row_key(arrival.key) in IMAGES:
+            buffer = self._inlet(arrival.key, keys.message_at(arrival.key), IMAGES_KEPT)
+        if buffer is not None:
             buffer.put(arrival)
 
     @property
@@ -139,26 +109,27 @@ class Watch:
         robot = self.robot
         if robot is None:
             return None
-        now_s, clock = time.monotonic(), self._get(keys.CLOCK, Clock)
-        world, status = self._get(keys.WORLD, World), self._get(keys.STATUS, Status)
+        now_s, newest = time.monotonic(), self._newest.get
+        clock: Clock | None = newest(keys.CLOCK)
+        world: World | None = newest(keys.WORLD)
         body, base = self._body(world)
         return RobotSnapshot(
             robot=robot,
             time_s=None if clock is None else clock.stamp_ns * 1e-9,
             silent_s=now_s - self._heard_s,
-            status=status,
-            joints=self._get(keys.JOINTS, JointState),
+            status=newest(keys.STATUS),
+            joints=newest(keys.JOINTS),
             body=body,
             base=base,
             world=world,
-            contacts=self._get(keys.CONTACTS, Contacts),
-            trajectory=self._get(keys.TRAJECTORY, Trajectory),
-            control=self._get(keys.CONTROL_STATE, ControlState),
-            applied=self._get(keys.APPLIED, AppliedCommand),
-            settings=self._get(keys.SETTINGS_IN_FORCE, ControlSettings),
+            contacts=newest(keys.CONTACTS),
+            trajectory=newest(keys.TRAJECTORY),
+            control=newest(keys.CONTROL_STATE),
+            applied=newest(keys.APPLIED),
+            settings=newest(keys.SETTINGS_IN_FORCE),
             configuration=self._configuration(robot),
-            power=self._get(keys.POWER, Power),
-            imu=self._get(keys.IMU, Imu),
+            power=newest(keys.POWER),
+            imu=newest(keys.IMU),
             images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColourImage)},
             own={key: found for key, found in self._newest.items() if isinstance(found, OwnSample)},
             streams=self._streams(clock),
@@ -167,11 +138,8 @@ class Watch:
 
     def _configuration(self, robot: Description) -> Configuration | None:
         """Of the host that describes itself, whichever of the two came first."""
-        configured = self._get(keys.CONFIG, Configuration)
+        configured: Configuration | None = self._newest.get(keys.CONFIG)
         return configured if configured is not None and configured.config_hash == robot.config_hash else None
-
-    def _get(self, key: str, message: type[MessageT]) -> MessageT | None:
-        return cast(MessageT | None, self._newest.get(key))
 
     def _take_in(self) -> None:
         """Decode what has arrived; what does not fit the robot is counted and dropped."""
@@ -211,7 +179,7 @@ class Watch:
 
     def _body(self, world: World | None) -> tuple[JointState | None, Any]:
         """The joint state of the instant of the pose, and the pose: by guidance, else by motion capture."""
-        pose = self._get(keys.POSE, Pose)
+        pose: Pose | None = self._newest.get(keys.POSE)
         if world is not None:
             of_ns = world.stamp_ns if world.base_position_sd_m is not None else world.pose_stamp_ns or world.stamp_ns
             base = (world.base_position_w, world.base_orientation_wxyz)

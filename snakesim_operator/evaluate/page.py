@@ -21,8 +21,6 @@ def page(title: str, about: str, lines: Sequence[Line], worst: Sequence[tuple[st
     return render(
         Path(__file__).parent / "evaluation.html",
         len(controllers),
-        styles=[],
-        scripts=[],
         title=title,
         about=about,
         runs=sum(line.runs for line in lines),

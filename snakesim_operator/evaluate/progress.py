@@ -1,35 +1,22 @@
 """The progress line of an evaluation, with the remaining time: rewritten in place on a terminal."""
 
-import sys
 import time
-from types import TracebackType
-from typing import Self
 
-from snakesim_hal.terminal import overwrite_line, say
 from snakesim_operator.evaluate.case import Outcome
-from snakesim_operator.run.progress import in_minutes
+from snakesim_operator.run.progress import OneLine, in_minutes
 
 PLAIN_PERIOD_S = 10.0
 
 
-class Progress:
+class Progress(OneLine):
     """Counts what is done."""
 
     def __init__(self, total: int) -> None:
+        super().__init__()
         self._total = total
-        self._done = self._with_goal = self._crossed = self._errors = self._shown = 0
+        self._done = self._with_goal = self._crossed = self._errors = 0
         self._began = time.monotonic()
         self._next = self._began + PLAIN_PERIOD_S
-        self._terminal = sys.stdout.isatty()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._shown:
-            say("")
 
     def done(self, outcome: Outcome) -> None:
         """One more."""
@@ -38,11 +25,9 @@ class Progress:
         self._crossed += outcome.numbers.get("crossed") is True
         self._errors += outcome.error is not None
         now = time.monotonic()
-        if self._terminal:
-            self._shown = overwrite_line(self._text(now), 118, self._shown)
-        elif now >= self._next or self._done == self._total:
+        if self.terminal or now >= self._next or self._done == self._total:
             self._next = now + PLAIN_PERIOD_S
-            say(self._text(now))
+            self.put(self._text(now))
 
     def _text(self, now: float) -> str:
         passed_s = now - self._began

@@ -109,15 +109,15 @@ def settings_of(suite: Suite, source: str) -> list[Setting]:
     varied = {key: _values(key, given, source) for key, given in suite.vary.items()}
     words = _short_names(list(varied))
     found: list[Setting] = []
-    for row in suite.row or [None]:
-        where = f"{source}: row {row.name!r}" if row is not None else source
-        own = [*_overrides(row.set, where), *_left_out(row.unset, where)] if row is not None else []
-        draws = _draws(suite, [] if row is None else row.without, where)
+    for row in suite.row or [Row(name="")]:
+        where = f"{source}: row {row.name!r}" if row.name else source
+        own = [*_overrides(row.set, where), *_left_out(row.unset, where)]
+        draws = _draws(suite, row.without, where)
         for values in itertools.product(*varied.values()):
             parts = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
-            name = ", ".join([*([row.name] if row is not None else []), *parts]) or "as it is"
+            name = ", ".join(filter(None, [row.name, *parts])) or "as it is"
             here = [Override(key, v, f"{source}: [vary]") for key, v in zip(varied, values, strict=True)]
-            number = values[0] if len(values) == 1 and row is None and _is_number(values[0]) else None
+            number = values[0] if len(values) == 1 and not row.name and _is_number(values[0]) else None
             found.append(Setting(name, [*always, *own, *here], number, draws))
     twice = {one.name for one in found if sum(other.name == one.name for other in found) > 1}
     if twice:

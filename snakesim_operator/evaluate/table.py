@@ -104,11 +104,11 @@ def best_of(lines: Sequence[Line]) -> str:
     return max(crossed, key=lambda name: crossed[name], default="")
 
 
-def worst(cases: Sequence[Case], done: Results, most: int = WORST) -> list[tuple[Case, str]]:
+def worst(cases: Sequence[Case], done: Results) -> list[tuple[Case, str]]:
     """The cases that came least far, and why they ended, as far as it is known."""
     failed = [case for case in cases if case.id in done and not _well(done[case.id])]
     failed.sort(key=lambda case: _share(done[case.id]))
-    return [(case, _why(done[case.id])) for case in failed[:most]]
+    return [(case, _why(done[case.id])) for case in failed[:WORST]]
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:

@@ -75,10 +75,6 @@ class Comparison:
         if last_tick not in self.recorded:
             self.replayed.pop(last_tick, None)
 
-    def end_at(self, tick: int) -> None:
-        """Leave out what comes later."""
-        self.recorded = {at: command for at, command in self.recorded.items() if at <= tick}
-
     def largest(self) -> tuple[int, int, float] | None:
         """Tick, joint and size of the largest difference of a target; None when there is none."""
         sizes = [
@@ -186,7 +182,8 @@ class Replay:
                 if not self.lacks:
                     raise
                 self.stopped = str(error)  # it waits for what is lost
-                self.comparison.end_at(max(self.comparison.replayed, default=-1))
+                found, last = self.comparison, max(self.comparison.replayed, default=-1)
+                found.recorded = {tick: command for tick, command in found.recorded.items() if tick <= last}
         return self.comparison
 
     def _play(self) -> None:

@@ -25,7 +25,6 @@ from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 
 LACKS = b"snakesim.lacks"  # metadata of a Parquet file: JSON
-FORMATS = ("csv", "parquet", "npz", "lerobot", "mcap")
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
 UNITS = {
     "time_s": "s",

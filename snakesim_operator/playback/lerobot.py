@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.episodes import Episode
@@ -235,9 +236,7 @@ def _picture_stats(pictures: Pictures, at: NDArray[np.int64]) -> Stats:
     """Of each channel, 0 to 1, over the pictures of these frames; quantiles are not made of pictures."""
     mean = np.array(pictures.channel_means)[at].mean(axis=0)
     squares = np.array(pictures.channel_squares)[at].mean(axis=0)
-    numbers = {"min": pictures.least, "max": pictures.most, "mean": mean}
-    numbers["std"] = np.sqrt(np.maximum(squares - np.square(mean), 0.0))
-    return {**{name: value.reshape(3, 1, 1).tolist() for name, value in numbers.items()}, "count": [len(at)]}
+    return _of_channels(pictures.least, pictures.most, mean, squares, len(at))
 
 
 def _together(found: Sequence[Stats]) -> Stats:
@@ -248,9 +247,13 @@ def _together(found: Sequence[Stats]) -> Stats:
     weights = np.array([one["count"][0] for one in found])
     mean = np.average(means, axis=0, weights=weights)
     squares = np.average(np.square(stds) + np.square(means), axis=0, weights=weights)
-    numbers = {"min": least.min(axis=0), "max": most.max(axis=0), "mean": mean}
-    numbers["std"] = np.sqrt(np.maximum(squares - np.square(mean), 0.0))
-    return {**{name: value.reshape(3, 1, 1).tolist() for name, value in numbers.items()}, "count": [int(weights.sum())]}
+    return _of_channels(least.min(axis=0), most.max(axis=0), mean, squares, int(weights.sum()))
+
+
+def _of_channels(least: Floats, most: Floats, mean: Floats, squares: Floats, count: int) -> Stats:
+    """squares: means of the squares; all are (3,)."""
+    numbers = {"min": least, "max": most, "mean": mean, "std": np.sqrt(np.maximum(squares - np.square(mean), 0.0))}
+    return {**{name: value.reshape(3, 1, 1).tolist() for name, value in numbers.items()}, "count": [count]}
 
 
 _PANDAS = {  # what pandas needs to read an index: https://pandas.pydata.org/docs/development/developer.html

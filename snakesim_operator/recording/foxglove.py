@@ -61,21 +61,7 @@ class PoseAndContacts(msgspec.Struct, frozen=True):
     contacts: list[WorldContact]
 
 
-_decoders: dict[type[Any], Any] = {
-    message: msgspec.msgpack.Decoder(message)
-    for message in (
-        JointState,
-        Contacts,
-        Pose,
-        PoseAndContacts,
-        World,
-        Trajectory,
-        DepthImage,
-        ColourImage,
-        Description,
-        Configuration,
-    )
-}
+_decoder: Any = cache(msgspec.msgpack.Decoder)  # of a message, by its type
 
 Kind = type[Protobuf] | type[State] | type[ContactForces] | type[OwnSample]
 ALWAYS: dict[str, Kind] = {  # topics below the robot's, but for those of images, of which a robot may have none
@@ -91,6 +77,7 @@ ALWAYS: dict[str, Kind] = {  # topics below the robot's, but for those of images
 _KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
 
 
+@cache
 def topic(robot: str, name: str) -> str:
     """A topic as ROS would name it. name: such as `joint_states`, below the robot's."""
     return f"/{_ros_name(robot)}/{name}"
@@ -139,7 +126,6 @@ class FoxgloveChannels:
     def __init__(self, robot: str) -> None:
         """robot: its name in the topics."""
         self._named = robot
-        self._topics: dict[str, str] = {}
         self._newest: dict[str, tuple[bytes, int]] = {}  # payload and its robot time in ns
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
@@ -170,11 +156,11 @@ class FoxgloveChannels:
     def _meet(self, key: str, payload: bytes) -> None:
         with suppress(SnakesimError, *UNDECODABLE):
             if key == keys.DESCRIPTION:
-                robot: Description = _decoders[Description].decode(payload)
+                robot: Description = _decoder(Description).decode(payload)
                 if len(robot.links) == len(robot.joints) + 1:
                     self._robot, self._frames, self._own = robot, BodyFrames(robot), own_kinds(robot)
             else:
-                config = msgspec.json.decode(_decoders[Configuration].decode(payload).content, type=RunConfig)
+                config = msgspec.json.decode(_decoder(Configuration).decode(payload).content, type=RunConfig)
                 placed = place(config.scene, capsules_at_start(config))  # checked when the run began
                 self._truth = shapes.obstacles([one.obstacle for one in placed], "obstacles", shapes.TRUTH, 0)
 
@@ -213,7 +199,7 @@ class FoxgloveChannels:
         if self._frames is None or joints is None or not joints.is_of(self._frames.joints):
             return []
         made = self._frames.joint_states(joints, time_ns)
-        return [FoxgloveMessage(self._topic("joint_states"), JointStates, made)]
+        return [FoxgloveMessage(topic(self._named, "joint_states"), JointStates, made)]
 
     def _contact_forces(self, payload: bytes) -> list[FoxgloveMessage]:
         felt: Contacts | None = _decoded(Contacts, payload)
@@ -229,7 +215,7 @@ class FoxgloveChannels:
         yield from (self._protobuf("log", one) for one in logged)
         if at == keys.CONTROL_STATE and self._frames is not None and len(wanted_rad) == self._frames.joints:
             made = self._frames.reference(wanted_rad, time_ns)
-            yield FoxgloveMessage(self._topic("joint_references"), JointStates, made)
+            yield FoxgloveMessage(topic(self._named, "joint_references"), JointStates, made)
 
     def _still(self, robot: Description, time_ns: int) -> Iterator[FoxgloveMessage]:
         if self._is_due("body", time_ns, STILL_NS):
@@ -266,20 +252,14 @@ class FoxgloveChannels:
         yield self._protobuf(f"{camera}/{kind}/image_raw", shapes.raw_image(image, frame_id, time_ns))
         yield self._protobuf(f"{camera}/{kind}/camera_info", shapes.calibration(image, frame_id, time_ns))
 
-    def _topic(self, name: str) -> str:
-        made = self._topics.get(name)
-        if made is None:
-            made = self._topics[name] = topic(self._named, name)
-        return made
-
     def _scene(self, name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
         return self._protobuf(f"scene/{name}", SceneUpdate(entities=entities))
 
     def _protobuf(self, name: str, message: Protobuf) -> FoxgloveMessage:
-        return FoxgloveMessage(self._topic(name), type(message), message.SerializeToString())
+        return FoxgloveMessage(topic(self._named, name), type(message), message.SerializeToString())
 
     def _json(self, name: str, message: State | ContactForces | OwnSample) -> FoxgloveMessage:
-        return FoxgloveMessage(self._topic(name), type(message), msgspec.json.encode(message))
+        return FoxgloveMessage(topic(self._named, name), type(message), msgspec.json.encode(message))
 
     def _own_sample(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
         """Of an own sensor, with its own schema: as JSON, which viewers plot; and its frame."""
@@ -298,7 +278,7 @@ class FoxgloveChannels:
 
 def _decoded(message: type[Any], payload: bytes | None) -> Any:
     with suppress(*UNDECODABLE):
-        return None if payload is None else _decoders[message].decode(payload)
+        return None if payload is None else _decoder(message).decode(payload)
     return None
 
 

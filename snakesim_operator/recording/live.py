@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from snakesim_hal.errors import NotConnectedError
@@ -50,9 +49,7 @@ class LiveServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._relay.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._relay.__exit__()
         with suppress(RuntimeError):  # it ends with its process in any case
             self._server.stop()

@@ -5,11 +5,10 @@ import contextlib
 import secrets
 import threading
 from collections.abc import Callable, Collection
-from types import TracebackType
 from typing import Self
 
 from snakesim_hal.errors import NotConnectedError
-from snakesim_operator.page_origin import why_refused
+from snakesim_operator.page_origin import why_head_refused
 
 HOST = "127.0.0.1"
 LONGEST_HEAD = 16 * 1024
@@ -65,9 +64,7 @@ class OriginRelay:
 
     async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
-        pairs = (line.partition(":") for line in head.decode("latin-1").split("\r\n")[1:])
-        headers = {name.strip().lower(): value.strip() for name, _, value in pairs}
-        why = why_refused(headers.get("host"), headers.get("origin"), self._also)
+        why = why_head_refused(head, self._also)
         if why is not None:
             self._tell(why)
             writer.write(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
@@ -92,9 +89,7 @@ class OriginRelay:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()

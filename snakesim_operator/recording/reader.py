@@ -138,8 +138,8 @@ class RecordingReader:
         """The record, unless it is of no use; a channel that was lost is made up for."""
         match record:
             case Message():
-                if record.channel_id not in self._channels:
-                    yield from self._from_summary(record.channel_id)
+                if record.channel_id not in self._channels and record.channel_id in (lost := self._lost_channels()):
+                    yield from self._opened(lost[record.channel_id])  # as the end of the file repeats it
                 if self._is_good(record):
                     yield record
             case Channel():
@@ -189,12 +189,6 @@ class RecordingReader:
                 if self._counted and last < count < LATEST_NS:
                     channel = self._channels.get(number) or self._lost_channels().get(number)
                     self._lose(ELSEWHERE if channel is None else channel.topic, count - last, gaps_then, None)
-
-    def _from_summary(self, number: int) -> Iterator[McapRecord]:
-        """A channel that was lost with its chunk, as the end of the file repeats it."""
-        channel = self._lost_channels().get(number)
-        if channel is not None:
-            yield from self._opened(channel)
 
     def _opened(self, channel: Channel) -> Iterator[McapRecord]:
         """The channel, behind its schema if that was lost."""

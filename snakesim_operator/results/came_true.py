@@ -6,13 +6,13 @@ moment before. While the body does not move, the ground's friction takes any dif
 less than ASKED_N always may.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.wire.messages import ControlState
+from snakesim_hal.wire.messages import ControlState, WorldContact
 
 DELAY_S = 0.06  # from the set-point to the mean that shows it
 ASKED_N = 1.0  # about a quarter of the drag of the shipped robots: less is not judged
@@ -37,6 +37,14 @@ class CameTrue:
     correlation: float | None  # of measured with solved; None: too few, or all the same
     median_error: float  # |measured - solved| over solved
     empty: float  # share of those that carry nothing
+
+
+def is_felt(push_point: WorldContact, contacts: Iterable[WorldContact]) -> bool:
+    """Whether one of the measured contacts is on the push-point's obstacle.
+
+    Elsewhere the force that a controller has solved for is asked for, and not there.
+    """
+    return any(contact.obstacle == push_point.obstacle for contact in contacts)
 
 
 def pairs(states: Sequence[ControlState]) -> list[Pair]:

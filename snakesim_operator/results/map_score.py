@@ -17,7 +17,7 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
 NEAR_M = 1.0
-VIEW_RAD = math.pi / 2
+VIEW_RAD = math.pi / 2  # of the camera
 NEAREST_M = 0.15  # a camera sees nothing nearer
 MATCH_M = 0.05  # between a reported outline and the true one
 POINTS = 48  # on an outline
@@ -50,17 +50,14 @@ def score(
     truth: Sequence[Obstacle],
     head_w: Sequence[float] | Floats,
     heading_rad: float,
-    *,
-    within_m: float = NEAR_M,
-    view_rad: float = VIEW_RAD,
 ) -> MapScore:
-    """Score the obstacles whose outlines are within `within_m` of the head's front (2,). view_rad: of the camera."""
+    """Score the obstacles whose outlines are within NEAR_M of the head's front (2,)."""
     head = np.asarray(head_w, dtype=np.float64)[:2]
-    near = _within(truth, head, within_m + MATCH_M)
+    near = _within(truth, head, NEAR_M + MATCH_M)
     true_outlines = Outlines.of(near)
     found = MapScore()
     matched: set[str] = set()
-    for one in _within(reported, head, within_m):
+    for one in _within(reported, head, NEAR_M):
         found.reported += 1
         errors = np.abs(true_outlines.distance_m(facing_points_w(one, head))).mean(axis=0)
         best = int(np.argmin(errors)) if near else -1
@@ -74,22 +71,20 @@ def score(
         found.surface_m.append(float(errors[best]))
         found.size_m.append(_size_m(one) - _size_m(true))
         found.in_sd.append(off / max(one.position_sd_m, 1e-4))
-    for true in visible(truth, head, heading_rad, within_m=within_m, view_rad=view_rad):
+    for true in visible(truth, head, heading_rad):
         found.visible += 1
         found.misses += true.name not in matched
     return found
 
 
-def visible(
-    truth: Sequence[Obstacle], head_w: Floats, heading_rad: float, *, within_m: float, view_rad: float
-) -> list[Obstacle]:
+def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
     """True obstacles near the head whose centre lies in view, and half of whose facing side no other one hides."""
-    near = _within(truth, head_w, within_m)
+    near = _within(truth, head_w, NEAR_M)
     outlines, found = Outlines.of(near), list[Obstacle]()
     for i, true in enumerate(near):
         to = np.array(true.position_w[:2]) - head_w
         off = (math.atan2(to[1], to[0]) - heading_rad + math.pi) % (2 * math.pi) - math.pi
-        if abs(off) > 0.45 * view_rad or outlines.distance_m(head_w)[i] < NEAREST_M:
+        if abs(off) > 0.45 * VIEW_RAD or outlines.distance_m(head_w)[i] < NEAREST_M:
             continue
         facing = facing_points_w(true, head_w)
         sight = head_w + SIGHT[:, None, None] * (facing - head_w)  # (steps, points, 2)

@@ -7,6 +7,7 @@ The rows have the columns of the black box, made of the messages: joints of `sen
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from snakesim_hal.wire.messages import (
     Configuration,
     ControlState,
     Description,
-    Message,
     Status,
     Trajectory,
     World,
@@ -32,17 +32,16 @@ from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.results.gaps import unread
 
-SERVICE_STREAMS: dict[str, type[Message]] = {
-    keys.CONTROL_STATE: ControlState,
-    keys.WORLD: World,
-    keys.TRAJECTORY: Trajectory,
-}
+SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 """What guidance, navigation and control publish."""
 OUTPUTS = (*SERVICE_STREAMS, keys.OWN_ALL)
 """What the host's black box does not have."""
 WORLDS_PER_S = 20.0  # as often as control publishes its state
 _TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
 ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.OWN_ALL, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+
+
+_decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
 
 
 @dataclass
@@ -69,7 +68,6 @@ class Contents:
     last_tick_ns: int | None = None  # robot time of the last of them
     whole: bool = True  # the file has an end
     replay_of: str = ""  # the recording whose sensors these are
-    _decoders: dict[str, Decoder[Any]] = field(default_factory=dict[str, Decoder[Any]])
 
     def take(self, recorded: RecordedMessage) -> None:
         """One message at a key of ALL, in the order of the file."""
@@ -79,9 +77,9 @@ class Contents:
         message_type = keys.message_at(recorded.key)
         if message_type is None:
             return
-        decoder = self._decoders.get(recorded.key) or self._decoders.setdefault(recorded.key, Decoder(message_type))
         try:
-            self._keep(recorded.key, decoder.decode(recorded.payload, recorded.encoding), recorded.wall_ns)
+            message = _decoder(message_type).decode(recorded.payload, recorded.encoding)
+            self._keep(recorded.key, message, recorded.wall_ns)
         except WireError as error:
             self.refused[f"{recorded.key}: {error}"[:200]] += 1
 

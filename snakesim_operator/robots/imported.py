@@ -1,11 +1,17 @@
 """What an import of a URDF is asked for, and what it returns."""
 
+import re
 from dataclasses import dataclass, field
 
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.robot import RobotFile
 
 UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+
+
+def plain(name: str, otherwise: str) -> str:
+    """A name as a robot file may have it; otherwise: instead of an empty one."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:40] or otherwise
 
 
 @dataclass(frozen=True)

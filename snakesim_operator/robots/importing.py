@@ -15,7 +15,7 @@ from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.files import Table, read_part, shipped
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.robots.body import put_body
-from snakesim_operator.robots.imported import Imported, Order
+from snakesim_operator.robots.imported import Imported, Order, plain
 from snakesim_operator.robots.joint_limits import put_limits
 from snakesim_operator.robots.urdf_sensors import put_sensors
 from snakesim_operator.robots.urdf_tree import row_of
@@ -34,7 +34,7 @@ def robot_of(file: Path, order: Order) -> Imported:
     found = Imported(_rest(urdf, order))
     row = row_of(urdf, file, tail=order.tail, warn=found.left_out.append)
     frames = put_body(found, row, order, urdf)
-    found.table.put("name", _name(urdf.get("name", file.stem)), str(file))
+    found.table.put("name", plain(urdf.get("name", file.stem), "robot"), str(file))
     own = urdf.first("snakesim") is not None
     put_limits(found.table, row.joints, found.negated, str(file), found.changed.append, own=own)
     if own:  # of a <snakesim> element; the others say the same, in fewer words
@@ -74,12 +74,6 @@ def _rest(urdf: Element, order: Order) -> Table:
         except ValueError as error:
             raise element.wrong(f"has a `value` that is not JSON: {short(str(error))}") from None
     return table
-
-
-def _name(text: str) -> str:
-    return (
-        "".join(char if char.isascii() and (char.isalnum() or char in "_-") else "_" for char in text)[:40] or "robot"
-    )
 
 
 def _warn_unread(found: Imported, urdf: Element) -> None:

@@ -16,6 +16,7 @@ from snakesim_hal.errors import short
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import DepthCamera
+from snakesim_operator.robots.imported import plain
 from snakesim_operator.robots.urdf_tree import Row, rotation
 from snakesim_operator.robots.xml_tree import Element
 
@@ -47,7 +48,7 @@ def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], sca
                 @ _in_metres(row.bodies[index].frames[reference], scale)
                 @ _in_metres(_pose(sensor), scale)
             )
-            values |= {"name": _plain(name), "link": index} | _place(pose, name, warn)
+            values |= {"name": plain(name, "sensor"), "link": index} | _place(pose, name, warn)
             values |= _camera(sensor) if kind in DEPTH else _lidar(sensor)
             group = "depth" if kind in DEPTH else "range"
             listed = table.values.get("sensors", {}).get(group, [])
@@ -57,12 +58,6 @@ def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], sca
 def _common(sensor: Element) -> dict[str, Any]:
     rate_hz = sensor.text_number("update_rate", 0.0)
     return {"rate_hz": rate_hz} if rate_hz > 0 else {}
-
-
-def _plain(name: str) -> str:
-    return (
-        "".join(char if char.isascii() and (char.isalnum() or char in "_-") else "_" for char in name)[:40] or "sensor"
-    )
 
 
 def _pose(sensor: Element) -> Floats:

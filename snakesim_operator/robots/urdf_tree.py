@@ -57,7 +57,6 @@ class Joint:
     name: str
     origin: Floats
     axis: Floats  # about which the front body turns against the rear one, for a positive angle of ours
-    backwards: bool  # the URDF's parent is in front
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def _joint(element: Element, frame: Floats) -> Joint:
     length = float(np.linalg.norm(axis))
     if length < 1e-9:
         raise element.wrong("has an axis of length 0")
-    return Joint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis / length, backwards=False)
+    return Joint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis / length)
 
 
 def _add_link(body: Body, link: Element, frame: Floats, file: Path, warn: Warn) -> None:
@@ -231,7 +230,7 @@ def _in_a_row(
     near: dict[str, list[tuple[str, Joint]]] = {name: [] for name in bodies}
     for parent, child, joint in movable:
         near[body_of[parent]].append((body_of[child], joint))
-        turned = Joint(joint.element, joint.name, joint.origin, -joint.axis, backwards=True)
+        turned = Joint(joint.element, joint.name, joint.origin, -joint.axis)
         near[body_of[child]].append((body_of[parent], turned))
     forks = [name for name, joints in near.items() if len(joints) > 2]
     if forks:

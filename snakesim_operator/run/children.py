@@ -29,7 +29,7 @@ class ProcessOutput:
         self._thread.start()
 
     def last(self) -> list[str]:
-        """The last lines, once the process has ended."""
+        """The last lines of its stdout and stderr, once it has ended."""
         self._thread.join(1.0)
         return self._last.decode(errors="replace").strip().splitlines()[-LINES_SHOWN:]
 
@@ -57,13 +57,9 @@ class Child:
             return None
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}"
-        why = (self.last_words() or [""])[-1]
+        why = (self.words.last() or [""])[-1]
         said = f"snakesim {self.name}: "
         return f"{self.name} ended with exit code {code}" + (f": {why[len(said) :]}" if why.startswith(said) else "")
-
-    def last_words(self) -> list[str]:
-        """The last lines of its stdout and stderr, once it has ended."""
-        return self.words.last()
 
 
 def start(

@@ -2,7 +2,6 @@
 
 import sys
 import time
-from types import TracebackType
 from typing import Self
 
 from snakesim_hal.model.scenario import RunConfig
@@ -13,29 +12,41 @@ TERMINAL_PERIOD_S = 0.1
 PLAIN_PERIOD_S = 5.0
 
 
-class Progress:
+class OneLine:
+    """A line that is rewritten in place on a terminal, and otherwise printed again."""
+
+    def __init__(self) -> None:
+        self.terminal = sys.stdout.isatty()
+        self._shown = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            say("")
+
+    def put(self, text: str) -> None:
+        """Show it now."""
+        if self.terminal:
+            self._shown = overwrite_line(text, 118, self._shown)
+        else:
+            say(text)
+
+
+class Progress(OneLine):
     """Shows the progress of a run."""
 
     def __init__(self, config: RunConfig) -> None:
+        super().__init__()
         self._duration_s = config.duration_s
         self._rate_hz = config.rate_hz
-        self._terminal = sys.stdout.isatty()
         self._next = 0.0
-        self._shown = 0
         self._origin: tuple[float, float] | None = None  # wall and robot time at arming
         self._armed_s = 0.0  # armed robot time so far, which a run's duration counts
         self._before: Status | None = None
         self._last = ""
         self._armed = False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._terminal and self._shown:
-            say("")
 
     def start_over(self) -> None:
         """Robot time restarts at 0, with a new host."""
@@ -55,12 +66,10 @@ class Progress:
         if armed and not self._armed_s:
             return  # the robot has been armed since the status before: for how long tells the next one
         self._armed = armed
-        self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
+        self._next = now + (TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S)
         text = self._running(status, control, now) if armed else f"starting: {status.why}"
-        if self._terminal:
-            self._shown = overwrite_line(text, 118, self._shown)
-        elif text != self._last:
-            say(text)
+        if self.terminal or text != self._last:
+            self.put(text)
         self._last = text
 
     def _count(self, status: Status) -> None:

@@ -185,7 +185,7 @@ class Supervisor:
 
     def _go_on_without(self, part: Part, how: str) -> None:
         if part.name not in self.lost:
-            self.lost[part.name] = (part.child.last_words() or [how])[-1]
+            self.lost[part.name] = (part.child.words.last() or [how])[-1]
             self._files.warn(self.lost[part.name])
 
     def _put_off(self, part: Part, how: str) -> None:
@@ -229,7 +229,7 @@ class Supervisor:
         if self._ending.reason is None or self._ending.interrupted:
             return
         for part in self._parts.values():
-            words = part.child.last_words()
+            words = part.child.words.last()
             if words:
                 self._say(f"--- output of {part.name}:")
                 for line in words:

@@ -89,7 +89,7 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
 
 def test_the_report_shows_a_perceived_map_and_the_planned_paths_beside_the_truth(tmp_path: Path) -> None:
     film = playback(simulate(load("clutter", [parse_set("duration_s=1")]).config, tmp_path / "run").record)
-    assert film is not None and film.with_map and film.with_path
+    assert film is not None and film.data["maps"] and film.data["paths"]
     maps, paths, last = film.data["maps"], film.data["paths"], film.data["frames"][-1]
     assert len(maps[last[6]]) >= 6 and len(paths[last[7]]) >= 20  # the launch row, and what lies ahead
     assert "as guidance perceived it" in (tmp_path / "run" / "report.html").read_text()

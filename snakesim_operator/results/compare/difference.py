@@ -15,9 +15,10 @@ from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned,
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, identity
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import Series, distance, propulsion_intervals, reported_distance
+from snakesim_operator.results.report.timeline import Propulsion, Series, distance, hand_overs, reported_distance
 
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
+NAMED = 12  # hand-overs, one after the other
 STOOD_M = 0.001  # who moved less did not move: no percentage is made of that
 TARGETS = (
     (Mode.POSITION, "angle target", "rad"),
@@ -89,16 +90,6 @@ class Advance:
 class FirstDivergence:
     """The first tick at which a joint's angles were further apart than a limit."""
 
-    row: int  # on the common time axis
-    time_s: float
-    joint: int
-    difference_rad: float
-
-
-@dataclass(frozen=True)
-class HandOver:
-    """A joint began to propel."""
-
     time_s: float
     joint: int
 
@@ -107,8 +98,8 @@ class HandOver:
 class HandOvers:
     """Which joints propelled, in order, in either run."""
 
-    a: list[HandOver]
-    b: list[HandOver]
+    a: list[Propulsion]
+    b: list[Propulsion]
     unknown: str = ""  # why they cannot be compared
 
     @property
@@ -120,7 +111,7 @@ class HandOvers:
     @property
     def later_s(self) -> list[float]:
         """By how much B was later, for each hand-over that agrees."""
-        return [b.time_s - a.time_s for a, b in list(zip(self.a, self.b, strict=False))[: self.agreed]]
+        return [b.start_s - a.start_s for a, b in list(zip(self.a, self.b, strict=False))[: self.agreed]]
 
     @property
     def same_order(self) -> bool:
@@ -147,7 +138,6 @@ class Difference:
     other_mode: float  # share of ticks and joints whose modes differ
     tracking_rad: tuple[float | None, float | None]  # RMS of angle - target in position mode, in A and in B
     hand_overs: HandOvers
-    apart_rad: float
     parted: FirstDivergence | None
 
     @property
@@ -166,7 +156,7 @@ class Difference:
         return [self.angle, self.speed, self.torque, *self.targets]
 
 
-def differ(a: RunRecord, b: RunRecord, apart_rad: float = APART_RAD) -> Difference:
+def differ(a: RunRecord, b: RunRecord) -> Difference:
     """Compare two runs of robots with the same joints. Raises ConfigError when they cannot be compared."""
     _check(a, b)
     aligned = align(a, b)
@@ -196,8 +186,7 @@ def differ(a: RunRecord, b: RunRecord, apart_rad: float = APART_RAD) -> Differen
         other_mode=float(1 - same_mode.mean()),
         tracking_rad=(_tracking_rad(on_a), _tracking_rad(on_b)),
         hand_overs=HandOvers(_hand_overs(a, until_s), _hand_overs(b, until_s), _unreported(a, b)),
-        apart_rad=apart_rad,
-        parted=_parted(time_s, angle.difference, apart_rad),
+        parted=_parted(time_s, angle.difference),
     )
 
 
@@ -282,26 +271,21 @@ def _unreported(a: RunRecord, b: RunRecord) -> str:
     return f"unknown, because nothing that control reported in {' and '.join(silent)} was recorded" if silent else ""
 
 
-def _hand_overs(record: RunRecord, until_s: float) -> list[HandOver]:
-    """Within the common time. A joint that pauses and goes on is no hand-over."""
-    taken: list[HandOver] = []
-    for one in propulsion_intervals(record):
-        if one.start_s <= until_s + SAME_INSTANT_S and (not taken or taken[-1].joint != one.joint):
-            taken.append(HandOver(one.start_s, one.joint))
-    return taken
+def _hand_overs(record: RunRecord, until_s: float) -> list[Propulsion]:
+    """Within the common time."""
+    return [one for one in hand_overs(record) if one.start_s <= until_s + SAME_INSTANT_S]
 
 
-def _parted(time_s: Floats, difference_rad: Floats, apart_rad: float) -> FirstDivergence | None:
+def _parted(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:
     sizes = np.abs(np.nan_to_num(difference_rad))
-    beyond = np.flatnonzero((sizes > apart_rad).any(axis=1))
+    beyond = np.flatnonzero((sizes > APART_RAD).any(axis=1))
     if not len(beyond):
         return None
     row = int(beyond[0])
-    joint = int(np.argmax(sizes[row]))
-    return FirstDivergence(row, float(time_s[row]), joint, float(difference_rad[row, joint]))
+    return FirstDivergence(float(time_s[row]), int(np.argmax(sizes[row])))
 
 
-def order(names: Sequence[str], hand_overs: Sequence[HandOver], most: int = 12) -> str:
+def order(names: Sequence[str], turns: Sequence[Propulsion]) -> str:
     """Hand-overs in words."""
-    shown = " → ".join(names[one.joint] for one in hand_overs[:most])
-    return (shown + (" → …" if len(hand_overs) > most else "")) or "none"
+    shown = " → ".join(names[one.joint] for one in turns[:NAMED])
+    return (shown + (" → …" if len(turns) > NAMED else "")) or "none"

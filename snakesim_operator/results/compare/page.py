@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_operator.results.compare import figures
-from snakesim_operator.results.compare.difference import Difference
+from snakesim_operator.results.compare.difference import APART_RAD, Difference
 from snakesim_operator.results.compare.verdict import ToleranceCheck, sentences, who_propelled
 from snakesim_operator.results.page.html import render, shown
 
@@ -21,10 +21,9 @@ def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
     return render(
         Path(__file__).parent / "compare.html",
         len(difference.joints),
-        styles=[],
-        scripts=[],
         title=" and ".join(record.folder.name for record in (difference.a, difference.b)),
         difference=difference,
+        apart_rad=APART_RAD,
         records=(difference.a, difference.b),
         kind="" if asked is None else "good" if asked.holds else "bad",
         said=" ".join(said),

@@ -68,7 +68,7 @@ def for_scripts(difference: Difference) -> dict[str, Any]:
         },
         "parted": None if parted is None else {"joint": names[parted.joint], "time_s": parted.time_s},
         "hand_overs": {
-            run: [{"joint": names[one.joint], "time_s": one.time_s} for one in order_of]
+            run: [{"joint": names[one.joint], "time_s": one.start_s} for one in order_of]
             for run, order_of in (("a", difference.hand_overs.a), ("b", difference.hand_overs.b))
         },
     }
@@ -121,7 +121,7 @@ def _hand_overs(difference: Difference) -> list[str]:
     lines = [_row("propulsion joints", f"{len(both.a)} in a row", f"{len(both.b)} in a row")]
     for i, later_s in enumerate(both.later_s[:HAND_OVERS_SHOWN]):
         a, b = both.a[i], both.b[i]
-        lines.append(_row(f"  {names[a.joint]}", f"{a.time_s:.2f} s", f"{b.time_s:.2f} s", f"{later_s:+.2f} s"))
+        lines.append(_row(f"  {names[a.joint]}", f"{a.start_s:.2f} s", f"{b.start_s:.2f} s", f"{later_s:+.2f} s"))
     if both.agreed > HAND_OVERS_SHOWN:
         lines.append(f"    and {both.agreed - HAND_OVERS_SHOWN} more that agree; the last is {both.later_s[-1]:+.2f} s")
     if not both.same_order:

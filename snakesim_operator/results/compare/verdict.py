@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from snakesim_operator.results.compare.difference import STOOD_M, Advance, Difference
+from snakesim_operator.results.compare.difference import APART_RAD, STOOD_M, Advance, Difference
 
 SAME = "the same"
 
@@ -50,12 +50,11 @@ def sentences(difference: Difference) -> list[str]:
     ]
     parted = difference.parted
     if parted is None:
-        said.append(f"No joint's angles were ever more than {difference.apart_rad:g} rad apart.")
+        said.append(f"No joint's angles were ever more than {APART_RAD:g} rad apart.")
     else:
         joint = difference.joints[parted.joint]
         said.append(
-            f"The runs diverge at {parted.time_s:.2f} s, "
-            f"when {joint} is first more than {difference.apart_rad:g} rad apart."
+            f"The runs diverge at {parted.time_s:.2f} s, when {joint} is first more than {APART_RAD:g} rad apart."
         )
     hand_overs = difference.hand_overs
     if hand_overs.a or hand_overs.b or hand_overs.unknown:
@@ -107,7 +106,7 @@ def who_propelled(difference: Difference) -> str:
     if both.same_order:
         return f"propulsion is handed over in the same order, {len(both.a)} joints one after another"
     next_ones = [
-        f"{run} goes on with {names[taken[both.agreed].joint]} at {taken[both.agreed].time_s:.2f} s"
+        f"{run} goes on with {names[taken[both.agreed].joint]} at {taken[both.agreed].start_s:.2f} s"
         if both.agreed < len(taken)
         else f"{run} with none"
         for run, taken in (("A", both.a), ("B", both.b))

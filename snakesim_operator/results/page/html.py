@@ -1,5 +1,6 @@
 """Pages from templates. Whatever comes from outside is escaped here: in text by Jinja, in figures by `chart`."""
 
+from collections.abc import Sequence
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -22,8 +23,8 @@ def render(
     template: Path,
     coloured_joints: int,
     *,
-    styles: list[Path],
-    scripts: list[Path],
+    styles: Sequence[Path] = (),
+    scripts: Sequence[Path] = (),
     charts: bool = True,
     **values: Any,
 ) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unfelt
-from snakesim_operator.results.report.timeline import end_s, jam_bands, propulsion_intervals
+from snakesim_operator.results.report.timeline import end_s, hand_overs, jam_bands
 from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.summary import RunSummary, distance_m
@@ -32,12 +32,9 @@ def events(record: RunRecord, summary: RunSummary) -> list[Event]:
         return []
     names = [joint.name for joint in record.description.joints]
     found = [Event(0.0, "Start")]
-    last = None
-    for one in propulsion_intervals(record):
-        if one.joint != last:
-            words = f"{names[one.joint]} begins to propel" if last is None else f"Hand-over to {names[one.joint]}"
-            found.append(Event(one.start_s, words, one.joint))
-        last = one.joint
+    for i, one in enumerate(hand_overs(record)):
+        words = f"Hand-over to {names[one.joint]}" if i else f"{names[one.joint]} begins to propel"
+        found.append(Event(one.start_s, words, one.joint))
     forces = record.contact_peak_n
     if np.nanmax(forces, initial=0.0) > 0:
         row = int(np.nanargmax(forces))

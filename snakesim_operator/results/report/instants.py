@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.felt import is_felt
+from snakesim_operator.results.came_true import is_felt
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import reported_at_s
 

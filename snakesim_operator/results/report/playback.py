@@ -39,8 +39,6 @@ class Playback:
     data: dict[str, Any]
     with_solved: bool
     with_felt: bool
-    with_map: bool  # obstacles as guidance perceived them
-    with_path: bool  # paths as navigation planned them
 
 
 def playback(record: RunRecord) -> Playback | None:
@@ -91,7 +89,7 @@ def playback(record: RunRecord) -> Playback | None:
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
     data |= {"maps": maps, "paths": paths}
     with_solved, with_felt = (any(frame[k] for frame in frames) for k in (4, 5))
-    return Playback(Markup(picture), data, with_solved, with_felt, with_map=bool(maps), with_path=bool(paths))
+    return Playback(Markup(picture), data, with_solved, with_felt)
 
 
 def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:

@@ -94,6 +94,15 @@ def propulsion_intervals(record: RunRecord) -> list[Propulsion]:
     return [Propulsion(b.start_s, b.end_s, joints[b.what]) for b in bands if b.what in joints]
 
 
+def hand_overs(record: RunRecord) -> list[Propulsion]:
+    """Every time that another joint began to propel. One that pauses and goes on is none."""
+    found: list[Propulsion] = []
+    for one in propulsion_intervals(record):
+        if not found or found[-1].joint != one.joint:
+            found.append(one)
+    return found
+
+
 def joined(intervals: list[Propulsion], gap_s: float) -> list[Propulsion]:
     """Turns of one joint with less than a gap between them are one: no chart could show them apart."""
     found: list[Propulsion] = []

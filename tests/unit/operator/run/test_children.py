@@ -14,5 +14,5 @@ def test_an_interrupt_while_a_child_starts_leaves_no_traceback(after_s: float) -
     child = start("control", ["snakesim_hal.serve", "control", "--help"], said.extend)
     time.sleep(after_s)
     child.process.send_signal(signal.SIGINT)
-    assert child.process.wait(30) == 0, child.last_words()
-    assert child.last_words() and b"Traceback" not in said
+    assert child.process.wait(30) == 0, child.words.last()
+    assert child.words.last() and b"Traceback" not in said
