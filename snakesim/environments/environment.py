@@ -21,7 +21,7 @@ from snakesim_gnc.control.observations import Observer, chosen
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.drawn import draws_of
 from snakesim_hal.model.plugins import FILMS, find_plugin
-from snakesim_hal.model.scenario import Override, RunConfig, check, description_of
+from snakesim_hal.model.scenario import Override, RunConfig, description_of
 from snakesim_hal.wire.messages import JointState
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
@@ -207,16 +207,10 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         return checked(self._scenario, [*self._overrides, *own], processes=False)
 
     def _of_seed(self, seed: int) -> RunConfig:
-        scene = self._scenario_config.scene
-        new_fields = scene.random_field if self._new_field else []
-        if self._draws:
-            return self._drawn(seed, ["seed", *(f"scene.random_field.{i}.seed" for i in range(len(new_fields)))])
-        config = msgspec.structs.replace(self._scenario_config, seed=seed)
-        if new_fields:
-            fields = [msgspec.structs.replace(field, seed=seed) for field in new_fields]
-            config = msgspec.structs.replace(config, scene=msgspec.structs.replace(scene, random_field=fields))
-            check(config)
-        return config
+        new_fields = len(self._scenario_config.scene.random_field) if self._new_field else 0
+        if self._draws or new_fields:
+            return self._drawn(seed, ["seed", *(f"scene.random_field.{i}.seed" for i in range(new_fields))])
+        return msgspec.structs.replace(self._scenario_config, seed=seed)  # at once
 
     def _observe(self) -> Observation:
         """As a controller would see it at this tick."""

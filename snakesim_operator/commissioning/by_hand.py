@@ -87,10 +87,6 @@ class Hand:
                 yield np.array(state.angle_rad)
             time.sleep(0.01)
 
-    def angle_now_rad(self) -> Floats:
-        """One sample. Raises as `angles_rad`."""
-        return next(self.angles_rad(lambda: False))
-
 
 def zero(path: Path, where: RobotSelection, *, asks: bool) -> int:
     """Take the present pose as straight. asks: wait for Enter first. Raises SnakesimError."""
@@ -123,7 +119,7 @@ def direction(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
     wrong: list[str] = []
     with _hand(path, where, "joints direction") as hand:
         for joint in chosen(hand.joints, names, path):
-            before_rad, turn = hand.angle_now_rad(), None
+            before_rad, turn = next(hand.angles_rad(lambda: False)), None
             say(f"{joint.name}: turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more; Enter skips it")
             for angles_rad in hand.angles_rad(_entered):
                 if (turn := turned(before_rad, angles_rad)) is not None:

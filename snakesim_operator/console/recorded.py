@@ -30,11 +30,9 @@ class RecordedRun:
         self.heard = Heard()
         self.record = RunRecord.load(kept, hear=self.heard.take)
         self.heard.robot = self.record.description
-        self._stamps = {id(messages): [_stamp_s(m) for m in messages] for messages in self._outputs()}
+        outputs = (self.record.control, self.record.worlds, self.record.trajectories)
+        self._stamps = {id(messages): [_stamp_s(m) for m in messages] for messages in outputs}
         self._log = self._written()
-
-    def _outputs(self) -> tuple[Sequence[ControlState], Sequence[World], Sequence[Trajectory]]:
-        return self.record.control, self.record.worlds, self.record.trajectories
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -1,10 +1,10 @@
-"""The ROS messages that the bridge sends, field by field in the order of their definitions; rosbags encodes them.
+"""Types and parts of the ROS messages that the bridge sends, field by field as defined; rosbags encodes them.
 
 Frames, units and conventions: REP 103. A stamp is in nanoseconds. Quaternions come as wxyz, and ROS has them as xyzw.
 Definitions are those of Jazzy; a test compares the types' hashes with later distributions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,8 +40,6 @@ Wxyz = tuple[float, float, float, float]
 Rgba = tuple[float, float, float, float]
 ARROW, CUBE, SPHERE, CYLINDER = 0, 1, 2, 3  # types of a marker
 ADD, DELETE_ALL = 0, 3  # actions of a marker
-OK, WARN, ERROR = 0, 1, 2  # levels of a diagnostic status
-PLUMB_BOB = "plumb_bob"  # distortion model, here without distortion
 LAST_SECOND = 2**31 - 1  # of ROS; a robot's clock may say anything
 
 
@@ -68,7 +66,8 @@ class Marker:
     points_m: tuple[Triple, ...] = ()
 
 
-def _sent(kind: RosType, *fields: Any) -> bytes:
+def sent(kind: RosType, *fields: Any) -> bytes:
+    """A message of this type in CDR, by its fields in their order."""
     return bytes(STORE.serialize_cdr(made(kind.name, *fields), kind.name))
 
 
@@ -82,11 +81,13 @@ def _time(stamp_ns: int) -> Any:
     return made("builtin_interfaces/msg/Time", min(stamp_ns // 10**9, LAST_SECOND), stamp_ns % 10**9)
 
 
-def _header(stamp_ns: int, frame: str) -> Any:
+def header(stamp_ns: int, frame: str) -> Any:
+    """Of a message. frame: empty for one that has none."""
     return made("std_msgs/msg/Header", _time(stamp_ns), frame)
 
 
-def _vector(xyz: Triple) -> Any:
+def vector(xyz: Triple) -> Any:
+    """geometry_msgs/Vector3."""
     return made("geometry_msgs/msg/Vector3", *xyz)
 
 
@@ -94,12 +95,9 @@ def _point(xyz: Triple) -> Any:
     return made("geometry_msgs/msg/Point", *xyz)
 
 
-def _quaternion(wxyz: Wxyz) -> Any:
+def quaternion(wxyz: Wxyz) -> Any:
+    """geometry_msgs/Quaternion."""
     return made("geometry_msgs/msg/Quaternion", *wxyz[1:], wxyz[0])
-
-
-def _doubles(values: Sequence[float]) -> np.ndarray:
-    return np.array(values, dtype=np.float64)
 
 
 def _octets(raw: bytes) -> np.ndarray:
@@ -108,108 +106,51 @@ def _octets(raw: bytes) -> np.ndarray:
 
 def clock(stamp_ns: int) -> bytes:
     """rosgraph_msgs/Clock."""
-    return _sent(CLOCK, _time(stamp_ns))
+    return sent(CLOCK, _time(stamp_ns))
 
 
 def string(text: str) -> bytes:
     """std_msgs/String."""
-    return _sent(STRING, text)
-
-
-def numbers(label: str, values: Sequence[float]) -> bytes:
-    """std_msgs/Float64MultiArray of one dimension."""
-    dimension = made("std_msgs/msg/MultiArrayDimension", label, len(values), len(values))
-    return _sent(NUMBERS, made("std_msgs/msg/MultiArrayLayout", [dimension], 0), _doubles(values))
-
-
-def joint_state(
-    stamp_ns: int,
-    names: Sequence[str],
-    angles_rad: Sequence[float],
-    velocities_rad_s: Sequence[float],
-    torques_nm: Sequence[float],
-) -> bytes:
-    """sensor_msgs/JointState; it has no frame."""
-    numbers = map(_doubles, (angles_rad, velocities_rad_s, torques_nm))
-    return _sent(JOINT_STATE, _header(stamp_ns, ""), names, *numbers)
+    return sent(STRING, text)
 
 
 def transforms(stamp_ns: int, all_of_them: Sequence[Transform]) -> bytes:
     """tf2_msgs/TFMessage."""
-    return _sent(TRANSFORMS, [_transform(stamp_ns, one) for one in all_of_them])
+    return sent(TRANSFORMS, [_transform(stamp_ns, one) for one in all_of_them])
 
 
 def _transform(stamp_ns: int, one: Transform) -> Any:
-    pose = made("geometry_msgs/msg/Transform", _vector(one.position_m), _quaternion(one.orientation_wxyz))
-    return made("geometry_msgs/msg/TransformStamped", _header(stamp_ns, one.parent), one.child, pose)
+    pose = made("geometry_msgs/msg/Transform", vector(one.position_m), quaternion(one.orientation_wxyz))
+    return made("geometry_msgs/msg/TransformStamped", header(stamp_ns, one.parent), one.child, pose)
 
 
 def markers(stamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
     """visualization_msgs/MarkerArray that replaces everything on its topic."""
-    header = _header(stamp_ns, frame)
-    cleared = _marker(header, 0, DELETE_ALL, Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
-    return _sent(MARKERS, [cleared, *(_marker(header, number, ADD, shape) for number, shape in enumerate(shapes))])
+    head = header(stamp_ns, frame)
+    cleared = _marker(head, 0, DELETE_ALL, Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
+    return sent(MARKERS, [cleared, *(_marker(head, number, ADD, shape) for number, shape in enumerate(shapes))])
 
 
-def _marker(header: Any, number: int, action: int, shape: Marker) -> Any:
-    pose = made("geometry_msgs/msg/Pose", _point(shape.position_m), _quaternion(shape.orientation_wxyz))
+def _marker(head: Any, number: int, action: int, shape: Marker) -> Any:
+    pose = made("geometry_msgs/msg/Pose", _point(shape.position_m), quaternion(shape.orientation_wxyz))
     colour = made("std_msgs/msg/ColorRGBA", *shape.rgba)
     until_replaced = made("builtin_interfaces/msg/Duration", 0, 0)
-    drawn = (pose, _vector(shape.size_m), colour, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
-    no_texture = ("", made("sensor_msgs/msg/CompressedImage", _header(0, ""), "", _octets(b"")), [])
+    drawn = (pose, vector(shape.size_m), colour, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
+    no_texture = ("", made("sensor_msgs/msg/CompressedImage", header(0, ""), "", _octets(b"")), [])
     no_mesh = ("", made("visualization_msgs/msg/MeshFile", "", _octets(b"")), False)
     what = (shape.group, number, shape.shape, action)
-    return made("visualization_msgs/msg/Marker", header, *what, *drawn, *no_texture, "", *no_mesh)
+    return made("visualization_msgs/msg/Marker", head, *what, *drawn, *no_texture, "", *no_mesh)
 
 
 def image(stamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
     """sensor_msgs/Image. encoding: 16UC1 (mm), 32FC1 (m) or rgb8; rows without padding, little endian."""
-    header = _header(stamp_ns, frame)
-    return _sent(IMAGE, header, height, width, encoding, 0, len(pixels) // height, _octets(pixels))
+    size = (height, width, encoding, 0, len(pixels) // height)
+    return sent(IMAGE, header(stamp_ns, frame), *size, _octets(pixels))
 
 
 def compressed_image(stamp_ns: int, frame: str, described: str, data: bytes) -> bytes:
     """sensor_msgs/CompressedImage. described: its `format`, as the plug-ins of image_transport read it."""
-    return _sent(COMPRESSED_IMAGE, _header(stamp_ns, frame), described, _octets(data))
-
-
-def imu(stamp_ns: int, frame: str, angular_velocity_rad_s: Triple, acceleration_m_s2: Triple) -> bytes:
-    """sensor_msgs/Imu without orientation, which its covariance of -1 says; covariances of 0: unknown."""
-    unknown, no_orientation = np.zeros(9), np.array([-1.0, *[0.0] * 8])
-    turn, push = _vector(angular_velocity_rad_s), _vector(acceleration_m_s2)
-    unturned = _quaternion((1.0, 0.0, 0.0, 0.0))
-    return _sent(IMU, _header(stamp_ns, frame), unturned, no_orientation, turn, unknown, push, unknown)
-
-
-def camera_info(stamp_ns: int, frame: str, width: int, height: int, k: tuple[float, float, float, float]) -> bytes:
-    """sensor_msgs/CameraInfo of a camera without distortion. k: fx, fy, cx, cy in pixels."""
-    fx, fy, cx, cy = k
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    projection = np.hstack([matrix, np.zeros((3, 1))])
-    whole = made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    numbers = (np.zeros(5), matrix.ravel(), np.eye(3).ravel(), projection.ravel())
-    return _sent(CAMERA_INFO, _header(stamp_ns, frame), height, width, PLUMB_BOB, *numbers, 0, 0, whole)
-
-
-def laser_scan(
-    stamp_ns: int,
-    frame: str,
-    first_rad: float,
-    step_rad: float,
-    limits_m: tuple[float, float],
-    range_m: Sequence[float],
-) -> bytes:
-    """sensor_msgs/LaserScan, all beams at one instant. range_m: infinite where there is nothing (REP 117)."""
-    angles = (first_rad, first_rad + step_rad * (len(range_m) - 1), step_rad)
-    beams, no_intensities = np.array(range_m, dtype=np.float32), np.array([], dtype=np.float32)
-    return _sent(LASER_SCAN, _header(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, beams, no_intensities)
-
-
-def diagnostics(stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> bytes:
-    """diagnostic_msgs/DiagnosticArray with one status."""
-    pairs = [made("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
-    status = made("diagnostic_msgs/msg/DiagnosticStatus", level, name, message, name, pairs)
-    return _sent(DIAGNOSTICS, _header(stamp_ns, ""), [status])
+    return sent(COMPRESSED_IMAGE, header(stamp_ns, frame), described, _octets(data))
 
 
 def six_doubles(twist: bytes) -> tuple[float, ...] | None:

@@ -27,21 +27,19 @@ ARROW_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of 
 CONTACT: Rgba = (0.85, 0.2, 0.1, 1.0)
 FELT: Rgba = (0.9, 0.55, 0.1, 1.0)
 SEEN: Rgba = (0.3, 0.5, 0.75, 1.0)
+OK, WARN, ERROR = 0, 1, 2  # levels of a diagnostic status
+PLUMB_BOB = "plumb_bob"  # distortion model, here without distortion
 MILLIMETRE = 0.001
 MOST_COUNTS = 65535  # of 16 bits
 INVERSE_DEPTH_UNUSED = struct.pack("<i2f", 0, 0.0, 0.0)  # format and two parameters, for depth in float alone
 
 
 def joint_state(stamp_ns: int, names: list[str], joints: JointState) -> bytes:
-    """Joints that are not valid are left out: JointState may name any subset."""
+    """sensor_msgs/JointState, without a frame. Joints that are not valid are left out: it may name any subset."""
     kept = [i for i, valid in enumerate(joints.valid) if valid]
-    return ros.joint_state(
-        stamp_ns,
-        [names[i] for i in kept],
-        [joints.angle_rad[i] for i in kept],
-        [joints.velocity_rad_s[i] for i in kept],
-        [joints.torque_nm[i] for i in kept],
-    )
+    series = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+    numbers = (np.array([values[i] for i in kept], dtype=np.float64) for values in series)
+    return ros.sent(ros.JOINT_STATE, ros.header(stamp_ns, ""), [names[i] for i in kept], *numbers)
 
 
 def contact_markers(contacts: Iterable[WorldContact]) -> list[Marker]:
@@ -104,32 +102,49 @@ def compressed_colour(stamp_ns: int, frame: str, seen: ColourImage) -> bytes:
 
 
 def imu(stamp_ns: int, frame: str, seen: Imu, entry: int) -> bytes:
-    """One link's IMU; acceleration is the specific force, as REP 145 wants it."""
-    return ros.imu(stamp_ns, frame, seen.angular_velocity_rad_s[entry], seen.acceleration_m_s2[entry])
+    """sensor_msgs/Imu of one link; acceleration is the specific force, as REP 145 wants it.
+
+    Without orientation, which its covariance of -1 says; covariances of 0: unknown.
+    """
+    unknown, no_orientation = np.zeros(9), np.array([-1.0, *[0.0] * 8])
+    turn, push = ros.vector(seen.angular_velocity_rad_s[entry]), ros.vector(seen.acceleration_m_s2[entry])
+    unturned = ros.quaternion((1.0, 0.0, 0.0, 0.0))
+    return ros.sent(ros.IMU, ros.header(stamp_ns, frame), unturned, no_orientation, turn, unknown, push, unknown)
 
 
 def camera_info(stamp_ns: int, frame: str, seen: DepthImage | ColourImage) -> bytes:
-    """The intrinsics of either image."""
-    return ros.camera_info(stamp_ns, frame, seen.width, seen.height, (seen.fx_px, seen.fy_px, seen.cx_px, seen.cy_px))
+    """sensor_msgs/CameraInfo of either image, of a camera without distortion."""
+    matrix = np.array([[seen.fx_px, 0.0, seen.cx_px], [0.0, seen.fy_px, seen.cy_px], [0.0, 0.0, 1.0]])
+    projection = np.hstack([matrix, np.zeros((3, 1))])
+    whole = ros.made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    numbers = (np.zeros(5), matrix.ravel(), np.eye(3).ravel(), projection.ravel())
+    size = (seen.height, seen.width, PLUMB_BOB)
+    return ros.sent(ros.CAMERA_INFO, ros.header(stamp_ns, frame), *size, *numbers, 0, 0, whole)
 
 
 def laser_scan(stamp_ns: int, frame: str, seen: Ranges) -> bytes:
-    """Beams without a return are infinite (REP 117)."""
-    metres = [float("inf") if range_m is None else range_m for range_m in seen.range_m]
-    limits = (seen.range_min_m, seen.range_max_m)
-    return ros.laser_scan(stamp_ns, frame, seen.angle_min_rad, seen.angle_step_rad, limits, metres)
+    """sensor_msgs/LaserScan, all beams at one instant. Those without a return are infinite (REP 117)."""
+    beams = np.array([np.inf if range_m is None else range_m for range_m in seen.range_m], dtype=np.float32)
+    last_rad = seen.angle_min_rad + seen.angle_step_rad * (len(beams) - 1)
+    angles, limits = (seen.angle_min_rad, last_rad, seen.angle_step_rad), (seen.range_min_m, seen.range_max_m)
+    no_intensities = np.array([], dtype=np.float32)
+    header = ros.header(stamp_ns, frame)
+    return ros.sent(ros.LASER_SCAN, header, *angles, 0.0, 0.0, *limits, beams, no_intensities)
 
 
 def numbers(kind: OwnKind, field: str, _stamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
-    """One field of a sensor's own message: its numbers, each dimension labelled with its name and unit."""
+    """std_msgs/Float64MultiArray of one field of a sensor's own message, of one dimension with its name and unit."""
     found = [value for name, value in kind.numbers(sample).items() if name.partition(".")[0] == field]
-    return ros.numbers(f"{field} [{kind.units[field]}]", found)
+    label = f"{field} [{kind.units[field]}]"
+    dimension = ros.made("std_msgs/msg/MultiArrayDimension", label, len(found), len(found))
+    layout = ros.made("std_msgs/msg/MultiArrayLayout", [dimension], 0)
+    return ros.sent(ros.NUMBERS, layout, np.array(found, dtype=np.float64))
 
 
 def diagnostics(stamp_ns: int, status: Status) -> bytes:
-    """The robot's state and its reason."""
+    """diagnostic_msgs/DiagnosticArray with one status: the robot's state and its reason."""
     stopped = status.lifecycle in ("fault", "estop")
-    level = ros.ERROR if stopped else ros.WARN if status.faults or status.isolated or status.derated else ros.OK
+    level = ERROR if stopped else WARN if status.faults or status.isolated or status.derated else OK
     values = {
         "lifecycle": status.lifecycle,
         "backend": status.backend,
@@ -139,4 +154,7 @@ def diagnostics(stamp_ns: int, status: Status) -> bytes:
         "isolated joints": ", ".join(status.isolated) or "none",
         **{f"fault {i}": f"{fault.what}: {fault.cause}" for i, fault in enumerate(status.faults)},
     }
-    return ros.diagnostics(stamp_ns, level, status.robot, f"{status.lifecycle}: {status.why}", values)
+    pairs = [ros.made("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+    words = f"{status.lifecycle}: {status.why}"
+    said = ros.made("diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, words, status.robot, pairs)
+    return ros.sent(ros.DIAGNOSTICS, ros.header(stamp_ns, ""), [said])

@@ -196,7 +196,7 @@ def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
 @given(messages_of(m.Status))
 def test_diagnostics(status: m.Status) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.diagnostics(STAMP_NS, status)).status
-    assert (seen.level == ros.ERROR) == (status.lifecycle in ("fault", "estop"))
+    assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
     assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.why}")
     assert {"lifecycle", "backend", "lease holder"} <= {value.key for value in seen.values}
 
