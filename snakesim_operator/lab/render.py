@@ -1,5 +1,6 @@
 """Writes what each machine of a lab needs into a folder of its own. Certificates lie beside it: see `certificates`."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from snakesim_hal.model.textfiles import read_text, write_text
 from snakesim_operator.lab.identities import identities
 from snakesim_operator.lab.lab_file import Lab
 from snakesim_operator.lab.units import unit_files
-from snakesim_operator.lab.zenoh_files import as_json5, router_settings, session_settings
+from snakesim_operator.lab.zenoh_files import router_settings, session_settings
 
 WRITTEN = "rendered.txt"  # names of the files that were written, so that the next time leaves none of an earlier lab
 
@@ -41,7 +42,8 @@ def rendered(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
     """Every file as ((machine, path in the machine's folder), text)."""
     for identity in identities(lab):
         settings = router_settings(identity, lab) if identity.role is None else session_settings(identity, lab)
-        yield (identity.machine, f"{identity.label}.json5"), as_json5(_origin(lab, identity.common_name), settings)
+        text = f"// {_origin(lab, identity.common_name)}\n{json.dumps(settings, indent=2)}\n"  # JSON is JSON5
+        yield (identity.machine, f"{identity.label}.json5"), text
     for machine in lab.file.machines:
         for name, text in unit_files(lab, machine, _origin(lab, machine)):
             yield (machine, name), text

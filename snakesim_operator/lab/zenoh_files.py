@@ -1,6 +1,5 @@
 """Zenoh's configuration of a lab's routers and sessions, as stock Zenoh reads it: nothing of ours is in there."""
 
-import json
 from typing import Any
 
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
@@ -69,8 +68,3 @@ def _tls(identity: Identity, lab: Lab, side: str) -> dict[str, Any]:
         f"{side}_certificate": f"{folder}/{identity.label}.pem",
         f"{side}_private_key": f"{folder}/{identity.label}.key",
     }
-
-
-def as_json5(about: str, settings: dict[str, Any]) -> str:
-    """A file's text; JSON is JSON5, and a comment says what it is."""
-    return f"// {about}\n{json.dumps(settings, indent=2)}\n"

@@ -14,12 +14,13 @@ import msgspec
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.files import Table, read_part, shipped
 from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.textfiles import read_bytes
 from snakesim_operator.robots.body import put_body
 from snakesim_operator.robots.imported import Imported, Order, plain
 from snakesim_operator.robots.joint_limits import put_limits
 from snakesim_operator.robots.urdf_sensors import put_sensors
 from snakesim_operator.robots.urdf_tree import row_of
-from snakesim_operator.robots.xml_tree import Element, read_xml
+from snakesim_operator.robots.xml_tree import Element, parse_xml
 
 SECTIONS = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
 
@@ -28,7 +29,7 @@ def robot_of(file: Path, order: Order) -> Imported:
     """Read a URDF. Raises ConfigError for what is no snake, and for files that are not well formed."""
     if not 1e-6 <= order.scale <= 1e3:
         raise ConfigError(f"--scale {order.scale:g}: give metres per unit of length of the file, such as 0.001 for mm")
-    urdf = read_xml(file)
+    urdf = parse_xml(read_bytes(file), str(file))
     if urdf.tag != "robot":
         raise urdf.wrong("is no URDF; its outermost element is <robot>")
     found = Imported(_rest(urdf, order))

@@ -7,11 +7,9 @@ elements are bounded.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from xml.parsers import expat
 
 from snakesim_hal.errors import ConfigError, short
-from snakesim_hal.model.textfiles import read_bytes
 
 MAX_ELEMENTS, MAX_DEPTH = 100_000, 32
 
@@ -103,11 +101,6 @@ class Element:
             for name in child.attributes.keys() - child.read_attributes:
                 yield f"{path}<{child.tag} {name}=...>", child.line
             yield from child.unread(inner)
-
-
-def read_xml(path: Path) -> Element:
-    """The root element of a file. Raises ConfigError."""
-    return parse_xml(read_bytes(path), str(path))
 
 
 def parse_xml(data: bytes, source: str) -> Element:

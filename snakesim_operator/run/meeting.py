@@ -2,12 +2,9 @@
 
 import contextlib
 import socket
-from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
-from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.endpoint import DEFAULT_PORT
-from snakesim_hal.network.local_registry import LocalRobot
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.stop_port import open_stop_port, stop_address
 from snakesim_hal.wire import keys
@@ -57,11 +54,6 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
                 f"{there} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
                 f"--router {endpoint} with another --namespace"
             )
-
-
-def local_robot(config: RunConfig, config_file: Path, link: Link, stop_port: socket.socket) -> LocalRobot:
-    """The run's entry in the local registry."""
-    return LocalRobot.on(link, config.robot.name, config.backend, stop_port, str(config_file.absolute()))
 
 
 def _is_free(port: int) -> bool:

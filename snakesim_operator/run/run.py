@@ -17,7 +17,7 @@ from snakesim_hal.injection import ROUTER
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.network.endpoint import check_guarded
-from snakesim_hal.network.local_registry import registered
+from snakesim_hal.network.local_registry import LocalRobot, registered
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.plugin_check import check_plugins
@@ -29,7 +29,7 @@ from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import claimed, named_after
-from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
+from snakesim_operator.run.meeting import meeting_point, refuse_second_robot
 from snakesim_operator.run.monitor import AFTER_FAULT_S, RunMonitor
 from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import HOST, Supervisor
@@ -83,9 +83,10 @@ def run(request: RunRequest) -> int:
     ending = Ending()
     with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
+        names = (request.config.robot.name, request.config.backend)
         with (
             interruptible(ending),
-            registered(local_robot(request.config, config_file, link, stop_port)) as failure,
+            registered(LocalRobot.on(link, *names, stop_port, str(config_file.absolute()))) as failure,
             _console(request, link, files, config_file),  # first, because somebody waits for it
         ):
             if failure is not None:

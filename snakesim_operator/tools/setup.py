@@ -1,6 +1,7 @@
 """Arguments of the commands that need no robot: `snakesim doctor`, `router`, `schemas`, `scenarios`, `config`."""
 
 import argparse
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,14 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _router(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.tools.status import run_router
+    from snakesim_hal.model.files import ROUTER
+    from snakesim_hal.network.router import open_router
 
-    return run_router(arguments.config, insecure=arguments.insecure)
+    path: Path = arguments.config or ROUTER
+    with open_router(path, insecure=arguments.insecure):
+        say(f"router running from {path}; Ctrl-C ends it")
+        threading.Event().wait()
+    return 0
 
 
 def _schemas(arguments: argparse.Namespace) -> int:

@@ -1,16 +1,13 @@
-"""`snakesim status`: the state of running robots; and `snakesim router`."""
+"""`snakesim status`: the state of running robots."""
 
 import contextlib
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import timedelta
-from pathlib import Path
 from queue import Empty
 
 from snakesim_hal.errors import NotConnectedError, WireError
-from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, differences
 from snakesim_hal.network.session import Arrival, Link, open_session
@@ -166,14 +163,3 @@ def _what_to_type(link: Link, status: Status) -> list[str]:
         return [f"  next: {arm}"]
     missing = ", ".join(f"`snakesim service {name} SCENARIO{where}`" for name in status.waiting_for)
     return [f"  next: {missing or '`snakesim status` again: what prevents arming is named above'}"]
-
-
-def run_router(config: Path | None, *, insecure: bool = False) -> int:
-    """Run a router until Ctrl-C."""
-    from snakesim_hal.network.router import open_router
-
-    path = config or ROUTER
-    with open_router(path, insecure=insecure):
-        say(f"router running from {path}; Ctrl-C ends it")
-        threading.Event().wait()
-    return 0
