@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -19,51 +19,36 @@ from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 MAX_TURN_RAD = 3.14159
 
-Travel = Annotated[float, above(MAX_TURN_RAD, "rad")]
 Side = Annotated[float, bounded(-MAX_TURN_RAD, MAX_TURN_RAD, "rad")]
-Speed = Annotated[float, above(100, "rad/s")]
-Acceleration = Annotated[float, above(1e5, "rad/s²")]
 Torque = Annotated[float, above(1000, "N·m")]
-TorqueRate = Annotated[float, above(1e5, "N·m/s")]
-CableTurns = Annotated[float, above(100, "turns")]
 Celsius = Annotated[float, above(300, "°C")]
-Kelvin = Annotated[float, above(1000, "K")]
-LeastVolts = Annotated[float, from_zero(1000, "V")]
-Stiffness = Annotated[float, above(1e5, "N·m/rad")]
-Damping = Annotated[float, from_zero(1e4, "N·m·s/rad")]
-VelocityGain = Annotated[float, above(1e4, "N·m·s/rad")]
 Lag = Annotated[float, from_zero(1, "s")]
 RotorInertia = Annotated[float, from_zero(10, "kg·m²")]
 Friction = Annotated[float, from_zero(100, "N·m")]
 Viscosity = Annotated[float, from_zero(100, "N·m·s/rad")]
 TorqueConstant = Annotated[float, above(1000, "N·m/A")]
 Text = Annotated[str, Meta(max_length=100)]
-DriveId = Annotated[int, Meta(ge=0, lt=2**29)]
 Sign = Literal[1, -1]
 Zero = Annotated[float, bounded(-1e4, 1e4, "rad")]
 Gear = Annotated[float, above(1e4, "1")]
-HeatTime = Annotated[float, above(1e5, "s")]
-Watts = Annotated[float, from_zero(1e5, "W")]
-Share = Annotated[float, from_zero(1, "1")]
-Volts = Annotated[float, above(1000, "V")]
-Amperes = Annotated[float, from_zero(1000, "A")]
 
 
 class Limits(FileStruct, frozen=True, kw_only=True):
     """Limits of a joint; enforced by the gate and by the motor."""
 
-    angle_rad: Travel  # to either side
+    angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]  # to either side
     angle_min_rad: Side | None = None  # of a side that differs
     angle_max_rad: Side | None = None
-    cable_turns: CableTurns | None = None  # to either side, that the cable of a joint without end stops bears
+    # To either side, that the cable of a joint without end stops bears.
+    cable_turns: Annotated[float, above(100, "turns")] | None = None
     cable_unwound: Text = ""  # when it was, at the joint's zero; written by `snakesim joints zero`
-    speed_rad_s: Speed
-    acceleration_rad_s2: Acceleration
+    speed_rad_s: Annotated[float, above(100, "rad/s")]
+    acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
     torque_nm: Torque
-    torque_rate_nm_s: TorqueRate
+    torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
     derate_from_c: Celsius = 80.0  # of the winding: above it torque is derated
     stop_at_c: Celsius = 105.0  # a fifth of the torque is left, and the robot stops
-    least_voltage_v: LeastVolts = 18.0  # below it the robot stops
+    least_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
 
     def __post_init__(self) -> None:
         """Derating must begin before the robot stops, and a joint must turn. Raises ValueError, for the file reader."""
@@ -98,9 +83,9 @@ class Limits(FileStruct, frozen=True, kw_only=True):
 class Motor(FileStruct, frozen=True, kw_only=True):
     """Motor of a joint, as seen at the joint: behind the gear."""
 
-    stiffness_nm_per_rad: Stiffness  # position mode
-    damping_nm_s_per_rad: Damping  # position mode
-    velocity_gain_nm_s_per_rad: VelocityGain  # velocity mode
+    stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]  # position mode
+    damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]  # position mode
+    velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]  # velocity mode
     response_time_s: Lag  # first-order lag of the torque
     armature_kg_m2: RotorInertia  # rotor inertia seen at the joint
     friction_nm: Friction = 0.0
@@ -139,63 +124,38 @@ class Heat(FileStruct, frozen=True, kw_only=True):
     """How a motor warms up. The defaults are typical of a small geared servo; none was measured."""
 
     ambient_c: Annotated[float, bounded(-50, 100, "°C")] = 20.0
-    rise_at_rated_k: Kelvin = 240.0  # of the winding, at rest under the rated torque, for ever
-    time_constant_s: HeatTime = 60.0
-    loss_at_rated_w: Watts = 48.0  # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm
-    board_share: Share = 0.3  # of the winding's rise, in the electronics beside it; a guess
+    # Of the winding, at rest under the rated torque, for ever.
+    rise_at_rated_k: Annotated[float, above(1000, "K")] = 240.0
+    time_constant_s: Annotated[float, above(1e5, "s")] = 60.0
+    # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm.
+    loss_at_rated_w: Annotated[float, from_zero(1e5, "W")] = 48.0
+    # Of the winding's rise, in the electronics beside it; a guess.
+    board_share: Annotated[float, from_zero(1, "1")] = 0.3
 
 
 class Supply(FileStruct, frozen=True, kw_only=True):
     """Electrical supply of a joint."""
 
-    voltage_v: Volts = 24.0
-    idle_a: Amperes = 0.05
+    voltage_v: Annotated[float, above(1000, "V")] = 24.0
+    idle_a: Annotated[float, from_zero(1000, "A")] = 0.05
 
 
-class JointExceptions(FileStruct, frozen=True, kw_only=True):
+class _Id(FileStruct, frozen=True, kw_only=True):
+    id: Annotated[int, Meta(ge=0, lt=2**29)] | None = None  # on its bus; none: the joint's number
+
+
+_OF_ALL = {"ambient_c"}  # the water is the same for all
+_differing = (
+    (field.name, field.type | None, None)
+    for section in (Limits, Motor, Drive, Heat, Supply)
+    for field in msgspec.structs.fields(section)
+    if field.name not in _OF_ALL
+)
+_of_one: Any = msgspec.defstruct("_OfOne", [*_differing], bases=(_Id,), frozen=True, kw_only=True)
+
+
+class JointExceptions(_of_one):
     """What differs in one joint from the sections for all: their fields, and the drive's id."""
-
-    id: DriveId | None = None  # on its bus; none: the joint's number
-    # [limits]
-    angle_rad: Travel | None = None
-    angle_min_rad: Side | None = None
-    angle_max_rad: Side | None = None
-    cable_turns: CableTurns | None = None
-    cable_unwound: Text | None = None
-    speed_rad_s: Speed | None = None
-    acceleration_rad_s2: Acceleration | None = None
-    torque_nm: Torque | None = None
-    torque_rate_nm_s: TorqueRate | None = None
-    derate_from_c: Celsius | None = None
-    stop_at_c: Celsius | None = None
-    least_voltage_v: LeastVolts | None = None
-    # [motor]
-    stiffness_nm_per_rad: Stiffness | None = None
-    damping_nm_s_per_rad: Damping | None = None
-    velocity_gain_nm_s_per_rad: VelocityGain | None = None
-    response_time_s: Lag | None = None
-    armature_kg_m2: RotorInertia | None = None
-    friction_nm: Friction | None = None
-    viscous_nm_s_per_rad: Viscosity | None = None
-    torque_constant_nm_per_a: TorqueConstant | None = None
-    rated_nm: Torque | None = None
-    peak_nm: Torque | None = None
-    # [drive]
-    family: Text | None = None
-    port: Text | None = None
-    sign: Sign | None = None
-    zero_rad: Zero | None = None
-    gear: Gear | None = None
-    modes: Modes | None = None
-    measures: Measures | None = None
-    # [heat]
-    rise_at_rated_k: Kelvin | None = None
-    time_constant_s: HeatTime | None = None
-    loss_at_rated_w: Watts | None = None
-    board_share: Share | None = None
-    # [supply]
-    voltage_v: Volts | None = None
-    idle_a: Amperes | None = None
 
 
 SectionT = TypeVar("SectionT", Limits, Motor, Drive, Heat, Supply)
