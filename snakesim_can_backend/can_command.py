@@ -14,13 +14,12 @@ from snakesim_can_backend.bus.load import (
     Reports,
     arithmetic,
     busiest_s,
+    each_bus,
     fits,
     load,
     mbit,
-    on_bus,
     reports_at,
     reports_of,
-    shares,
     what_fits,
 )
 from snakesim_can_backend.bus.strangers import Stranger, strangers
@@ -40,7 +39,7 @@ from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.record.black_box import read_black_box
 from snakesim_hal.record.host_record import BLACK_BOX
-from snakesim_hal.terminal import say
+from snakesim_hal.terminal import aligned, say
 
 OK, FAILED = 0, 1
 LISTEN_S = 0.3  # for others on a bus; most devices say something five times a second or more
@@ -121,16 +120,14 @@ def settings_of(loaded: Loaded) -> CanSettings:
 
 def one(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
     """The sum for every bus as lines, and whether all fit."""
-    joints, reports = shares(config, settings), reports_of(config, settings)
-    period_ms = 1e3 / config.rate_hz
-    lines: list[str] = []
-    for i, count in enumerate(joints):
-        name = settings.channels[i] if settings.channels else "one bus"
-        busiest_ms = 1e3 * busiest_s(count, on_bus(i, reports))
-        lines += [f"{name}: {count} joints at {config.rate_hz:g} Hz", *arithmetic(count, on_bus(i, reports))]
+    buses, period_ms, lines = each_bus(config, settings), 1e3 / config.rate_hz, list[str]()
+    for name, bus in zip(settings.channels or ["one bus"], buses, strict=True):
+        lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *arithmetic(*bus)]
+        busiest_ms = 1e3 * busiest_s(*bus)
         lines.append(f"  Sync, answers, forces and set-points of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
-    all_fit = all(fits(count, on_bus(i, reports)) for i, count in enumerate(joints))
-    return (lines if all_fit else [*lines, f"Refused. {what_fits(joints, config, settings)}"]), all_fit
+    if all(fits(*bus) for bus in buses):
+        return lines, True
+    return [*lines, f"Refused. {what_fits([joints for joints, _ in buses], config, settings)}"], False
 
 
 def table(
@@ -168,7 +165,7 @@ def _scan(arguments: argparse.Namespace) -> int:
             rows = scan(wire, arguments.seconds)
         finally:
             wire.close()
-        for line in aligned(rows) if rows else [f"{channel}: no module answers"]:
+        for line in aligned(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
             say(line)
         found += len(rows)
     return OK if found else FAILED
@@ -189,14 +186,6 @@ def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
     reading = Reading(LAST_NODE)
     everybody = Bus(wire, range(FIRST_NODE, LAST_NODE + 1))
     return [_row(identity, reading) for identity in find([everybody], seconds, reading.take)]
-
-
-def aligned(rows: Sequence[dict[str, str]]) -> Iterator[str]:
-    """The rows as lines with a heading."""
-    every = [dict(zip(COLUMNS, COLUMNS, strict=True)), *rows]
-    widths = [max(len(row[column]) for row in every) for column in COLUMNS]
-    for row in every:
-        yield "  ".join(f"{row[name]:<{width}}" for name, width in zip(COLUMNS, widths, strict=True)).rstrip()
 
 
 def _row(identity: Identity, reading: Reading) -> dict[str, str]:

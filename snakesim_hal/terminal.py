@@ -7,11 +7,11 @@ bidirectional overrides. They are printed as JSON escapes instead, so that print
 import io
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, TextIO
 
-from snakesim_hal.errors import SnakesimError
+from snakesim_hal.errors import ConfigError, SnakesimError
 
 Say = Callable[[str], None]
 
@@ -88,11 +88,28 @@ def print_stderr(line: str) -> None:
     print(printable(line), file=sys.stderr, flush=True)
 
 
+def exit_code(tool: str, act: Callable[[], int]) -> int:
+    """Of a program: what it returns; else the error is told, 2 for wrong input, 1 for any other."""
+    try:
+        return act()
+    except SnakesimError as error:
+        report_error(error, tool)
+        return 2 if isinstance(error, ConfigError) else 1
+
+
 def report_error(error: SnakesimError, tool: str) -> None:
     """Print an error to stderr: the tool's name, and the error's own lines."""
     first, *more = error.lines
     for line in (f"{tool}: {first}", *more):
         print_stderr(line)
+
+
+def aligned(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> Iterator[str]:
+    """Rows, which are texts by column, as lines with a heading."""
+    every = [dict(zip(columns, columns, strict=True)), *rows]
+    widths = [max(len(row[column]) for row in every) for column in columns]
+    for row in every:
+        yield "  ".join(f"{row[name]:<{width}}" for name, width in zip(columns, widths, strict=True)).rstrip()
 
 
 def overwrite_line(line: str, most: int, before: int) -> int:

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterator, Sequence
 
 from snakesim_hal.errors import BackendError
-from snakesim_hal.terminal import say
+from snakesim_hal.terminal import aligned, say
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
@@ -52,7 +52,7 @@ def _scan(arguments: argparse.Namespace) -> int:
                 rows += scan(wire)
             finally:
                 wire.close()
-    for line in _aligned(rows) if rows else [*dict.fromkeys(failed), "nobody answers"]:
+    for line in aligned(COLUMNS, rows) if rows else [*dict.fromkeys(failed), "nobody answers"]:
         say(line)
     return OK if rows else FAILED
 
@@ -87,10 +87,3 @@ def _row(port: Port, said: Packet) -> dict[str, str]:
         "heat": f"{data[at.TEMPERATURE]} °C",
         "errors": at.error_names(data[at.HARDWARE_ERROR]) if data[at.HARDWARE_ERROR] else "none",
     }
-
-
-def _aligned(rows: Sequence[dict[str, str]]) -> Iterator[str]:
-    every = [dict(zip(COLUMNS, COLUMNS, strict=True)), *rows]
-    widths = [max(len(row[column]) for row in every) for column in COLUMNS]
-    for row in every:
-        yield "  ".join(f"{row[name]:<{width}}" for name, width in zip(COLUMNS, widths, strict=True)).rstrip()

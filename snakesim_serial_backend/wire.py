@@ -10,8 +10,9 @@ import select
 import termios
 import time
 import tty
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TextIO
 
 import serial
 
@@ -27,12 +28,8 @@ GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`, on a port that has gone
 
 
-class Peer(Protocol):
-    """Drives that are emulated in this process."""
-
-    def __call__(self) -> None:
-        """Handle what was sent to them, answer, and let time pass up to now."""
-        ...
+# Drives that are emulated in this process: they handle what was sent to them, answer, and let time pass up to now.
+Peer = Callable[[], None]
 
 
 class Pty:

@@ -14,7 +14,7 @@ import socket
 import struct
 import time
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -32,6 +32,7 @@ EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
 LAST_STANDARD_ID = 0x7FF
 MAX_AT_ONCE = 4096  # a babbling bus must not block its reader for ever
+MOMENT_S, PAUSE_S = 0.01, 0.001
 SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
 _wire_format = struct.Struct("<IB3x8s")
@@ -309,6 +310,15 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     elif timeout_s > 0:
         time.sleep(timeout_s)
     return True
+
+
+def arrivals(wires: Sequence[Wire], limit_s: float = MOMENT_S) -> Iterator[tuple[Wire, Frame]]:
+    """What has come after a moment at most; for the time before ticks begin."""
+    if not wait(wires, min(limit_s, MOMENT_S)):
+        time.sleep(PAUSE_S)
+    for wire in wires:
+        for frame in wire.receive():
+            yield wire, frame
 
 
 def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) -> bool:

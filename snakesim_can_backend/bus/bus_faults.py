@@ -8,7 +8,7 @@ import socket
 import struct
 import subprocess
 
-from snakesim_can_backend.bus.bus_errors import BusError
+from snakesim_can_backend.bus.bus_errors import BusError, Kind
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
@@ -24,6 +24,15 @@ ERROR_FRAMES = {  # fault, begins -> class, state of the controller, transmit er
 }
 
 
+SEEN: dict[tuple[str, bool], tuple[Kind, str]] = {  # fault, begins -> the error that a kernel interface would tell
+    ("cut", True): ("interface_down", "the interface is down"),
+    ("cut", False): ("interface_up", "the interface is up again"),
+    ("bus_off", True): ("bus_off", f"transmit errors {MAX_ERRORS}, receive errors 0"),
+    ("bus_off", False): ("restarted", "transmit errors 0, receive errors 0"),
+    ("error_passive", True): ("error_passive", f"transmit errors {PASSIVE_ERRORS}, receive errors 0"),
+}
+
+
 class VirtualFaults:
     """Injected faults of one end of a virtual bus."""
 
@@ -34,26 +43,12 @@ class VirtualFaults:
 
     def inject(self, kind: str, *, begins: bool) -> None:
         """Begin or end one."""
-        channel = self._channel
-        if kind == "error_passive":
-            counters = f"transmit errors {PASSIVE_ERRORS}, receive errors 0"
-            self._found.append(BusError("error_passive", channel, counters))
-            return
-        if begins == (kind in self.on):
-            return
-        self.on.symmetric_difference_update([kind])
-        match kind, begins:
-            case "cut", True:
-                self._found.append(BusError("interface_down", channel, "the interface is down"))
-            case "cut", False:
-                self._found.append(BusError("interface_up", channel, "the interface is up again"))
-            case "bus_off", True:
-                counters = f"transmit errors {MAX_ERRORS}, receive errors 0"
-                self._found.append(BusError("bus_off", channel, counters))
-            case "bus_off", False:
-                self._found.append(BusError("restarted", channel, "transmit errors 0, receive errors 0"))
-            case _:
-                pass
+        if kind != "error_passive":  # which has no end
+            if begins == (kind in self.on):
+                return
+            self.on.symmetric_difference_update([kind])
+        if seen := SEEN.get((kind, begins)):
+            self._found.append(BusError(seen[0], self._channel, seen[1]))
 
     def stops_sending(self) -> bool | None:
         """What happens to a frame: False, rejected; True, accepted and lost; None, sent."""

@@ -153,18 +153,17 @@ def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
 
     Too high is more than `MAX_LOAD` of the time, or a single period that is too long.
     """
-    reports = reports_of(config, settings)
-    joints = shares(config, settings)
-    loads = [load(count, on_bus(i, reports)) for i, count in enumerate(joints)]
+    buses = each_bus(config, settings)
+    joints, loads = [count for count, _ in buses], [load(*bus) for bus in buses]
     worst = max(range(len(loads)), key=lambda i: loads[i])
     if loads[worst] > MAX_LOAD:
         raise ConfigError(
             f"{joints[worst]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, worst)}:",
-            *arithmetic(joints[worst], on_bus(worst, reports)),
+            *arithmetic(*buses[worst]),
             what_fits(joints, config, settings),
         )
-    longest = max(range(len(joints)), key=lambda i: busiest_s(joints[i], on_bus(i, reports)))
-    needed_s = busiest_s(joints[longest], on_bus(longest, reports))
+    longest = max(range(len(buses)), key=lambda i: busiest_s(*buses[i]))
+    needed_s = busiest_s(*buses[longest])
     if needed_s * config.rate_hz > 1:
         raise ConfigError(
             f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, longest)}: a period "
@@ -227,6 +226,7 @@ def most_rate_hz(joints: int, config: RunConfig, settings: CanSettings) -> int |
     return None
 
 
-def on_bus(index: int, reports: Reports) -> Reports:
-    """Only the bus with the tail carries TailContact."""
-    return replace(reports, tail=reports.tail and index == 0)
+def each_bus(config: RunConfig, settings: CanSettings) -> list[tuple[int, Reports]]:
+    """Joints and reports of every bus, tail to head: only the first carries TailContact. Raises ConfigError."""
+    reports = reports_of(config, settings)
+    return [(count, replace(reports, tail=reports.tail and i == 0)) for i, count in enumerate(shares(config, settings))]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_can_backend.bus.bus import LAST_STANDARD_ID, Wire
-from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
@@ -18,14 +17,6 @@ FLUSH_BYTES = 1 << 16
 FD_MARK = "##1"  # a second bit rate
 
 _log = logging.getLogger("snakesim.can")
-
-
-def logged(wires: list[Wire], path: str, backend: str = "can", *, fd: bool = False) -> list[Wire]:
-    """The wires with a log, if there is to be one. Raises ConfigError."""
-    if not path:
-        return wires
-    log = open_log(Path(path), backend)
-    return [LoggedWire(wire, log, fd=fd) for wire in wires]
 
 
 def open_log(path: Path, backend: str = "can") -> TextIO:
@@ -42,6 +33,8 @@ class LoggedWire:
     def __init__(self, wire: Wire, log: TextIO, *, fd: bool = False) -> None:
         self._wire, self._log, self._mark = wire, log, FD_MARK if fd else "#"
         self.channel = wire.channel
+        # As the wire does. Injected faults: frames that do not reach it are not logged.
+        self.errors, self.fileno, self.idle, self.inject = wire.errors, wire.fileno, wire.idle, wire.inject
         self._full = False
 
     def send(self, frame: Frame) -> bool:
@@ -57,22 +50,6 @@ class LoggedWire:
         if frames:
             self._write(frames, "R")
         return frames
-
-    def errors(self) -> list[BusError]:
-        """As the wire does."""
-        return self._wire.errors()
-
-    def fileno(self) -> int | None:
-        """As the wire does."""
-        return self._wire.fileno()
-
-    def idle(self) -> float | None:
-        """As the wire does."""
-        return self._wire.idle()
-
-    def inject(self, kind: str, *, begins: bool) -> None:
-        """As the wire does; frames that do not reach it are not logged."""
-        self._wire.inject(kind, begins=begins)
 
     def close(self) -> None:
         """Close the wire; the log is complete."""

@@ -64,7 +64,7 @@ def is_ours(message: can.Message) -> bool:
     if message.is_extended_id or message.is_remote_frame or message.is_fd:
         return False
     frame = Frame(message.arbitration_id, bytes(message.data))
-    opcode, layouts = opcode_of(frame.id), codec().layouts
+    opcode, layouts = opcode_of(frame.id), codec()
     if opcode not in layouts or node_of(frame.id) > LAST_NODE or len(frame.data) != layouts[Opcode(opcode)].length:
         return False
     return opcode not in WITH_CHECKSUM or intact(frame)

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from snakesim_can_backend.bus.bus import Wire, wait
+from snakesim_can_backend.bus.bus import Wire, arrivals
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import (
@@ -26,7 +26,6 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_hal.errors import BackendError
 
 ASK_EVERY_S = 0.1
-PAUSE_S = 0.001
 LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id may answer later
 
 
@@ -65,15 +64,12 @@ def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None]
             for wire in wires:
                 wire.send(commands.command(Action.IDENTIFY))
             ask_at = now + ASK_EVERY_S
-        if not wait(wires, min(0.01, end - now)):
-            time.sleep(PAUSE_S)
-        for wire in wires:
-            for frame in wire.receive():
-                if opcode_of(frame.id) == Opcode.IDENTITY and len(frame.data) == codec()[Opcode.IDENTITY].length:
-                    identity = _identity(wire.channel, node_of(frame.id), read(frame.data))
-                    found[identity.channel, identity.node, identity.serial] = identity
-                elif on_frame is not None:
-                    on_frame(frame)
+        for wire, frame in arrivals(wires, end - now):
+            if opcode_of(frame.id) == Opcode.IDENTITY and len(frame.data) == codec()[Opcode.IDENTITY].length:
+                identity = _identity(wire.channel, node_of(frame.id), read(frame.data))
+                found[identity.channel, identity.node, identity.serial] = identity
+            elif on_frame is not None:
+                on_frame(frame)
         if not complete and wanted <= {(i.channel, i.node) for i in found.values()}:
             complete, end = True, min(end, time.monotonic() + LISTEN_ON_S)
     return sorted(found.values(), key=lambda i: (i.node, i.channel, i.serial))
@@ -142,23 +138,20 @@ def configure(
                 frame = request.frame(node, index=left[0], operation=operation, value=value or 0.0)
                 if wire_of[node].send(frame):
                     asked_at[node] = now
-        if not wait(wires, 0.01):
-            time.sleep(PAUSE_S)
-        for wire in wires:
-            for frame in wire.receive():
-                node = node_of(frame.id)
-                known = opcode_of(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
-                if not known or not due.get(node):
-                    if on_frame is not None:
-                        on_frame(frame)
-                    continue
-                answer = read(frame.data)
-                if answer["index"] != due[node][0]:
-                    continue
-                parameter = due[node].pop(0)
-                asked_at.pop(node, None)
-                _check(node, parameter, wanted[node].get(parameter), int(answer["result"]))
-                in_force[node][parameter] = answer["value"]
+        for _, frame in arrivals(wires):
+            node = node_of(frame.id)
+            known = opcode_of(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
+            if not known or not due.get(node):
+                if on_frame is not None:
+                    on_frame(frame)
+                continue
+            answer = read(frame.data)
+            if answer["index"] != due[node][0]:
+                continue
+            parameter = due[node].pop(0)
+            asked_at.pop(node, None)
+            _check(node, parameter, wanted[node].get(parameter), int(answer["result"]))
+            in_force[node][parameter] = answer["value"]
         due = {node: left for node, left in due.items() if left}
     return in_force
 

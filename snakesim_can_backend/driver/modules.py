@@ -7,11 +7,12 @@ in the period before. So a command acts exactly one period after the state that 
 import logging
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from snakesim_can_backend.bus.adapter import open_wire
 from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, virtual_channel, wait
 from snakesim_can_backend.bus.load import reports_of, shares, worst_bits
-from snakesim_can_backend.bus.log import logged
+from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Watch
 from snakesim_can_backend.driver.own_twins import TwinProcess, modules_know, twins_here
@@ -236,7 +237,9 @@ class Modules:
             else:
                 self.local_twins = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
                 self.wires.append(VirtualWire(name, self.local_twins))
-        self.wires = logged(self.wires, settings.log)
+        if settings.log:
+            log = open_log(Path(settings.log))
+            self.wires = [LoggedWire(wire, log) for wire in self.wires]
         buses, first = [], 1
         for wire, count in zip(self.wires, joints_of, strict=True):
             buses.append(Bus(wire, range(first, first + count)))

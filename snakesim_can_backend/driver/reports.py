@@ -89,7 +89,7 @@ class Reading:
         self.strangers: Counter[int] = Counter()  # frames of unexpected nodes, since the last tick
         self.from_other_host: Counter[Opcode] = Counter()
         self.malformed = 0
-        layouts = codec().layouts
+        layouts = codec()
         self._joint = [(0,) * 5 for _ in range(joints)]  # as returned by `_read_state`
         self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: no report yet
         self._gyro: list[tuple[int, ...] | None] = [None] * joints

@@ -38,7 +38,7 @@ class Sensors:
         self._radius_m, self._lengths_m = config.robot.module.radius_m, config.robot.link_lengths_m
         self._threshold_n = config.robot.sensors.contacts.threshold_n if config.robot.sensors.contacts else 0.0
         self._felt = FeltForce(max(reports.contact_every, 1) * config.period_ns * 1e-9)
-        layouts = codec().layouts
+        layouts = codec()
         contact = layouts[Opcode.CONTACT].signals
         self._contact_scales = [contact[name].scale for name in ("force_x", "along", "bearing")]
         self._rate_scale = layouts[Opcode.GYRO].signals["rate_x"].scale

@@ -1,7 +1,9 @@
 """The drives of a robot, emulated, as a process on a CAN bus."""
 
 import argparse
+import contextlib
 from collections.abc import Sequence
+from functools import partial
 
 import msgspec
 
@@ -10,13 +12,12 @@ from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.family.backend import CanDriveBackend
 from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.drivers.twin_body import serve_until_stopped
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Override, load, parse_set
-from snakesim_hal.process import die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.terminal import report_error, say
-
-POLL_S = 0.001
+from snakesim_hal.process import die_with_parent
+from snakesim_hal.terminal import exit_code, say
 
 
 def run(backend: type[CanDriveBackend], command: str, argv: Sequence[str] | None) -> int:
@@ -32,15 +33,10 @@ def run(backend: type[CanDriveBackend], command: str, argv: Sequence[str] | None
     arguments = parser.parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    try:
-        serve(backend, command, arguments)
-    except SnakesimError as error:
-        report_error(error, f"snakesim {command}")
-        return 2 if isinstance(error, ConfigError) else 1
-    return 0
+    return exit_code(f"snakesim {command}", lambda: serve(backend, command, arguments))
 
 
-def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Namespace) -> None:
+def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Namespace) -> int:
     """Until a stop signal."""
     overrides = [Override("backend", backend.name, f"snakesim {command}"), *map(parse_set, arguments.set)]
     config = load(arguments.scenario, overrides).config
@@ -52,20 +48,14 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
         bus = f"{load_.drives} {backend.a_drive} at {config.rate_hz:g} Hz on {backend.rates(settings)}"
         share = f"{load_.share:.0%} at worst-case stuffing"
         say(f"{bus}: {share}; {MAX_LOAD:.0%} are allowed, so up to {load_.fits_hz} Hz")
-        return
+        return 0
     for channel in settings.channels:
         if not is_emulated(channel):
             raise ConfigError(f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous")
     config = msgspec.structs.replace(config, pace="realtime")
     wires = backend.open(settings)
     twin = backend.twin_on(config, settings, wires, Clock(config), arguments.pose)
-    running = [True]
-    on_stop_signal(lambda: running.clear())
-    tune_garbage_collector()
-    say(f"{backend.a_drive} ready: {len(twin.wires)} on {', '.join(settings.channels)}")
-    try:
-        while running:
-            twin()
-            wait(wires, POLL_S)
-    finally:
-        twin.close()
+    ready = f"{backend.a_drive} ready: {len(twin.wires)} on {', '.join(settings.channels)}"
+    with contextlib.closing(twin):
+        serve_until_stopped(ready, twin, partial(wait, wires))
+    return 0

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from snakesim_can_backend.bus.bus import VirtualPeer, Wire, inject_into, wait
+from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_into, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.arrays import Floats
@@ -233,6 +233,5 @@ class CanDrives(ABC):
                 for i in range(len(self.nodes)):
                     ask(i)
                 ask_at = now + ASK_EVERY_S
-            if not wait([self.wire], 0.01):
-                time.sleep(0.001)
-            self._receive()
+            for _, frame in arrivals([self.wire]):
+                self.take(frame)

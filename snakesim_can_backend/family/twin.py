@@ -1,26 +1,23 @@
 """Emulated drives of a family, at the other end of their buses, on a body that a plant moves."""
 
 import struct
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.drivers.twin_body import TwinBody
-from snakesim_hal.injection import Injection
+from snakesim_hal.drivers.twin_body import DriveTwin, TwinBody
 
 
-class CanTwin(ABC):
-    """All drives of a family. What it adds are the abstract methods; i: a drive, tail to head."""
+class CanTwin(DriveTwin):
+    """All drives of a family on CAN."""
 
     def __init__(self, body: TwinBody, wires: Sequence[Wire], watchdog_s: float, clock_ns: Callable[[], int]) -> None:
         """wires: of every joint; clock_ns: the time, since anything."""
-        self.body, self.wires, self.watchdog_us = body, list(wires), watchdog_s * 1e6
-        self._buses = list({id(wire): wire for wire in wires}.values())
+        self.wires, self.watchdog_us = list(wires), watchdog_s * 1e6
         nodes = (joint.id for joint in body.joints)
         self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, nodes, strict=True))}
-        self._clock_ns, self._start_ns = clock_ns, clock_ns()
-        body.each_step(self.each_step)
+        super().__init__(body, wires, clock_ns)
 
     @abstractmethod
     def addressee(self, frame: Frame) -> int:
@@ -30,14 +27,6 @@ class CanTwin(ABC):
     def take(self, i: int, frame: Frame) -> None:
         """A frame to a drive. ValueError, LookupError, struct.error: malformed."""
 
-    @abstractmethod
-    def restart(self, i: int) -> None:
-        """A drive begins anew."""
-
-    @abstractmethod
-    def each_step(self, now_us: float) -> None:
-        """Time has passed: watchdogs, heat, reports that are due."""
-
     def __call__(self) -> float | None:
         """Handle what has arrived, and let time pass up to now."""
         with self.body.lock:
@@ -45,7 +34,7 @@ class CanTwin(ABC):
         return None
 
     def _act(self) -> None:
-        for wire in self._buses:
+        for wire in self._ends:
             for frame in wire.receive():
                 i = self._at.get((id(wire), self.addressee(frame)))
                 if i is None or self.body.deaf(i):
@@ -60,16 +49,3 @@ class CanTwin(ABC):
         """A frame of a drive, unless it is silent."""
         if not self.body.silent(i):
             self.wires[i].send(frame)
-
-    def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of a drive."""
-        with self.body.lock:
-            restarts = self.body.inject(injection, begins=begins)
-            if restarts is not None:
-                self.restart(restarts)
-
-    def close(self) -> None:
-        """Leave the buses."""
-        self.body.leave(self.each_step)
-        for wire in self._buses:
-            wire.close()

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from operator import itemgetter
-from pathlib import Path
 from struct import Struct
 from typing import Any
 
@@ -123,36 +122,18 @@ class Layout:
         return {name: self.signals[name].value(read(data)[0]) for name, read in self._readers.items()}
 
 
-class Codec:
-    """Every message, by opcode."""
-
-    def __init__(self, database: Database) -> None:
-        self.layouts: dict[Opcode, Layout] = {}
-        for message in database.messages:
-            layout = Layout(message)
-            self.layouts[layout.opcode] = layout
-
-    def __getitem__(self, opcode: Opcode) -> Layout:
-        """The layout of a message."""
-        return self.layouts[opcode]
-
-
 @cache
-def codec() -> Codec:
-    """The layouts of the DBC file, read once a process."""
-    return Codec(load_database())
+def codec() -> dict[Opcode, Layout]:
+    """The layout of every message of the DBC file, read once a process."""
+    layouts = map(Layout, load_database().messages)
+    return {layout.opcode: layout for layout in layouts}
 
 
 def load_database() -> Database:
-    """The DBC file as cantools has it; ids of all nodes find their message."""
-    database = cantools.database.load_file(dbc_path(), frame_id_mask=OPCODE_MASK)
+    """The DBC file, which comes with the HAL, as cantools has it; ids of all nodes find their message."""
+    database = cantools.database.load_file(SCHEMAS / "can" / DBC, frame_id_mask=OPCODE_MASK)
     assert isinstance(database, Database)
     return database
-
-
-def dbc_path() -> Path:
-    """Where the DBC file is: it comes with the HAL, as the other schemas do."""
-    return SCHEMAS / "can" / DBC
 
 
 def _padding(bits: int) -> str:

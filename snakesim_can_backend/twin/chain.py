@@ -293,10 +293,8 @@ class ModuleChain:
             case "babble":
                 frame = slot.module.heartbeat(now_us) if change.begins else None
                 self.buses[slot.channel].babble(slot.sender, frame, now_us)
-            case kind if change.begins:
-                slot.begin(kind, now_us)
             case kind:
-                slot.end(kind)
+                slot.go_wrong(kind, change.begins, now_us)
 
     def _seat(self, number: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
         joint, gear = self._joints[number], self._told[number].drive.gear  # its maker does not know where it ends up

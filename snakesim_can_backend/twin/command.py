@@ -5,7 +5,7 @@ import select
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 import msgspec
 
@@ -19,15 +19,13 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.faults import explain, parse, parse_typed
 from snakesim_can_backend.twin.server import TwinServer
 from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.twin_body import make_plant
-from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
 from snakesim_hal.process import die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.terminal import report_error, say
+from snakesim_hal.terminal import exit_code, say
 
-OK, FAILED, BAD_INPUT = 0, 1, 2
 DEFAULT_CHANNEL = "vcan0"
 DEFAULT_POSE, NO_POSE = "127.0.0.1:7450", "none"
 STATS_EVERY_S = 1.0
@@ -39,15 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    try:
-        with ExitStack() as open_things:
-            return _serve(arguments, open_things)
-    except ConfigError as error:
-        report_error(error, "snakesim modules")
-        return BAD_INPUT
-    except SnakesimError as error:
-        report_error(error, "snakesim modules")
-        return FAILED
+    return exit_code("snakesim modules", lambda: _serve(arguments))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -85,32 +75,31 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
+def _serve(arguments: argparse.Namespace) -> int:
     loaded = _configuration(arguments)
     settings = _settings(arguments, loaded)
     _check_channels(settings.channels, on_real_bus=arguments.on_real_bus)
     shares(loaded.config, settings)
     for text in settings.faults:
         parse(text, loaded.config.robot.chain.modules)
-    send_pose = None
-    if arguments.pose != NO_POSE:
-        send_pose = PoseSender(arguments.pose)
-        open_things.callback(send_pose.close)
-    wires: list[Wire] = []
-    for channel in settings.channels:
-        wires.append(open_wire(channel, FROM_HOST, settings.bit_rate))
-        open_things.callback(wires[-1].close)
-    plant = make_plant(as_built(loaded.config, settings.mounted), "can", settings.plant, settings.plant_settings)
-    chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
-    loop = Loop(TwinServer(wires, chain), arguments, settings.bit_rate)
-    on_stop_signal(loop.stop)
-    tune_garbage_collector()
-    count = loaded.config.robot.chain.modules
-    say(f"modules ready: {count} on {', '.join(settings.channels)}")
-    loop.run()
-    for line in loop.summary():
-        say(line)
-    return OK
+    with ExitStack() as opened:
+        send_pose = None
+        if arguments.pose != NO_POSE:
+            send_pose = opened.enter_context(closing(PoseSender(arguments.pose)))
+        wires: list[Wire] = []
+        for channel in settings.channels:
+            wires.append(opened.enter_context(closing(open_wire(channel, FROM_HOST, settings.bit_rate))))
+        plant = make_plant(loaded.config, settings, "can")
+        chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
+        loop = Loop(TwinServer(wires, chain), arguments, settings.bit_rate)
+        on_stop_signal(loop.stop)
+        tune_garbage_collector()
+        count = loaded.config.robot.chain.modules
+        say(f"modules ready: {count} on {', '.join(settings.channels)}")
+        loop.run()
+        for line in loop.summary():
+            say(line)
+        return 0
 
 
 def _configuration(arguments: argparse.Namespace) -> Loaded:

@@ -28,17 +28,8 @@ class ModuleSlot:
         """Under its supply."""
         self.module.inside.voltage_v = self.built.supply.voltage_v
 
-    def begin(self, kind: str, now_us: float) -> None:
-        """Begin a fault of this module."""
-        self._set(kind, True)
-        if kind == "reboot":
-            self.module.reboot(now_us)
-
-    def end(self, kind: str) -> None:
-        """End it."""
-        self._set(kind, False)
-
-    def _set(self, kind: str, wrong: bool) -> None:
+    def go_wrong(self, kind: str, wrong: bool, now_us: float) -> None:
+        """Begin or end a fault of this module."""
         match kind:
             case "mute":
                 self.mute = wrong
@@ -53,6 +44,8 @@ class ModuleSlot:
             case "undervoltage":
                 sagged_v = SAGGED * self.built.limits.least_voltage_v
                 self.module.inside.voltage_v = sagged_v if wrong else self.built.supply.voltage_v
+            case "reboot" if wrong:
+                self.module.reboot(now_us)
             case _:
                 pass
 

@@ -14,7 +14,6 @@ from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
@@ -112,15 +111,9 @@ def here(
     pose: str | None = None,
     *,
     stepped: bool,
-    clock_ns: Callable[[], int] = time.monotonic_ns,
 ) -> InProcessTwins:
     """All twins of a run on one virtual bus; pose: address for poses, HOST:PORT. Raises ConfigError."""
     send_pose = None if pose is None else PoseSender(pose)
-    chain = ModuleChain(
-        config,
-        settings,
-        make_plant(as_built(config, settings.mounted), "can", settings.plant, settings.plant_settings),
-        stepped=stepped,
-        send_pose=send_pose,
-    )
-    return InProcessTwins(TwinServer([VirtualWire(channel)], chain), send_pose, clock_ns)
+    plant = make_plant(config, settings, "can")
+    chain = ModuleChain(config, settings, plant, stepped=stepped, send_pose=send_pose)
+    return InProcessTwins(TwinServer([VirtualWire(channel)], chain), send_pose, time.monotonic_ns)

@@ -21,14 +21,7 @@ from snakesim_hal.injection import Injection
 from snakesim_hal.model.robot import describe, identified
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import (
-    Description,
-    Fault,
-    LifecycleState,
-    Message,
-    Mode,
-    SensorDescription,
-)
+from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Message, Mode, SensorDescription
 
 LATCHED = ("fault", "estop")
 SILENT_AFTER = 3  # questions without an answer

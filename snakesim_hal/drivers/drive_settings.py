@@ -7,7 +7,7 @@ from msgspec import Meta
 
 from snakesim_hal.drivers.mocap import check_pose
 from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.mounted import Mounted, as_built, check_mounted
+from snakesim_hal.drivers.mounted import Mounted, check_mounted
 from snakesim_hal.drivers.twin_body import FAULTS, TwinBody, make_plant, twin_body
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.fault_plan import check_backend_can
@@ -40,7 +40,7 @@ class DriveSettings(BodySettings, frozen=True, kw_only=True):
 
 def body_of(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> TwinBody:
     """What emulated drives move. pose: where its motion capture sends, HOST:PORT. Raises ConfigError."""
-    plant = make_plant(as_built(config, settings.mounted), backend, settings.plant, settings.plant_settings)
+    plant = make_plant(config, settings, backend)
     return twin_body(config, plant, settings.mounted, PoseSender(pose) if pose else None)
 
 

@@ -11,14 +11,7 @@ from typing import Any, ClassVar
 
 from snakesim_hal.drivers.buses import Bus, Buses
 from snakesim_hal.drivers.drive_backend import Clock, DriveBackend, Drives
-from snakesim_hal.drivers.drive_settings import (
-    DriveSettings,
-    body_of,
-    check_body,
-    check_buses,
-    port_of,
-    who,
-)
+from snakesim_hal.drivers.drive_settings import DriveSettings, body_of, check_body, check_buses, port_of, who
 from snakesim_hal.drivers.mocap import receiver
 from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.drivers.twin_body import TwinBody

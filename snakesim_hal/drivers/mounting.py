@@ -26,8 +26,6 @@ class Mounting:
         self.zero_rad: Floats = np.array([joint.drive.zero_rad for joint in joints])
         self.gear: Floats = np.array([joint.drive.gear for joint in joints])
         self._turns = self.sign * self.gear
-        self._least_rad = np.array([joint.limits.least_rad for joint in joints])
-        self._most_rad = np.array([joint.limits.most_rad for joint in joints])
 
     # --- to the drive ----------------------------------------------------------------------------------------
 
@@ -57,15 +55,6 @@ class Mounting:
     def drive_torque_limit_nm(self, joint_limit_nm: Floats) -> Floats:
         """Limits, which have no sign."""
         return joint_limit_nm / self.gear
-
-    def drive_gain(self, joint_gain: Floats) -> Floats:
-        """A gain at the drive's shaft, of N·m per rad or rad/s there."""
-        return joint_gain / self.gear**2
-
-    def drive_travel_rad(self) -> tuple[Floats, Floats]:
-        """Least and greatest angle of each drive's shaft, from the joints' limits."""
-        ends = self.drive_angle_rad(self._least_rad), self.drive_angle_rad(self._most_rad)
-        return np.minimum(*ends), np.maximum(*ends)
 
     # --- from the drive --------------------------------------------------------------------------------------
 

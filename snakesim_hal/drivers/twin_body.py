@@ -2,6 +2,7 @@
 
 import math
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,20 +18,24 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.plant import Plant
 from snakesim_hal.physics.thermal import Thermal
+from snakesim_hal.process import on_stop_signal, tune_garbage_collector
+from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Mode
 
 HEAT_EVERY = 10  # steps
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process the drives skip the rest of it
 BOOT_US = 500_000.0  # in which a drive that restarts says nothing; a guess
 WEAK_V = 12.0  # of a supply that an injected fault lets fall
+POLL_S = 0.001  # of drives in a process of their own
 FAULTS = ("mute", "reboot", "overheat", "undervoltage")  # that can be injected into emulated drives
 
 
-def make_plant(config: RunConfig, backend: str, name: str, settings: dict[str, Any]) -> Plant:
-    """The plant that a backend's settings name. Raises ConfigError."""
-    factory: Any = find_plugin(PLANTS, name)
-    where = f"backends.{backend}.plant_settings"
-    return factory(config, plugin_settings(factory, settings, f"plant {name!r}", where))
+def make_plant(config: RunConfig, settings: Any, backend: str) -> Plant:
+    """The plant that a backend's settings name, moved by motors as they are in truth. Raises ConfigError."""
+    factory: Any = find_plugin(PLANTS, settings.plant)
+    source, where = f"plant {settings.plant!r}", f"backends.{backend}.plant_settings"
+    own = plugin_settings(factory, settings.plant_settings, source, where)
+    return factory(as_built(config, settings.mounted), own)
 
 
 def twin_body(
@@ -44,6 +49,17 @@ def twin_body(
     mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period.
     """
     return TwinBody(_Motion(config, plant, mounted, send_pose), range(config.robot.chain.modules))
+
+
+def serve_until_stopped(ready: str, twin: Callable[[], object], wait: Callable[[float], object]) -> None:
+    """Emulated drives in a process of their own, until a stop signal. wait: for frames or bytes, at most so long."""
+    running = [True]
+    on_stop_signal(running.clear)
+    tune_garbage_collector()
+    say(ready)
+    while running:
+        twin()
+        wait(POLL_S)
 
 
 class _Motion:
@@ -193,3 +209,34 @@ class TwinBody:
         """Of a drive's winding, and of its electronics."""
         j = self._at[i]
         return float(self.thermal.winding_c[j]), float(self.thermal.board_c()[j])
+
+
+class DriveTwin(ABC):
+    """Emulated drives of a family on their body. What it adds are the abstract methods; i: a drive, tail to head."""
+
+    def __init__(self, body: TwinBody, ends: Sequence[Any], clock_ns: Callable[[], int]) -> None:
+        """ends: of every joint's bus, which this one closes; clock_ns: the time, since anything."""
+        self.body, self._clock_ns, self._start_ns = body, clock_ns, clock_ns()
+        self._ends: list[Any] = list({id(end): end for end in ends}.values())  # each once
+        body.each_step(self.each_step)
+
+    @abstractmethod
+    def restart(self, i: int) -> None:
+        """A drive begins anew."""
+
+    @abstractmethod
+    def each_step(self, now_us: float) -> None:
+        """Time has passed: watchdogs, heat, reports that are due."""
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Begin or end a fault of a drive."""
+        with self.body.lock:
+            restarts = self.body.inject(injection, begins=begins)
+            if restarts is not None:
+                self.restart(restarts)
+
+    def close(self) -> None:
+        """Leave the buses."""
+        self.body.leave(self.each_step)
+        for end in self._ends:
+            end.close()

@@ -5,23 +5,24 @@ import contextlib
 import select
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
 
 from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.drivers.twin_body import serve_until_stopped
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Override, load, parse_set
-from snakesim_hal.process import die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.terminal import report_error, say
+from snakesim_hal.process import die_with_parent
+from snakesim_hal.terminal import exit_code, say
 from snakesim_serial_backend.dynamixel.backend import twin_on
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
 from snakesim_serial_backend.wire import Pty
 
-POLL_S = 0.001
 TABLE_OF = (1, 4, 8, 13, 18, 24)  # servos on a port
 
 
@@ -30,15 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    try:
-        if arguments.load:
-            for line in table():
-                say(line)
-        else:
-            serve(arguments)
-    except SnakesimError as error:
-        report_error(error, "snakesim dynamixels")
-        return 2 if isinstance(error, ConfigError) else 1
+    if not arguments.load:
+        return exit_code("snakesim dynamixels", lambda: serve(arguments))
+    for line in table():
+        say(line)
     return 0
 
 
@@ -55,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def serve(arguments: argparse.Namespace) -> None:
+def serve(arguments: argparse.Namespace) -> int:
     """Until a stop signal."""
     overrides = [Override("backend", NAME, "snakesim dynamixels"), *map(parse_set, arguments.set)]
     config = load(arguments.scenario, overrides).config
@@ -65,16 +61,12 @@ def serve(arguments: argparse.Namespace) -> None:
     links: list[Path] = arguments.link or [Path("servos")]
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
     config = msgspec.structs.replace(config, pace="realtime")
-    running = [True]
-    on_stop_signal(lambda: running.clear())
-    tune_garbage_collector()
     with named(links) as ptys:
         twin = twin_on(config, settings, ptys, Clock(config), arguments.pose)
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
-        say(f"servos ready: {len(twin.servos)} on {ends}")
-        while running:
-            twin()
-            select.select(ptys, [], [], POLL_S)
+        ready = f"servos ready: {len(twin.servos)} on {ends}"
+        serve_until_stopped(ready, twin, partial(select.select, ptys, [], []))
+    return 0
 
 
 @contextlib.contextmanager

@@ -12,21 +12,21 @@ QUESTIONS = 2
 AROUND = 10  # bytes of a packet around its parameters: header, id, length, instruction, CRC
 
 
-def cycle_bytes(servos: int, *, fast: bool = True) -> int:
+def cycle_bytes(servos: int) -> int:
     """On the wire, both ways, without stuffing."""
     asked = AROUND + 4 + servos
     each = at.present_form.size
-    told = AROUND + servos * (each + 4) if fast else servos * (AROUND + 1 + each)
+    told = AROUND + servos * (each + 4)
     health = AROUND + 4 + AROUND + 1 + at.HEALTH_SIZE
     goals = AROUND + 4 + servos * (1 + at.goals_form.size)
     return asked + told + health + goals
 
 
-def cycle_s(servos: int, baud: int, *, fast: bool = True, latency_s: float = USB_LATENCY_S) -> float:
+def cycle_s(servos: int, baud: int) -> float:
     """How long a port is busy, or waits."""
-    return cycle_bytes(servos, fast=fast) * BITS_A_BYTE / baud + QUESTIONS * latency_s
+    return cycle_bytes(servos) * BITS_A_BYTE / baud + QUESTIONS * USB_LATENCY_S
 
 
-def fits_hz(servos: int, baud: int, *, fast: bool = True, latency_s: float = USB_LATENCY_S) -> int:
+def fits_hz(servos: int, baud: int) -> int:
     """The fastest control rate that holds, in whole Hz."""
-    return int(MAX_LOAD / cycle_s(servos, baud, fast=fast, latency_s=latency_s))
+    return int(MAX_LOAD / cycle_s(servos, baud))

@@ -84,8 +84,9 @@ def _crc_table() -> list[int]:
 _CRC = _crc_table()
 
 
-def crc16(data: bytes, crc: int = 0) -> int:
-    """Checksum of bytes, or of more of them."""
+def crc16(data: bytes) -> int:
+    """Checksum of bytes."""
+    crc = 0
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC[crc >> 8 ^ byte]
     return crc

@@ -8,8 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.drivers.twin_body import TwinBody
-from snakesim_hal.injection import Injection
+from snakesim_hal.drivers.twin_body import DriveTwin, TwinBody
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import (
@@ -62,7 +61,7 @@ class Servo:
         return self.table[at.TORQUE_ENABLE] == 1
 
 
-class DynamixelTwin:
+class DynamixelTwin(DriveTwin):
     """All servos of a robot, at the other end of their ports."""
 
     def __init__(
@@ -74,7 +73,6 @@ class DynamixelTwin:
         clock_ns: Callable[[], int],
     ) -> None:
         """ports: of every joint; constants: torque constants, N·m/A; clock_ns: the time, since anything."""
-        self._body, self._clock_ns, self._start_ns = body, clock_ns, clock_ns()
         self.servos: list[Servo] = []
         for joint, port, constant in zip(body.joints, ports, constants, strict=True):
             servo = Servo(bytearray(at.SIZE), port, CURRENT_A * constant)
@@ -85,42 +83,28 @@ class DynamixelTwin:
             servo.put("H", at.LEAST_VOLTAGE, round(joint.limits.least_voltage_v / at.VOLTS))
             servo.put("H", at.CURRENT_LIMIT, MOST_CURRENT)
             self.servos.append(servo)
-        self._ports = list({id(port): port for port in ports}.values())
-        self._decoders = [Decoder() for _ in self._ports]
-        body.each_step(self._check)
+        super().__init__(body, ports, clock_ns)
+        self._decoders = [Decoder() for _ in self._ends]
         for i in range(len(self.servos)):
-            self._wake_up(i)
+            self.restart(i)
 
     def __call__(self) -> None:
         """Handle what has arrived, and let time pass up to now."""
-        taken = [port.take() for port in self._ports]  # may wait for the kernel; nobody else has to wait for it
-        with self._body.lock:
-            for port, decoder, data in zip(self._ports, self._decoders, taken, strict=True):
+        taken = [port.take() for port in self._ends]  # may wait for the kernel; nobody else has to wait for it
+        with self.body.lock:
+            for port, decoder, data in zip(self._ends, self._decoders, taken, strict=True):
                 for packet in decoder.feed(data):
                     if packet.instruction != Instruction.STATUS:
                         self._take(port, packet)
-            self._body.advance_to((self._clock_ns() - self._start_ns) / 1000)
-
-    def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of a servo."""
-        with self._body.lock:
-            restarts = self._body.inject(injection, begins=begins)
-            if restarts is not None:
-                self._wake_up(restarts)
-
-    def close(self) -> None:
-        """Leave the ports."""
-        self._body.leave(self._check)
-        for port in self._ports:
-            port.close()
+            self.body.advance_to((self._clock_ns() - self._start_ns) / 1000)
 
     # --- packets ----------------------------------------------------------------------------------------------
 
     def _take(self, port: Pty, packet: Packet) -> None:
-        mine = [i for i, servo in enumerate(self.servos) if servo.port is port and not self._body.deaf(i)]
+        mine = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.deaf(i)]
         by_id = {self.servos[i].id: i for i in mine}
         for i in mine:
-            self.servos[i].fed_us = self._body.now_us
+            self.servos[i].fed_us = self.body.now_us
         given = packet.parameters
         match packet.instruction:
             case Instruction.SYNC_WRITE:
@@ -149,8 +133,8 @@ class DynamixelTwin:
                 self._answer(i, b"", self._write(i, struct.unpack_from("<H", given)[0], given[2:]))
             case Instruction.REBOOT:
                 self._answer(i, b"")
-                self._body.boot(i)
-                self._wake_up(i)
+                self.body.boot(i)
+                self.restart(i)
             case _:
                 self._answer(i, b"", Refusal.INSTRUCTION)
 
@@ -158,7 +142,7 @@ class DynamixelTwin:
         """In the order of their ids in the packet: each waits for the one before it, for ever."""
         parts: list[tuple[int, int, bytes]] = []
         for i in asked:
-            if i is None or self._body.silent(i):
+            if i is None or self.body.silent(i):
                 break
             data, refusal = self._read(i, what)
             if instruction == Instruction.SYNC_READ:
@@ -169,7 +153,7 @@ class DynamixelTwin:
             port.give(fast_status(parts, len(asked)))
 
     def _answer(self, i: int, data: bytes, refusal: int = 0) -> None:
-        if not self._body.silent(i):
+        if not self.body.silent(i):
             status = bytes([refusal | self._alert(i)]) + data
             self.servos[i].port.give(encoded(self.servos[i].id, Instruction.STATUS, status))
 
@@ -184,12 +168,12 @@ class DynamixelTwin:
         return bytes(self.servos[i].table[address : address + size]), 0
 
     def _measure(self, i: int) -> None:
-        servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self._body.shaft(i)
+        servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self.body.shaft(i)
         servo.put("h", at.PRESENT, max(min(round(torque_nm / servo.unit_nm), 32767), -32768))
         servo.put("i", at.PRESENT + 2, round(velocity_rad_s / at.SPEED))
         servo.put("i", at.PRESENT + 6, round(angle_rad / at.RAD) - servo.from_counts)
-        servo.put("H", at.VOLTAGE, round(self._body.supply(i)[0] / at.VOLTS))
-        servo.table[at.TEMPERATURE] = min(max(round(self._body.temperatures(i)[0]), 0), 255)
+        servo.put("H", at.VOLTAGE, round(self.body.supply(i)[0] / at.VOLTS))
+        servo.table[at.TEMPERATURE] = min(max(round(self.body.temperatures(i)[0]), 0), 255)
 
     def _write(self, i: int, address: int, data: bytes) -> int:
         """Set registers, all of them or none; why not."""
@@ -225,14 +209,14 @@ class DynamixelTwin:
 
     # --- motors -----------------------------------------------------------------------------------------------
 
-    def _wake_up(self, i: int) -> None:
+    def restart(self, i: int) -> None:
         """Everything from address 64 on is as at first, and the turns are forgotten."""
         servo = self.servos[i]
         servo.table[at.TORQUE_ENABLE :] = bytes(at.SIZE - at.TORQUE_ENABLE)
         servo.table[at.STATUS_LEVEL], servo.held_counts = 2, None
         servo.put("H", at.GAINS + 4, 800)
         servo.put("h", at.GOALS, servo.get("H", at.CURRENT_LIMIT))
-        servo.from_counts = round(self._body.shaft(i)[0] / at.RAD) // at.COUNTS * at.COUNTS
+        servo.from_counts = round(self.body.shaft(i)[0] / at.RAD) // at.COUNTS * at.COUNTS
         self._measure(i)
         servo.put("i", at.GOAL_POSITION, servo.get("i", at.PRESENT + 6))
         self._drive(i)
@@ -244,25 +228,25 @@ class DynamixelTwin:
         current, goal = servo.get("h", at.GOALS), servo.get("i", at.GOAL_POSITION)
         stiffness, damping = at.law(d, p, servo.unit_nm)
         goal_rad = (goal + servo.from_counts if servo.held_counts is None else servo.held_counts) * at.RAD
-        limit_nm, joint = abs(current) * servo.unit_nm, self._body.joints[i]
+        limit_nm, joint = abs(current) * servo.unit_nm, self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
         if servo.on and mode == at.CURRENT_BASED_POSITION:
-            self._body.drive(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
+            self.body.drive(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
         elif servo.on and mode == 0:
-            self._body.drive(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
+            self.body.drive(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
         else:
-            self._body.drive(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
+            self.body.drive(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
-    def _check(self, now_us: float) -> None:
+    def each_step(self, now_us: float) -> None:
         """Watchdogs, heat and supply."""
         for i, servo in enumerate(self.servos):
             watchdog = servo.table[at.WATCHDOG]
             if servo.on and 0 < watchdog != at.TRIPPED and now_us - servo.fed_us > watchdog * at.WATCHDOG_S * 1e6:
                 servo.table[at.WATCHDOG] = at.TRIPPED
-                servo.held_counts = round(self._body.shaft(i)[0] / at.RAD)
+                servo.held_counts = round(self.body.shaft(i)[0] / at.RAD)
                 self._drive(i)
-            hot = at.HardwareError.OVERHEATING if self._body.too_hot(i) else 0
-            weak = self._body.supply(i)[0] < servo.get("H", at.LEAST_VOLTAGE) * at.VOLTS
+            hot = at.HardwareError.OVERHEATING if self.body.too_hot(i) else 0
+            weak = self.body.supply(i)[0] < servo.get("H", at.LEAST_VOLTAGE) * at.VOLTS
             found = hot | (at.HardwareError.INPUT_VOLTAGE if weak else 0)
             if found & ~servo.table[at.HARDWARE_ERROR]:
                 servo.table[at.HARDWARE_ERROR] |= found

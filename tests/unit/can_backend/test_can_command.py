@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire, message_of
 from snakesim_can_backend.bus.load import check_load, load, reports_at
-from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
+from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, main, scan, settings_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.commands import command
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
@@ -17,6 +17,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.terminal import aligned
 from tests.unit.can_backend.frames import health, heartbeat
 
 TRIPLET = load_scenario("triplet").config
@@ -117,7 +118,7 @@ def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
     assert rows[2]["state"] == "disarmed" and rows[2]["faults"] == "none"
     assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
     assert heard and set(heard) == {command(Action.IDENTIFY)}
-    heading, *lines = aligned(rows)
+    heading, *lines = aligned(COLUMNS, rows)
     assert heading.split() == list(COLUMNS) and len(lines) == 3
 
 

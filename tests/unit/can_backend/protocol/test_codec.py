@@ -21,15 +21,12 @@ from snakesim_can_backend.protocol.definitions import (
 DATABASE = load_database()
 TARGETS = ("position", "velocity", "torque")
 EVERY_SIGNAL = [
-    (layout, signal)
-    for layout in codec().layouts.values()
-    for signal in layout.signals.values()
-    if signal.name != "checksum"
+    (layout, signal) for layout in codec().values() for signal in layout.signals.values() if signal.name != "checksum"
 ]
 each_signal = pytest.mark.parametrize(
     ("layout", "signal"), EVERY_SIGNAL, ids=[f"{m.name}.{s.name}" for m, s in EVERY_SIGNAL]
 )
-LAYOUTS = list(codec().layouts.values())
+LAYOUTS = list(codec().values())
 each_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
 any_layout, any_signal = st.sampled_from(LAYOUTS), st.sampled_from(EVERY_SIGNAL)
 often = settings(max_examples=400)

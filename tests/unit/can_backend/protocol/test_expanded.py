@@ -48,7 +48,7 @@ def database(expanded: Path) -> Database:
 def test_every_message_of_every_node_is_there_and_no_other(database: Database) -> None:
     expected = {
         opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
-        for opcode, layout in codec().layouts.items()
+        for opcode, layout in codec().items()
         for node in nodes_of(opcode)
     }
     assert {message.frame_id: message.name for message in database.messages} == expected

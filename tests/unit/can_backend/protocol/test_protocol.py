@@ -83,7 +83,7 @@ def test_directions() -> None:
 
 
 def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
-    for opcode, layout in codec().layouts.items():
+    for opcode, layout in codec().items():
         assert ("checksum" in layout.signals) == (opcode in WITH_CHECKSUM)
         if opcode in WITH_CHECKSUM:
             signal = layout.signals["checksum"]
@@ -91,7 +91,7 @@ def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
 
 
 def test_signals_of_a_message_do_not_overlap_but_for_the_targets_of_a_set_point() -> None:
-    for opcode, layout in codec().layouts.items():
+    for opcode, layout in codec().items():
         for a, b in combinations(layout.signals.values(), 2):
             shared = (a.mask << a.shift) & (b.mask << b.shift)
             targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {"position", "velocity", "torque"}

@@ -162,7 +162,7 @@ def test_an_alert_is_in_every_answer_until_a_restart_which_is_silent_for_a_while
     assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
     assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
     bench.twin.inject(parse("overheat:joint_1@0-9"), begins=False)
-    bench.twin._body.thermal.winding_c[:] = 20.0
+    bench.twin.body.thermal.winding_c[:] = 20.0
     assert SDK.reboot(port, 1)[0] == COMM_SUCCESS
     assert SDK.ping(port, 1)[1] == COMM_RX_TIMEOUT
     bench.pass_time(0.6)

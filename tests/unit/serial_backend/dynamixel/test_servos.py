@@ -49,7 +49,7 @@ def test_a_hardware_error_stays_until_the_operators_clear_restarts_the_servo(rob
     assert robot.run(100, "fault") == [] and robot.twin.servos[1].table[at.HARDWARE_ERROR]
     assert [fault.joint for fault in robot.run(BOOTED + NOTICED, "disarmed")] == ["joint_2"], "it was still hot"
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
-    robot.twin._body.thermal.winding_c[:] = 20.0
+    robot.twin.body.thermal.winding_c[:] = 20.0
     robot.run(5, "fault")
     assert robot.run(BOOTED, "disarmed") == [] and not robot.twin.servos[1].table[at.HARDWARE_ERROR]
     assert robot.run(60, "armed") == [] and robot.joints is not None
