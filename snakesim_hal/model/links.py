@@ -3,13 +3,12 @@
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.quantities import above
+from snakesim_hal.wire.quantities import above, bounded
 
-Offset = Annotated[float, Meta(ge=-10, le=10, extra_json_schema={"unit": "m"})]
-Moment = Annotated[float, Meta(ge=-100, le=100, extra_json_schema={"unit": "kg·m²"})]
+Offset = Annotated[float, bounded(-10, 10, "m")]
+Moment = Annotated[float, bounded(-100, 100, "kg·m²")]
 Inertia = tuple[Moment, Moment, Moment, Moment, Moment, Moment]
 
 

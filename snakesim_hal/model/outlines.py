@@ -10,28 +10,21 @@ from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
 
 
-def metres(low: float | None = None, high: float = 1000) -> Meta:
-    """Bounds of a length in a file: above `low`, or of either sign."""
-    if low is None:
-        return Meta(ge=-high, le=high, extra_json_schema={"unit": "m"})
-    return Meta(gt=low, le=high, extra_json_schema={"unit": "m"})
-
-
-Coordinate = Annotated[float, metres()]
-Size = Annotated[float, metres(0)]
-Clearance = Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "m"})]
-Friction = Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})]
-Heading = Annotated[float, Meta(ge=-6.3, le=6.3, extra_json_schema={"unit": "rad"})]
+Coordinate = Annotated[float, bounded(-1000, 1000, "m")]
+Size = Annotated[float, above(1000, "m")]
+Clearance = Annotated[float, from_zero(100, "m")]
+Friction = Annotated[float, from_zero(5, "1 (Coulomb coefficient)")]
+Heading = Annotated[float, bounded(-6.3, 6.3, "rad")]
 Point = tuple[Coordinate, Coordinate]
 
 

@@ -14,29 +14,20 @@ from msgspec import Meta
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.outlines import (
-    Capsule,
-    Coordinate,
-    Friction,
-    Heading,
-    Outlines,
-    Point,
-    Size,
-    metres,
-)
+from snakesim_hal.model.outlines import Capsule, Coordinate, Friction, Heading, Outlines, Point, Size
 from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles, solids_of
 from snakesim_hal.model.route import Route, sine_points
 from snakesim_hal.model.solids import Solid, Upright, made_of
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_hal.wire.quantities import Name
+from snakesim_hal.wire.quantities import Name, above
 
 
 class Uneven(FileStruct, frozen=True, kw_only=True):
     """Smooth random hills."""
 
-    height_m: Annotated[float, metres(0, 1)]  # from lowest to highest point
-    wavelength_m: Annotated[float, metres(0, 100)]  # typical distance between two hills
-    area_m: Annotated[float, metres(0, 200)] = 20.0  # edge of the square around the origin
+    height_m: Annotated[float, above(1, "m")]  # from lowest to highest point
+    wavelength_m: Annotated[float, above(100, "m")]  # typical distance between two hills
+    area_m: Annotated[float, above(200, "m")] = 20.0  # edge of the square around the origin
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
 
@@ -103,7 +94,7 @@ class Step(FileStruct, frozen=True, kw_only=True):
 
     position_m: Point
     size_m: tuple[Size, Size]
-    height_m: Annotated[float, metres(0, 2)]
+    height_m: Annotated[float, above(2, "m")]
     yaw_rad: Heading = 0.0
     friction: Friction = 0.5
     name: Name | None = None

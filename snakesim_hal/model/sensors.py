@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.links import Offset
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.quantities import (
     MAX_BEAMS,
@@ -15,12 +16,12 @@ from snakesim_hal.wire.quantities import (
     MAX_JOINTS,
     MAX_OWN_SENSORS,
     above,
+    bounded,
     from_zero,
 )
 
 MAX_MOUNTED = 8  # cameras, and as many lidars and range finders: a description has room for 48 keys
-Angle = Annotated[float, Meta(ge=-math.pi, le=math.pi, extra_json_schema={"unit": "rad"})]
-Offset = Annotated[float, Meta(ge=-10, le=10, extra_json_schema={"unit": "m"})]
+Angle = Annotated[float, bounded(-math.pi, math.pi, "rad")]
 Model = Annotated[str, Meta(min_length=1, max_length=500)]
 LinkName = Literal["head", "tail"] | Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
 
@@ -34,30 +35,29 @@ class JointSensor(FileStruct, frozen=True, kw_only=True):
     torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
 
 
-class ContactSensor(FileStruct, frozen=True, kw_only=True):
-    """Contacts of the links with obstacles."""
-
+class _Sampled(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+
+
+class ContactSensor(_Sampled, frozen=True, kw_only=True):
+    """Contacts of the links with obstacles."""
+
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
     force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
     threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker contacts are not detected
 
 
-class ImuSensor(FileStruct, frozen=True, kw_only=True):
+class ImuSensor(_Sampled, frozen=True, kw_only=True):
     """Angular velocity and acceleration (gravity included) of every link."""
 
-    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
     angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
     acceleration_noise_m_s2: Annotated[float, from_zero(100, "m/s²")] = 0.0
 
 
-class PoseSensor(FileStruct, frozen=True, kw_only=True):
+class PoseSensor(_Sampled, frozen=True, kw_only=True):
     """Pose of the base, from motion capture."""
 
-    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
     angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
 
