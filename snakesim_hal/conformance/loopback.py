@@ -20,7 +20,6 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
-    Description,
     Fault,
     JointCommand,
     JointState,
@@ -46,41 +45,26 @@ def wait_until(happened: Callable[[], Any], what: str) -> None:
         time.sleep(0.002)
 
 
-@dataclass
 class RecordingBackend:
     """A backend that forwards and records all calls; a fault can be planted in it."""
 
-    inner: Backend
-    seen: list[JointState] = field(default_factory=list[JointState])
-    planted: Callable[[int], Fault | None] | None = None  # tick -> a fault to report besides the backend's own
-
-    def describe(self) -> Description:
-        """The backend's."""
-        return self.inner.describe()
+    def __init__(self, inner: Backend) -> None:
+        self._inner = inner
+        self.describe, self.enact, self.advance, self.close = inner.describe, inner.enact, inner.advance, inner.close
+        self.seen: list[JointState] = []
+        self.planted: Callable[[int], Fault | None] | None = None  # tick -> a fault to report besides the backend's own
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """The backend's, recorded."""
-        samples = self.inner.sample(tick, stamp_ns)
+        samples = self._inner.sample(tick, stamp_ns)
         self.seen.append(samples.joints)
         return samples
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """To the backend."""
-        self.inner.enact(set_points, lifecycle)
-
-    def advance(self) -> None:
-        """The backend's."""
-        self.inner.advance()
-
     def faults(self) -> list[Fault]:
         """The backend's, and the planted one."""
-        found = self.inner.faults()
+        found = self._inner.faults()
         planted = self.planted(self.seen[-1].tick) if self.planted is not None and self.seen else None
         return found if planted is None else [*found, planted]
-
-    def close(self) -> None:
-        """The backend's."""
-        self.inner.close()
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """Behind the real host, commanded by a real client over Zenoh: lease, staleness, faults."""
 
+import functools
 import math
 import time
 from collections import Counter
@@ -16,16 +17,21 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, Mode, SimulatorRequest
 
 
-def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
-    """Do it, and again if a lease ran out meanwhile: then this machine may have been too slow, not the backend."""
-    for left in reversed(range(t.ATTEMPTS)):
-        try:
-            act()
-            return
-        except AssertionError:
-            faults = [fault.what for fault in hosted.host.authority.faults]
-            if "lease_expired" not in faults or not left:
-                raise
+def undisturbed(act: Callable[[Hosted], None]) -> Callable[[Hosted], None]:
+    """Done again if a lease ran out meanwhile: then this machine may have been too slow, not the backend."""
+
+    @functools.wraps(act)
+    def several(hosted: Hosted) -> None:
+        for left in reversed(range(t.ATTEMPTS)):
+            try:
+                return act(hosted)
+            except AssertionError:
+                faults = [fault.what for fault in hosted.host.authority.faults]
+                if "lease_expired" not in faults or not left:
+                    raise
+        return None
+
+    return several
 
 
 def moves_then(silent: bool, hosted: Hosted) -> int:
@@ -66,13 +72,9 @@ def must_come_to_rest_after(fault: Fault, hosted: Hosted) -> None:
     assert np.ptp(tail, axis=0).max() < t.STILL_RAD, f"still moving: {np.ptp(tail, axis=0)} rad"
 
 
-def test_bad_commands_are_refused_and_counted_and_move_nothing(bench: Bench, hosted: Hosted) -> None:
+@undisturbed
+def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -> None:
     """Of another lease, for another robot, too long, NaN, too old, from the future: each by its own word."""
-    undisturbed(hosted, lambda: refuses_bad_commands(hosted))
-
-
-def refuses_bad_commands(hosted: Hosted) -> None:
-    """One attempt."""
     hosted.arm(stay)
     hosted.passes(t.ARMING_PERIODS)
     count = len(hosted.robot.joints)
@@ -103,13 +105,9 @@ def refuses_bad_commands(hosted: Hosted) -> None:
     assert np.abs(away).max() < t.STILL_RAD, f"it moved by {np.abs(away).max():.3f} rad"
 
 
-def test_a_fault_of_the_backend_latches_and_stops_the_joints(bench: Bench, hosted: Hosted) -> None:
+@undisturbed
+def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: Hosted) -> None:
     """Whatever the controller still sends; and only a clear ends it."""
-    undisturbed(hosted, lambda: stops_at_a_fault(hosted))
-
-
-def stops_at_a_fault(hosted: Hosted) -> None:
-    """One attempt."""
     ticks = moves_then(silent=False, hosted=hosted)
     at = hosted.armed_at + ticks
     hosted.backend.planted = lambda tick: Fault(tick=tick, what="planted", cause="by the test") if tick >= at else None
@@ -126,13 +124,14 @@ def stops_at_a_fault(hosted: Hosted) -> None:
 def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench: Bench, hosted: Hosted) -> None:
     """The lease is the dead-man switch: it runs out, that is a fault, and the joints come to rest."""
     try:
-        undisturbed(hosted, lambda: loses_its_lease(hosted))
+        loses_its_lease(hosted)
         # Not tried again: no slow machine keeps a joint moving.
         must_come_to_rest_after(hosted.host.authority.faults[0], hosted)
     finally:
         bench.spoil()  # a lockstep host does not wait again for a service that has stalled
 
 
+@undisturbed
 def loses_its_lease(hosted: Hosted) -> None:
     """One attempt."""
     moves_then(silent=True, hosted=hosted)
@@ -144,13 +143,9 @@ def loses_its_lease(hosted: Hosted) -> None:
     assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
 
 
-def test_a_simulator_stands_still_on_request_and_a_robot_refuses(bench: Bench, hosted: Hosted) -> None:
+@undisturbed
+def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted) -> None:
     """In a pause no tick passes and no lease expires; whatever cannot stand still says so."""
-    undisturbed(hosted, lambda: stands_or_refuses(hosted))
-
-
-def stands_or_refuses(hosted: Hosted) -> None:
-    """One attempt."""
     hosted.arm(stay)
     hosted.passes(t.ARMING_PERIODS)
     answer = hosted.session.ask(keys.SIMULATOR, SimulatorRequest(action="pause", who="contract"), timeout_s=10.0)
