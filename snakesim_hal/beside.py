@@ -11,6 +11,7 @@ the stop port: modules then stop by their own watchdogs. One that ends its proce
 import threading
 import time
 import traceback
+from contextlib import closing
 from types import TracebackType
 from typing import Self
 
@@ -63,19 +64,17 @@ class Beside:
 
     def _serve_once(self, name: str) -> None:
         """Until it fails, or the host ends. Its token vanishes then, so that the host knows."""
-        part = self._session.part()
+        config, over = self._config, self._closing.is_set
         try:
-            loop = ServiceLoop(find_service(self._config, name), self._config, part, lambda: not self._closing.is_set())
-            try:
+            with (
+                closing(self._session.part()) as part,
+                closing(ServiceLoop(find_service(config, name), config, part, lambda: not over())) as loop,
+            ):
                 loop.join()
-                loop.run(self._closing.is_set)
-            finally:
-                loop.close()
+                loop.run(over)
         except SnakesimError as error:
             if not self._closing.is_set():
                 report_error(error, f"snakesim {name}")
         except Exception:  # noqa: BLE001 - this thread's outermost loop: the host goes on, and stops the robot
             if not self._closing.is_set():
                 traceback.print_exc()
-        finally:
-            part.close()

@@ -21,17 +21,12 @@ def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
     return found
 
 
-def check_planned(config: RunConfig, table: Table | None = None) -> None:
-    """Check that every target exists: process, key or joint. Raises ConfigError."""
-    _check(config, table, MAX_BUSES)
-
-
 def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, because: str) -> None:
     """Check that a backend supports the planned faults of joints, buses and the simulator. Raises ConfigError.
 
     does: kinds of these that it knows by itself; because: why it knows no more. The host does some for any backend.
     """
-    for i, injection in enumerate(_check(config, None, buses)):
+    for i, injection in enumerate(check_planned(config, buses=buses)):
         own = injection.part == HAL and injection.target_type not in ("process", "key")
         if own and not {"host", "samples"} & {*injection.about.by} and injection.kind not in does:
             raise ConfigError(
@@ -50,7 +45,8 @@ def check_without_run(config: RunConfig, table: Table | None = None) -> None:
             )
 
 
-def _check(config: RunConfig, table: Table | None, buses: int) -> list[Injection]:
+def check_planned(config: RunConfig, table: Table | None = None, buses: int = MAX_BUSES) -> list[Injection]:
+    """The planned faults; every target exists: process, key, joint or bus. Raises ConfigError."""
     found = planned(config, table)
     for i, injection in enumerate(found):
         try:

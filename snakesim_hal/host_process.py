@@ -11,30 +11,29 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.arguments import add_host
 from snakesim_hal.backend import BackendFactory
-from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
+from snakesim_hal.errors import BackendError, RefusedError, SnakesimError
 from snakesim_hal.fault_plan import check_without_run
 from snakesim_hal.host.cable_file import kept_at
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.model.checked import CHECK, why_unchecked
-from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
 from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
-from snakesim_hal.plugin_check import check_backend
+from snakesim_hal.plugin_check import backend_settings, check_backend
 from snakesim_hal.process import HOST_PRIORITY, enter_realtime, on_stop_signal, restart_process, tune_garbage_collector
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.record.recorder import HostRecordWriter
 from snakesim_hal.serve import ProcessOptions, joined, process_options
-from snakesim_hal.terminal import report_error
+from snakesim_hal.terminal import exit_code
 from snakesim_hal.wire import keys
 
 GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
@@ -44,14 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
     parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
     add_host(parser)
-    try:
-        return host(process_options(parser.parse_args(argv), hosts=True))
-    except ConfigError as error:
-        report_error(error, "snakesim host")
-        return 2
-    except SnakesimError as error:
-        report_error(error, "snakesim host")
-        return 1
+    arguments = parser.parse_args(argv)
+    return exit_code("snakesim host", lambda: host(process_options(arguments, hosts=True)))
 
 
 def host(given: ProcessOptions) -> int:
@@ -137,11 +130,6 @@ def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
         raise
     except (Exception, SystemExit) as error:  # a backend may be third-party code
         raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
-
-
-def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
-    """The scenario's [backends.<name>] section, checked by the backend's own Struct."""
-    return plugin_settings(factory, config.backend_settings, f"scenario {config.name!r}", config.backend_section)
 
 
 def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:

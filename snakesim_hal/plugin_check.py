@@ -112,19 +112,23 @@ def on_backend(config: RunConfig, backend: Any) -> RunConfig:
     return config if modes is None else msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
 
 
+def backend_settings(config: RunConfig, backend: Any, table: Table | None = None) -> Any:
+    """The scenario's [backends.<name>] section, checked by the backend's own Struct. Raises ConfigError."""
+    source, origin = (f"scenario {config.name!r}", None) if table is None else (table.source, table.origin)
+    return plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
+
+
 def check_backend(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
     """What of it concerns the backend: enough for a computer with nothing but that. Raises ConfigError."""
     backend = (find_plugin if run_files else find_installed)(BACKENDS, config.backend)
     if backend is None:
         return config
-    source = table.source if table is not None else f"scenario {config.name!r}"
-    origin = table.origin if table is not None else None
-    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
+    settings = backend_settings(config, backend, table)
     config = on_backend(config, backend)
     paces = backend.check(config, settings)
     if config.pace in paces:
         return config
-    asked_by = table.origin_of("pace") if table is not None else source
+    asked_by = table.origin_of("pace") if table is not None else f"scenario {config.name!r}"
     if asked_by.startswith("--"):
         raise ConfigError(f"{asked_by}: backend {config.backend!r} cannot keep this pace, only {' or '.join(paces)}")
     return msgspec.structs.replace(config, pace=paces[0])

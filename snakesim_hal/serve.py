@@ -8,13 +8,13 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.arguments import add_service, link_of, load_scenario
-from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
+from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.plugin_check import find_service
@@ -27,7 +27,7 @@ from snakesim_hal.process import (
     tune_garbage_collector,
 )
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
-from snakesim_hal.terminal import print_stderr, report_error
+from snakesim_hal.terminal import exit_code, print_stderr
 
 TRY_S = 2.0  # to connect
 TELL_S = 20.0  # between two signs of life
@@ -64,18 +64,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the service that the arguments name. Returns the exit code."""
-    try:
-        given = process_options(arguments)
-        serve(find_service(given.config, arguments.name), given)
-    except ConfigError as error:
-        report_error(error, f"snakesim {arguments.name}")
-        return 2
-    except SnakesimError as error:
-        report_error(error, f"snakesim {arguments.name}")
-        return 1
-    except KeyboardInterrupt:
+
+    def act() -> int:
+        with suppress(KeyboardInterrupt):
+            given = process_options(arguments)
+            serve(find_service(given.config, arguments.name), given)
         return 0
-    return 0
+
+    return exit_code(f"snakesim {arguments.name}", act)
 
 
 def serve(service_type: type[Service], given: ProcessOptions) -> None:
@@ -88,13 +84,10 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
         drop_priority_after(config.lease_ns * 1e-9)
     with joined(given.link, name) as session:
         waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
-        loop = ServiceLoop(service_type, config, session, waiting.goes_on)
-        loop.join()
-        tune_garbage_collector()
-        try:
+        with closing(ServiceLoop(service_type, config, session, waiting.goes_on)) as loop:
+            loop.join()
+            tune_garbage_collector()
             loop.run()
-        finally:
-            loop.close()
 
 
 class StartupWait:

@@ -10,9 +10,9 @@ import msgspec
 from snakesim_hal.backend import Backend, BackendFactory
 from snakesim_hal.conformance.loopback import Hosted
 from snakesim_hal.conformance.rig import HOLDER, Rig
-from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import Override, RunConfig, Service, load, parse_set
-from snakesim_hal.plugin_check import on_backend
+from snakesim_hal.plugin_check import backend_settings, on_backend
 from snakesim_hal.wire.messages import Pace
 
 SCENARIO = str(Path(__file__).parent / "scenario.toml")
@@ -61,12 +61,9 @@ class Bench:
         overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
         config = on_backend(load(self._scenario, overrides).config, self.factory)
         # The tests' own controller is the only service.
-        return msgspec.structs.replace(config, pace=self.pace_of(config), services={HOLDER: Service()})
-
-    def pace_of(self, config: RunConfig) -> Pace:
-        """Lockstep if supported: quick, and the same on every machine. Else real time."""
-        paces = self.factory.check(config, self._settings(config))
-        return "lockstep" if "lockstep" in paces else "realtime"
+        paces = self.factory.check(config, backend_settings(config, self.factory))
+        pace = "lockstep" if "lockstep" in paces else "realtime"  # the first: quick, and the same on every machine
+        return msgspec.structs.replace(config, pace=pace, services={HOLDER: Service()})
 
     @property
     def pace(self) -> Pace:
@@ -79,7 +76,7 @@ class Bench:
         """A new backend; an open one is closed before."""
         self.close()
         self.was_opened = True
-        return self.factory(self.config, self._settings(self.config))
+        return self.factory(self.config, backend_settings(self.config, self.factory))
 
     def fresh_rig(self) -> Rig:
         """A rig on a fresh backend."""
@@ -120,7 +117,3 @@ class Bench:
         if name not in self._kept:
             self._kept[name] = make()
         return self._kept[name]
-
-    def _settings(self, config: RunConfig) -> Any:
-        source = f"scenario {config.name!r}"
-        return plugin_settings(self.factory, config.backend_settings, source, config.backend_section)

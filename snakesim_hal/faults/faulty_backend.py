@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import msgspec
 
-from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
+from snakesim_hal.backend import Backend, Injectable, Samples
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
-from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
+from snakesim_hal.wire.messages import Description, JointState
 
 NO_NUMBER = float("nan")
 
@@ -26,6 +26,7 @@ class FaultyBackend:
         self._on: dict[int, dict[str, Injection]] = {}  # joint -> kind -> fault applied here
         self._last: JointState | None = None  # as returned
         self._share: float | None = None  # of real time, speed of a slowed simulator
+        self.enact, self.faults, self.close = inner.enact, inner.faults, inner.close  # as the backend does
 
     def inject(self, injection: Injection, begins: bool) -> None:
         """Begin or end a fault. Raises ConfigError for one that cannot be had here."""
@@ -50,10 +51,6 @@ class FaultyBackend:
         self._last = samples.joints
         return samples
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """As the backend does."""
-        self._inner.enact(set_points, lifecycle)
-
     def advance(self) -> None:
         """As the backend does, at a share of real time if requested."""
         began = time.monotonic()
@@ -61,14 +58,6 @@ class FaultyBackend:
         if self._share is not None:
             takes_s = self._description.period_ns * 1e-9 / self._share
             time.sleep(max(began + takes_s - time.monotonic(), 0.0))
-
-    def faults(self) -> list[Fault]:
-        """As the backend does."""
-        return self._inner.faults()
-
-    def close(self) -> None:
-        """As the backend does."""
-        self._inner.close()
 
     # --- faults applied here ---------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ or a flood is active.
 import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 
 from snakesim_hal.faults.disturbance import Disturbance
@@ -20,13 +21,8 @@ SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does n
 class Line:
     """The outgoing messages of one key."""
 
-    faults: "MessageFaults"
     key: str
     disturbance: Disturbance
-
-    def put(self, payload: bytes) -> None:
-        """Replaces the publisher's own `put`."""
-        self.faults.put(self, payload)
 
 
 class MessageFaults:
@@ -45,8 +41,8 @@ class MessageFaults:
             key = injection.target
             line = self._lines.get(key)
             if line is None:
-                line = self._lines[key] = Line(self, key, Disturbance(f"{self._seed} {key}"))
-                self._session.reroute(key, line.put)
+                line = self._lines[key] = Line(key, Disturbance(f"{self._seed} {key}"))
+                self._session.reroute(key, partial(self.put, line))
             line.disturbance.begin(injection, time.monotonic())
             self._see_to(line)
 
@@ -59,7 +55,7 @@ class MessageFaults:
                 self._see_to(line)
 
     def put(self, line: Line, payload: bytes) -> None:
-        """Take a message of the writer."""
+        """Take a message of the writer, in place of the publisher's own `put`."""
         with self._changed:
             self._send(line, line.disturbance.put(payload, time.monotonic()))
             self._see_to(line)

@@ -4,15 +4,15 @@ They lie beside the latched emergency stop, with whose they are: drive, sign and
 was last declared unwound. What is of another is not known. A thread writes, so that no joint waits for a disk.
 """
 
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 
 import msgspec
 
+from snakesim_hal.host.outbox import Sender
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.safety.cables import TURN_RAD, CableJoint, Cables
@@ -23,7 +23,6 @@ CABLES = "cables.json"
 FRESH_S = 3600.0  # that `cable_unwound` of a robot file counts for a host that has not kept it
 AHEAD_S = 60.0  # that the clock of who declared it may be ahead
 END_STOP_RAD = 0.1  # that end stops take of a turn, at least
-CLOSE_S = 1.0  # for a disk that hangs
 WAY_OUT = "with its cable unwound and the robot straight, `snakesim joints zero`, then restart the host within an hour"
 
 NO_STOPS = (
@@ -66,9 +65,7 @@ class CableFile:
             else:
                 seen_rad[joint.name] = found
         self.cables = Cables(wanted, seen_rad, unknown)
-        self._asked: SimpleQueue[dict[str, float] | None] = SimpleQueue()  # None ends it
-        self._writer = threading.Thread(target=self._write, name="cables", daemon=True)
-        self._writer.start()
+        self._writer = Sender("cables")
 
     def take(self, joints: JointState) -> None:
         """Follow a sample, and keep it when that is due."""
@@ -78,26 +75,24 @@ class CableFile:
     def close(self) -> None:
         """Keep where they are now, unless the disk hangs."""
         self._keep(self.cables.to_keep(all_of_it=True))
-        self._asked.put(None)
-        self._writer.join(CLOSE_S)
+        self._writer.close()
 
     def _keep(self, angles_rad: dict[str, float] | None) -> None:
         if angles_rad is not None:
-            self._asked.put(angles_rad)
+            self._writer.do(partial(self._write, angles_rad))
 
-    def _write(self) -> None:
-        while (angles_rad := self._asked.get()) is not None:
-            content = {
-                name: KeptCable(angle_rad=round(angle_rad, 4), drive=owner, unwound=unwound)
-                for name, (owner, unwound) in self._owners.items()
-                if (angle_rad := angles_rad.get(name)) is not None
-            }
-            try:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(self._path, msgspec.json.encode(content), durable=True)
-                self.cables.not_kept = ""
-            except OSError as error:
-                self.cables.not_kept = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
+    def _write(self, angles_rad: dict[str, float]) -> None:
+        content = {
+            name: KeptCable(angle_rad=round(angle_rad, 4), drive=owner, unwound=unwound)
+            for name, (owner, unwound) in self._owners.items()
+            if (angle_rad := angles_rad.get(name)) is not None
+        }
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(self._path, msgspec.json.encode(content), durable=True)
+            self.cables.not_kept = ""
+        except OSError as error:
+            self.cables.not_kept = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
 
     def _read(self) -> Mapping[str, KeptCable] | str:
         try:

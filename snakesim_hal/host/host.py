@@ -439,7 +439,7 @@ class Host:
             self.participants.delivered(service, tick)
 
     def refuse(self, error: WireError) -> Answer:
-        """A message cannot be decoded."""
+        """A message cannot be decoded; returns the answer if it was a query."""
         self.authority.reject(error.reason)
         return self._answer(ok=False, reason=str(error), refusal=error.reason)
 
@@ -453,7 +453,7 @@ class Host:
         )
 
     def answer(self, request: Request, reply: Callable[[Answer], None]) -> None:
-        """A request for the lease, for another state, or for a stop."""
+        """A request for the lease, for another state, or for a stop; replies once, from any thread."""
         now_ns = self._safety_now()
         if isinstance(request, LeaseRequest):
             self.authority.expire(now_ns, self._tick)  # first: an expired lease is a fault

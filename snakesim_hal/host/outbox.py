@@ -20,7 +20,7 @@ from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Descri
 
 WAITING_LIMIT = 64  # queued actions, each of which sends one message or those of a tick; the oldest are dropped
 IMAGES_WAITING_LIMIT = 8
-FLUSH_S = 1.0  # how long queued messages are still sent at the end
+FLUSH_S = 1.0  # how long what is queued is still done at the end: a network or a disk may hang
 
 
 Outgoing = tuple[str, Message, bytes | None]  # key, message, and its bytes if it has been encoded already
@@ -99,7 +99,7 @@ class Outbox:
 
     def put_status(self, status: Status) -> None:
         """Publish the status."""
-        self._send(self._streams, lambda: self._publishers[keys.STATUS].put(status))
+        self.put((keys.STATUS, status, None))
 
     def answer(self, question: Question, answer: Answer) -> None:
         """Answer a query. The requester may be slow."""
@@ -117,12 +117,6 @@ class Outbox:
         """Send queued messages for at most FLUSH_S."""
         for sender in dict.fromkeys((self._answers, self._images, self._streams)):
             sender.close()
-
-    def _send(self, sender: Sender, put: Callable[[], None]) -> None:
-        if self._lockstep:
-            put()
-        else:
-            sender.do(put)
 
     def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)

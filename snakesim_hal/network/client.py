@@ -278,10 +278,9 @@ class Client:
 class Commander:
     """The right to command: acquires the lease, and stamps every command with it."""
 
-    def __init__(self, client: Client, description: Description, *, priority: int = 100) -> None:
+    def __init__(self, client: Client, description: Description) -> None:
         self._client = client
         self._description = description
-        self._priority = priority
         self._epoch = 0
         self._sequence = 0
         self._asked_at = 0.0
@@ -295,7 +294,7 @@ class Commander:
         if clock.lifecycle == "armed" or now - self._asked_at < LEASE_RETRY_S:
             return False
         self._asked_at = now
-        request = LeaseRequest(action="acquire", holder=self._client.service, priority=self._priority)
+        request = LeaseRequest(action="acquire", holder=self._client.service)
         try:
             answer: Answer = self._client.session.ask(keys.LEASE, request, host=self._description.host)
         except NotConnectedError as error:

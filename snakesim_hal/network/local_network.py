@@ -160,9 +160,7 @@ class LocalSession(Session):
         """Call `take` for every sample."""
         self._subscribe(key, take)
 
-    def on_urgent_arrival(self, key: str, take: Take) -> None:
-        """All arrivals are at once."""
-        self._subscribe(key, take)
+    on_urgent_arrival = on_arrival  # all are at once
 
     def on_latched_arrival(self, key: str, take: Take) -> None:
         """Like `on_arrival`, and for the values that were latched before."""

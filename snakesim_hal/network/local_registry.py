@@ -63,19 +63,19 @@ def robot_folder(robot: str, backend: str, hardware: str) -> Path:
 @contextlib.contextmanager
 def registered(robot: LocalRobot) -> Iterator[str | None]:
     """Register a robot for tools. Yields why they will not find it, if the file cannot be written; otherwise None."""
-    path = _live() / f"{robot.pid}.json"
+    path, failure = _live() / f"{robot.pid}.json", None
+    only = "`snakesim status` and `estop` find this run only with --endpoint"
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
-        yield f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
+        yield f"{path}: {error.strerror}; {only}"
         return
-    failure = None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         os.write(handle, json.dumps(asdict(robot)).encode())
     except OSError as error:
-        failure = f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
+        failure = f"{path}: {error.strerror}; {only}"
     try:
         yield failure
     finally:
