@@ -95,9 +95,8 @@ def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str
 def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
     """Where nobody tells the pose, a controller of joints runs alone; for any other guidance reckons it."""
     alone = GUIDANCE in config.own_services and config.own_services.keys() <= {*BY_POSE, CONTROL}
-    reckons = (
-        config.dead_reckons(description_of(config)) and config.mission.localisation == "pose_sensor"
-    )  # nobody has asked for it
+    # Nobody has asked for it.
+    reckons = config.dead_reckons(description_of(config)) and config.mission.localisation == "pose_sensor"
     if not (reckons and alone and getattr(controller, "NEEDS", "world") == "joints"):
         return config
     left = {name: service for name, service in config.services.items() if name not in BY_POSE}

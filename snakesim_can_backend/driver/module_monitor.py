@@ -22,9 +22,7 @@ MAX_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
 # Faults of one module that concern all others: two modules with one id, a full bus, water,
 # the common supply, an emergency; and a robot that is not complete does not start.
 NEVER_ARMED = "module_never_armed"
-CONCERNS_ALL = {
-    "duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED
-}  # fmt: skip
+CONCERNS_ALL = {"duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED}
 
 
 class Watch:

@@ -73,9 +73,8 @@ class Modules:
         self.wires: list[Wire] = []
         self.local_twins: VirtualPeer | None = None
         self._twins: TwinProcess | None = None
-        self._ours = (
-            False  # whether no other host uses the modules: before that is known, nothing that disturbs them is sent
-        )
+        # Whether no other host uses the modules: before that is known, nothing that disturbs them is sent.
+        self._ours = False
         self._unconfigured = set(range(len(self._names)))  # joints whose parameters may differ from the robot file
         self._set_points = commands.SetPointWriter(len(self._names))
         self._lifecycle: LifecycleState = "disarmed"

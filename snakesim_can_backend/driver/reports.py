@@ -32,9 +32,8 @@ ONE_CLOCK_MS = 350  # two heartbeats whose uptimes differ by no more are of the 
 LATE_SYNCS = 3  # a state this many Syncs late is still accepted, with its age; older counts are wrong
 COUNT_AT, STATE_AT = 3, 4  # in the result of `_read_state`
 UNTOUCHED = b""
-STATES = [
-    ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)
-]  # unknown ones count as FAULT
+# Unknown ones count as FAULT.
+STATES = [ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)]
 STOPPED = (ModuleState.FAULT, ModuleState.EMERGENCY)  # until a Clear
 
 

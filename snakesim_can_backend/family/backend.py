@@ -46,9 +46,8 @@ class CanDriveBackend(FamilyBackend):
     a_drive: ClassVar[str]  # what the family calls one, in the plural
     last_id: ClassVar[int]
     traffic: ClassVar[Traffic]
-    drives: ClassVar[
-        Callable[..., CanDrives]
-    ]  # (joints of the family, settings, joints of the bus, wire, readings, and the kit's arguments by name)
+    # (joints of the family, settings, joints of the bus, wire, readings, and the kit's arguments by name)
+    drives: ClassVar[Callable[..., CanDrives]]
     twin: ClassVar[Callable[..., CanTwin]]  # (joints of the family, settings, body, wires, clock)
     says_every_s: ClassVar[float | None] = None  # how often a drive reports its state; None: when it is asked
 

@@ -37,9 +37,8 @@ from snakesim_hal.wire.messages import Mode
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
 HEAT_EVERY = 10  # steps
 ROUND_US = 1 << 32  # Sync times wrap around
-LONGEST_STEP_US = (
-    60_000_000  # a Sync that is later by more is of another clock; no bus is cut for that long in lockstep
-)
+# A Sync that is later by more is of another clock; no bus is cut for that long in lockstep.
+LONGEST_STEP_US = 60_000_000
 NEW_HOST_US = 1_000_000  # a Sync that is earlier by this much is of a restarted host, not a late one of another bus
 OTHER_SERIAL = 0x0D0B1E00
 
@@ -161,9 +160,8 @@ class ModuleChain:
     def receive(self, channel: int, frame: Frame) -> None:
         """A frame of the host has arrived."""
         opcode, node = opcode_of(frame.id), node_of(frame.id)
-        wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(
-            opcode
-        )  # which is valid at any length
+        # An Emergency is valid at any length.
+        wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)
         if opcode not in FROM_HOST or wrong_length:
             self.refused += 1
             return

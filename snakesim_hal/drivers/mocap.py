@@ -28,9 +28,8 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Pose
 
 MAX_BYTES = 2048
-MAX_AT_ONCE = (
-    64  # datagrams a tick: six times those of a camera with 1 kHz in 10 ms, and 0.6 ms at worst to reject them
-)
+# Datagrams a tick: six times those of a camera with 1 kHz in 10 ms, and 0.6 ms at worst to reject them.
+MAX_AT_ONCE = 64
 RECEIVE_BUFFER_BYTES = 1 << 15  # the kernel buffers about as many: the rest of a flood is soon read
 UNIT_WITHIN = 0.05  # of the length of a quaternion
 LONGEST_GAP_NS = 200_000_000  # between two poses that give a velocity

@@ -34,10 +34,7 @@ from snakesim_hal.wire.quantities import above
 SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
 SENSOR = "sensor"  # the service of cameras, motion capture and other sensors that the backend does not have
 POLICY = "policy:"  # a controller that begins so names its model behind it
-CHOSEN = (
-    "control.",
-    "backend.",
-)  # --set control.x=1 changes the chosen controller, --set backend.x=1 the backend
+CHOSEN = ("control.", "backend.")  # --set control.x=1 changes the chosen controller, --set backend.x=1 the backend
 
 
 class Start(FileStruct, frozen=True, kw_only=True):
