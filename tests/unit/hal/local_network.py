@@ -63,7 +63,8 @@ class LagBackend:
         self._points = SetPoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
         self.enacted: list[SetPoints] = []
         self.advanced = 0
-        self.fails_in: str | None = None  # sample, enact or advance
+        self.fails_in: str | None = None  # sample, enact, advance or faults
+        self.fails_with: Exception = BackendError("diverged")
         self.read_s = 0.0  # what a sample takes
         self.next_faults: list[Fault] = []
 
@@ -119,6 +120,7 @@ class LagBackend:
 
     def faults(self) -> list[Fault]:
         """Those that the test planted."""
+        self._fail("faults")
         found, self.next_faults = self.next_faults, []
         return found
 
@@ -127,7 +129,7 @@ class LagBackend:
 
     def _fail(self, where: str) -> None:
         if self.fails_in == where:
-            raise BackendError(f"the test lets {where} fail")
+            raise self.fails_with
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """Small robots, configurations and files for the tests of the HAL."""
 
 import copy
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,38 +13,6 @@ from snakesim_hal.wire.messages import Clock, Description, JointCommand, JointSt
 
 PERIOD_NS = 10_000_000
 LEASE_NS = 50_000_000
-
-ROBOT: dict[str, Any] = {
-    "name": "worm",
-    "chain": {"modules": 3, "axes": ["yaw"]},
-    "module": {"length_m": 0.1, "radius_m": 0.03, "mass_kg": 0.2},
-    "limits": {
-        "angle_rad": 1.5,
-        "speed_rad_s": 5.0,
-        "acceleration_rad_s2": 100.0,
-        "torque_nm": 4.0,
-        "torque_rate_nm_s": 80.0,
-    },
-    "motor": {
-        "stiffness_nm_per_rad": 40.0,
-        "damping_nm_s_per_rad": 1.0,
-        "velocity_gain_nm_s_per_rad": 1.0,
-        "response_time_s": 0.01,
-        "armature_kg_m2": 0.005,
-    },
-    "safety": {"action": "damp", "max_step_rad": 0.3},
-}
-SCENE: dict[str, Any] = {"name": "plain", "ground": {"friction": 0.1}}
-RUN: dict[str, Any] = {
-    "name": "crawl",
-    "robot": ROBOT,
-    "scene": SCENE,
-    "backend": "lag",
-    "controller": "hold",
-    "pace": "lockstep",
-    "services": {"control": {}},
-    "start": {"on_route": False},
-}
 
 ROBOT_TOML = """\
 name = "worm"
@@ -69,6 +38,20 @@ armature_kg_m2 = 0.005
 [sensors.pose]
 rate_hz = 50.0
 """
+ROBOT: dict[str, Any] = {**tomllib.loads(ROBOT_TOML), "safety": {"action": "damp", "max_step_rad": 0.3}}
+del ROBOT["sensors"]
+SCENE: dict[str, Any] = {"name": "plain", "ground": {"friction": 0.1}}
+RUN: dict[str, Any] = {
+    "name": "crawl",
+    "robot": ROBOT,
+    "scene": SCENE,
+    "backend": "lag",
+    "controller": "hold",
+    "pace": "lockstep",
+    "services": {"control": {}},
+    "start": {"on_route": False},
+}
+
 SCENE_TOML = """\
 name = "bend"
 [ground]

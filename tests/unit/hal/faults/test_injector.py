@@ -42,20 +42,6 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_
         assert all(text.startswith("tick ") for text in run.host.faults.noted)
 
 
-def test_what_was_planned_comes_at_its_tick_after_the_first_arming_in_every_run() -> None:
-    config = run_config(faults=["mute:joint_1@0.1-0.12"], faults_allowed=True)
-    for _ in range(2):
-        with running(config) as run, following(run.link, Follower()):
-            run.arm()
-            run.reaches("fault")
-            wait_until(lambda run=run: len(run.host.faults.noted) == 2, "begin and end")
-            assert run.host.faults.noted == [
-                "tick 10: mute:joint_1@0.1-0.12 begins",
-                "tick 12: mute:joint_1@0.1-0.12 ends",
-            ]
-            assert run.host.authority.since_start.kept[0].tick == 10
-
-
 @pytest.mark.parametrize(
     ("request_", "refusal", "words"),
     [

@@ -8,54 +8,36 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.errors import BackendError, SnakesimError
-from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.backend import Samples
+from snakesim_hal.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, LifecycleState, Pace
+from snakesim_hal.wire.messages import Mode, Pace
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, LagBackend, following, running
-from tests.unit.hal.network.test_client_host import run_config
-from tests.unit.hal.rig import pose, power
-
-
-class Clumsy(LagBackend):
-    """Raises what a backend should not, once it is told to."""
-
-    raises_in: str | None = None
-
-    def _trip(self, where: str) -> None:
-        if self.raises_in == where:
-            raise OSError(19, "No such device")
-
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
-        self._trip("sample")
-        return super().sample(tick, stamp_ns)
-
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        self._trip("enact")
-        super().enact(set_points, lifecycle)
-
-    def advance(self) -> None:
-        self._trip("advance")
-        super().advance()
-
-    def faults(self) -> list[Fault]:
-        self._trip("faults")
-        return super().faults()
+from tests.unit.hal.rig import pose, power, run_config
 
 
 @pytest.mark.parametrize("where", ["sample", "enact", "advance", "faults"])
-def test_an_error_anywhere_is_a_latched_fault(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.unit.hal.local_network.LagBackend", Clumsy)
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (BackendError("diverged"), "diverged"),  # our own errors stay as they are
+        (OSError(19, "No such device"), "LagBackend.{} failed: OSError: [Errno 19] No such device"),
+    ],
+)
+def test_an_error_anywhere_is_a_latched_fault_and_the_joints_are_told_to_be_safe(
+    where: str, error: Exception, cause: str
+) -> None:
+    with running(run_config()) as run, following(run.link, Follower()) as control:
         run.arm()
-        backend: Any = run.backend
-        backend.raises_in = where
+        wait_until(lambda: len(control.armed_ticks) > 3, "three ticks")
+        run.backend.fails_in, run.backend.fails_with = where, error
         wait_until(run.ended, "the end of the host")
         assert run.host.ended == "failed" and run.host.authority.state == "fault"
         causes = {fault.what: fault.cause for fault in run.host.authority.since_start.kept}
-        assert causes["backend_failed"] == f"Clumsy.{where} failed: OSError: [Errno 19] No such device"
+        assert causes["backend_failed"] == cause.format(where)
+        if where != "enact":
+            assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
 
 
 class Wrong(LagBackend):
@@ -98,12 +80,3 @@ def test_a_sample_that_no_reader_would_accept_is_a_latched_fault_that_names_it(
         assert run.host.ended == "failed" and run.host.authority.state == "fault"
         cause = next(fault.cause for fault in run.host.authority.since_start.kept if fault.what == "backend_failed")
         assert cause.startswith(f"Wrong.sample: {key} cannot be published: {why}"), cause
-
-
-def test_our_own_errors_stay_as_they_are() -> None:
-    class Refusing(LagBackend):
-        def advance(self) -> None:
-            raise BackendError("diverged")
-
-    with pytest.raises(SnakesimError, match=r"^diverged$"):
-        GuardedBackend(Refusing(run_config())).advance()

@@ -15,7 +15,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import running
-from tests.unit.hal.network.test_client_host import run_config
+from tests.unit.hal.rig import run_config
 
 
 def asked(latch: EstopLatch, what: str) -> str | None:
@@ -56,17 +56,6 @@ def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
     latch = EstopLatch(tmp_path / "in the way")
     failure = asked(latch, "engage")
     assert failure is not None and "will not outlive this host" in failure
-
-
-def test_a_host_that_finds_one_begins_in_estop(tmp_path: Path) -> None:
-    with running(run_config(), latch=EstopLatch(tmp_path)) as run:
-        answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))
-        assert answer.ok and (tmp_path / ESTOP).is_file()
-    with running(run_config(), latch=EstopLatch(tmp_path)) as run:
-        assert run.status.lifecycle == "estop" and "anna, before this host" in run.status.why
-        assert not run.lifecycle("arm").ok
-        assert run.lifecycle("clear").ok and not (tmp_path / ESTOP).exists()
-        run.reaches("disarmed")
 
 
 @pytest.fixture

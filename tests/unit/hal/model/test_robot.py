@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, decode, read_part, shipped
+from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Motor, Supply
 from snakesim_hal.model.robot import RobotFile, describe, layout_hash
 from snakesim_hal.wire import keys
@@ -149,14 +149,3 @@ def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
     found = {layout_hash(joints) for joints in (three.joints, four.joints, mixed.joints, swapped)}
     assert len(found) == 4
     assert description(limits__torque_nm=1.0).layout == three.layout  # the same vectors, other numbers
-
-
-@pytest.mark.parametrize("section", ["chain", "module", "limits", "motor"])
-def test_sections_without_defaults_must_be_there(section: str) -> None:
-    values = {key: value for key, value in ROBOT.items() if key != section}
-    with pytest.raises(ConfigError, match=f"field `{section}` is missing"):
-        decode(Table(values, "worm.toml"), RobotFile)
-    for field in ROBOT[section]:
-        less = {key: value for key, value in ROBOT[section].items() if key != field}
-        with pytest.raises(ConfigError, match=rf"field `{section}\.{field}` is missing"):
-            decode(Table({**ROBOT, section: less}, "worm.toml"), RobotFile)

@@ -225,12 +225,6 @@ def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float,
         check_clear(made, place(made), SNAKE)
 
 
-def test_how_deep_a_peg_overlaps_is_told() -> None:
-    made = scene(cylinder=[{"position_m": [0.1, 0.08], "radius_m": 0.05}])
-    with pytest.raises(ConfigError, match=r"scene 'plain': obstacle 'cylinder_0' overlaps link_0 .* by 10\.0 mm"):
-        check_clear(made, place(made), SNAKE)
-
-
 @given(x=st.floats(-0.5, 1.1), y=st.floats(-0.5, 0.5), yaw_rad=st.floats(-3, 3))
 def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, yaw_rad: float) -> None:
     made = scene(box=[{"position_m": [x, y], "size_m": [0.3, 0.1, 0.2], "yaw_rad": yaw_rad}])

@@ -185,20 +185,6 @@ def test_arming_waits_for_everybody_and_says_for_whom() -> None:
         assert run.status.alive == ["control"] or run.host.authority.faults
 
 
-@pytest.mark.parametrize("where", ["sample", "enact", "advance"])
-def test_a_backend_that_fails_ends_the_run_with_its_words(where: str) -> None:
-    with running(run_config()) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 3, "three ticks")
-        run.backend.fails_in = where
-        wait_until(run.ended, "the end of the run")
-        (fault,) = (f for f in run.host.authority.faults if f.what == "backend_failed")
-        assert fault.cause == f"the test lets {where} fail"
-        assert run.host.authority.state == "fault"
-        if where != "enact":  # the joints were told to be safe even so
-            assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
-
-
 def test_a_fault_of_the_backend_stops_the_robot() -> None:
     with running(run_config(), end_after_fault_s=0.05) as run, following(run.link, Follower()) as control:
         run.arm()
@@ -299,19 +285,6 @@ def test_realtime_keeps_its_deadlines_on_average() -> None:
         median_us = latency.percentile_us(50)
         assert latency.count == run.host.statistics.answered_ticks > 0
         assert median_us is not None and 0 < median_us < 20_000
-
-
-def test_realtime_goes_on_with_the_last_command_for_one_lease_term_only() -> None:
-    config = run_config(pace="realtime")
-    with running(config, end_after_fault_s=0.05) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 10, "ten ticks")
-        control.silent.set()
-        began = time.monotonic()
-        wait_until(run.ended, "the end of the run")
-        assert time.monotonic() - began < 2.0
-        assert [fault.what for fault in run.host.authority.faults] == ["lease_expired"]
-        assert run.backend.enacted[-2].mode == [Mode.VELOCITY] * 3
 
 
 def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold() -> None:

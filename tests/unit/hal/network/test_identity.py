@@ -21,7 +21,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, LifecycleRequest
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, following, running
-from tests.unit.hal.network.test_client_host import run_config
+from tests.unit.hal.rig import run_config
 
 
 def test_a_description_is_proven_by_the_runs_key_alone() -> None:
@@ -85,17 +85,9 @@ def test_a_starter_that_does_not_read_holds_up_nothing() -> None:
             host.say(HostMessage(description=run.host.description))
 
 
-def a_robot(**more: object) -> LocalRobot:
-    values = {
-        "namespace": "worm",
-        "robot": "worm",
-        "backend": "sim",
-        "endpoint": "tcp/127.0.0.1:7447",
-        "stop_host": "127.0.0.1",
-        "stop_port": 7447,
-        "pid": os.getpid(),
-    }
-    return msgspec.convert(values | more, LocalRobot)
+def a_robot() -> LocalRobot:
+    where = {"endpoint": "tcp/127.0.0.1:7447", "stop_host": "127.0.0.1", "stop_port": 7447}
+    return LocalRobot(namespace="worm", robot="worm", backend="sim", **where, pid=os.getpid())
 
 
 def test_robots_of_this_computer_are_found_as_long_as_they_live(

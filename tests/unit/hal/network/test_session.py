@@ -137,19 +137,6 @@ def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both()
         assert split == {("lab/a", "hal/done/a"), ("lab/b", "hal/done/b")}
 
 
-def test_questions_are_answered() -> None:
-    request = LeaseRequest(action="acquire", holder="control")
-
-    def answer(question: Question) -> None:
-        assert question.payload == encode(request) and question.encoding.endswith("LeaseRequest/1")
-        question.reply(Answer(ok=False, reason="held by teleop", epoch=3, lifecycle="armed"))
-
-    with meeting("worm", "worm") as (hal, session):
-        hal.on_question(keys.LEASE, answer)
-        wanted = Answer(ok=False, reason="held by teleop", epoch=3, lifecycle="armed")
-        assert session.ask(keys.LEASE, request) == wanted
-
-
 def test_a_question_by_pattern_is_about_the_key_that_was_declared() -> None:
     questions: list[Question] = []
     with meeting("worm", None) as (hal, tool):
