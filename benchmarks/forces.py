@@ -1,0 +1,8 @@
+"""`python -m benchmarks.forces`: every controller in the case study, and why solved forces do not come true."""
+
+import sys
+
+from tests.physics.solved_and_felt import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,177 @@
+"""What `python -m benchmarks.forces` prints: every controller in the case study, and why solved forces differ.
+
+Runs of `triplet` and `peg_row` in this process. Contact forces are taken from the simulator in every physics step, so
+neither table depends on when the contact sensor looks.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+import snakesim
+from snakesim_hal.arrays import Floats
+from snakesim_hal.model.felt_force import FELT_OVER_S
+from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.results.came_true import ASKED_N, EMPTY_N
+from snakesim_sim_backend.sensors.contacts import ContactReader
+
+SCENARIOS = ("triplet", "peg_row")
+SHIPPED = (
+    "obstacle_aided",
+    "obstacle_triplet",
+    "path_following",
+    "lateral_undulation",
+    "head_steered_undulation",
+    "compliant_undulation",
+    "hold",
+)
+WITHOUT_PATH = ("lateral_undulation", "compliant_undulation", "hold")  # a mission's speed does not change them
+AMPLITUDES_RAD = (0.2, 0.3, 0.4, 0.5, 0.6)  # of README's wave
+FASTER_M_S = 0.3
+STEP_S = 0.002
+SHIFTS_S = np.arange(-0.1, 0.105, 0.01)  # from command to force
+CASES = "| scenario | controller | m in 8 s | J/m | N·s/m |\n|---|---|---|---|---|"
+CAUSES = (
+    "| scenario | controller | asked, N | felt, N | asked, but empty | felt, not asked | too much or little in all "
+    "| wrong share | correlation | at its best, after |\n|---|---|---|---|---|---|---|---|---|---|"
+)
+
+Forces = Mapping[str, Floats]  # of each obstacle, in every physics step
+
+
+def wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
+    """README's ten-line wave."""
+    lag_rad = 0.9 * np.arange(13)[::-1]
+    return lambda time_s, joints: min(time_s, 1.0) * amplitude_rad * np.sin(np.pi * time_s - lag_rad)
+
+
+def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.Result, Forces]:
+    """A run of 8 s, and the forces of all obstacles in it."""
+    with recorded() as steps:
+        result = snakesim.run(scenario, controller=controller, duration=options.pop("duration", 8), set=options)
+    forces = {name: np.zeros(len(steps)) for names in steps for name in names}
+    for k, found in enumerate(steps):
+        for name, force_n in found.items():
+            forces[name][k] = force_n
+    return result, forces
+
+
+@contextmanager
+def recorded() -> "Iterator[list[dict[str, float]]]":
+    """Forces of the obstacles that the body touches, one dict a physics step of the run within."""
+    steps: list[dict[str, float]] = []
+    feel = ContactReader._feel  # pyright: ignore[reportPrivateUsage] - called in every physics step
+
+    def felt(self: ContactReader) -> None:
+        touches = self._touches  # pyright: ignore[reportPrivateUsage]
+        found: dict[str, float] = {}
+        names = touches._obstacles  # pyright: ignore[reportPrivateUsage]
+        for pair, force_n in touches.sizes_n().items():
+            name = next(names[geom] for geom in pair if names[geom] is not None)  # pyright: ignore
+            found[name] = found.get(name, 0.0) + force_n
+        steps.append(found)
+        feel(self)
+
+    ContactReader._feel = felt  # pyright: ignore[reportPrivateUsage]
+    try:
+        yield steps
+    finally:
+        ContactReader._feel = feel  # pyright: ignore[reportPrivateUsage]
+
+
+def case(scenario: str, label: str, controller: Any, **options: Any) -> tuple[float, str]:
+    """Distance, and its row."""
+    result, forces = measured(scenario, controller, **options)
+    metres, joules = result.summary.advance_m or 0.0, result.summary.energy_j_per_m
+    impulse_ns = STEP_S * sum(float(force.sum()) for force in forces.values())
+    per_m = f"{joules:.1f} | {impulse_ns / metres:.0f}" if joules is not None else "- | -"
+    return metres, f"| `{scenario}` | {label} | {metres:.2f} | {per_m} |"
+
+
+def cases(scenario: str) -> Iterator[str]:
+    """A row each: shipped controllers at the mission's speed, at a higher one, and the wave."""
+    for name in SHIPPED:
+        yield case(scenario, f"`{name}`", name)[1]
+    for name in SHIPPED if scenario == "triplet" else ():
+        if name not in WITHOUT_PATH:
+            label = f"`{name}`, {FASTER_M_S} m/s asked for"
+            yield case(scenario, label, name, **{"mission.speed_m_s": FASTER_M_S})[1]
+    waves = [(rad, *case(scenario, f"wave, {rad} rad", wave(rad))) for rad in AMPLITUDES_RAD]
+    best = max(waves, key=lambda found: found[1])
+    yield next(row for rad, _, row in waves if rad == 0.3)
+    yield best[2].replace(f"{best[0]} rad", f"{best[0]} rad (of {len(waves)} tried the one that goes furthest)")
+
+
+def causes(scenario: str, controller: str, **options: Any) -> str:
+    """What the difference of asked and felt forces is made of."""
+    result, forces = measured(scenario, controller, **options)
+    states = [state for state in result.record.control if state.state == "Locomoting"]
+    asked, felt = table_of(states, forces, 0.0)
+    judged = [one for one in np.arange(len(asked)) if asked[one].max(initial=0.0) >= ASKED_N]
+    asked, felt = asked[judged], felt[judged]
+    empty = float(asked[felt < EMPTY_N].sum())
+    unasked = float(felt[asked == 0.0].sum())
+    both = (asked > 0.0) & (felt >= EMPTY_N)
+    total, split = 0.0, 0.0
+    for wanted, found, here in zip(asked, felt, both, strict=True):
+        if here.any():
+            scale = found[here].sum() / wanted[here].sum()
+            total += abs(found[here].sum() - wanted[here].sum())
+            split += float(np.abs(found[here] - scale * wanted[here]).sum())
+    whole = empty + unasked + total + split
+    by_shift = [correlation(*table_of(states, forces, float(shift))) for shift in SHIFTS_S]
+    best = int(np.argmax(by_shift))
+    shares = " | ".join(f"{part / whole:.0%}" for part in (empty, unasked, total, split))
+    return (
+        f"| `{scenario}` | `{controller}` | {asked.sum(axis=1).mean():.1f} | {felt.sum(axis=1).mean():.1f} | {shares} "
+        f"| {correlation(asked, felt):.2f} | {by_shift[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
+    )
+
+
+def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
+    """Asked and felt forces, (n_states, n_obstacles) each; felt: mean over 50 ms, centred so long after asking."""
+    names = sorted({*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)})
+    window = round(FELT_OVER_S / STEP_S)
+    asked, felt = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
+    for j, name in enumerate(names):
+        sums = np.concatenate(([0.0], np.cumsum(forces.get(name, np.zeros(1)))))
+        for i, state in enumerate(states):
+            begin = round((1e-9 * state.stamp_ns + shift_s) / STEP_S) - window // 2
+            first, last = (min(max(k, 0), len(sums) - 1) for k in (begin, begin + window))
+            felt[i, j] = (sums[last] - sums[first]) / window
+    column = {name: j for j, name in enumerate(names)}
+    for i, state in enumerate(states):
+        for point, force_n in zip(state.push_points, state.solved_force_n, strict=True):
+            if point.obstacle is not None:
+                asked[i, column[point.obstacle]] += force_n
+    return asked, felt
+
+
+def correlation(asked: Floats, felt: Floats) -> float:
+    """Over all push-points that are judged."""
+    judged = asked >= ASKED_N
+    if judged.sum() < 2 or asked[judged].std() == 0.0 or felt[judged].std() == 0.0:
+        return 0.0
+    return float(np.corrcoef(asked[judged], felt[judged])[0, 1])
+
+
+def main() -> int:
+    """Print both tables, a row as soon as it is known."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=("cases", "causes"), help="one of the two tables")
+    only = parser.parse_args().only
+    if only != "causes":
+        print(CASES, flush=True)
+        for scenario in SCENARIOS:
+            for row in cases(scenario):
+                print(row, flush=True)
+        print()
+    if only != "cases":
+        print(CAUSES, flush=True)
+        for scenario in SCENARIOS:
+            for controller in ("obstacle_aided", "obstacle_triplet"):
+                print(causes(scenario, controller), flush=True)
+    return 0
