@@ -1,11 +1,14 @@
 """Obstacle-aided propulsion with all joints: forces on the obstacles, and the shape slightly further along the path.
 
-A body that obstacles hold on its path has one freedom, its arc length s. Two terms push it along, both under a PI law
-of the speed, both bounded:
+A body that obstacles hold on its path has one freedom, its arc length s. It is pushed along it by forces on the
+obstacles that are near (`push.py`), under a bounded PI law of the speed.
 
-- forces on the obstacles that are near (`push.py`): the torques of those forces close gaps, and press where it pushes;
-- the shape at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by virtual work a force
-  F = l k sum theta_i'^2, also where no contacts can balance it.
+Where these can balance a push, joints are in torque mode: they get the torques of those forces, and a shape so soft
+that obstacles decide it, with no stiffness along the path. So the forces come true.
+
+Elsewhere, and where drives have no torque mode, joints hold the shape in position mode. The torques then only close
+gaps, and the shape itself pushes, at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by
+virtual work a force F = l k sum theta_i'^2.
 
 A negative speed backs the body out along its own path. A body that does not come on moves by a wave until it lies where
 it can push (`contact_search.py`). See `docs/poal.md`.
@@ -29,18 +32,17 @@ from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Description, World
+from snakesim_hal.wire.messages import Description, Mode, World
 from snakesim_hal.wire.quantities import about, above, from_zero
 
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
 LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
-AS_WANTED = 0.5  # share of the wanted speed from which on a body moves as it is to
 STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where on its path it is
-LARGEST_SLIDE_M = 0.02
 FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
-DRAG_S = 0.3  # time constant of what all contacts are felt to do along the body
+ACTS_AFTER_S = 0.03  # command and motor are on their way for so long
+SOFT_REST, SOFT_AFTER_S = 0.1, 0.1  # what may be out of balance of a push with a soft shape, and for how long before
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -54,7 +56,7 @@ class PushSnapshot:
 
 
 class ObstacleAided:
-    """Speed along the path by look-ahead, with every joint."""
+    """Speed along the path, with every joint."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Look-ahead l = lead_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
@@ -98,7 +100,7 @@ class ObstacleAided:
         loose_m: Annotated[float, above(1, "m"), about("gap to an obstacle at which a contact counts half")] = 0.005
         torque_filter_s: Annotated[
             float, above(5, "s"), about("time constant of the filter of the pushing torques")
-        ] = 0.1
+        ] = 0.03
         search_after_s: Annotated[
             float,
             from_zero(1000, "s"),
@@ -107,31 +109,19 @@ class ObstacleAided:
         search_s: Annotated[float, above(1000, "s"), about("how long it does so, and then tries its path again")] = 30.0
         blend_s: Blend = 0.3
         speed_filter_s: SpeedFilter = 0.05
-        slides: Annotated[
-            float,
-            Meta(ge=0, le=1),
-            about(
-                "share of the shape's resistance to sliding along the path that is taken out: so much of the way that "
-                "the joint angles are ahead of or behind the measured place, the shape goes with them"
-            ),
-        ] = 0.0
-        servo_lag_s: Annotated[
-            float,
-            from_zero(1, "s"),
-            about("by which joints are behind their targets, from latency and damping; the shape leads by it"),
-        ] = 0.0
         empty_price: Annotated[
             float,
             from_zero(1000, "1"),
             about("how many times dearer the force on an obstacle is that is not felt; 0: as dear as on others"),
-        ] = 0.0
-        felt_push_s: Annotated[
+        ] = 10.0
+        shape_nm_per_rad: Annotated[
             float,
-            from_zero(1000, "s"),
-            about(
-                "time constant in which the push of a moving body becomes what its contacts are felt to do; 0: never"
-            ),
-        ] = 0.0
+            from_zero(1000, "N*m/rad"),
+            about("stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are"),
+        ] = 2.0
+        shape_nm_s_per_rad: Annotated[
+            float, from_zero(1000, "N*m*s/rad"), about("damping of the shape in torque mode")
+        ] = 0.1
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
@@ -144,12 +134,13 @@ class ObstacleAided:
         self._integral_m = 0.0
         self._push_n = 0.0
         self._bends = self._body.bends
+        self._soft = settings.shape_nm_per_rad > 0.0 and all(robot.joints[i].has(Mode.TORQUE) for i in self._bends)
+        self._unbalanced_s = 0.0  # when contacts could last not balance a push
         self._torques_nm = np.zeros(len(robot.joints))
         self._unit_nm = np.zeros(len(robot.joints))
         self._last_push: PushSnapshot | None = None
         self._max_force_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
         self._moved_at_s = 0.0
-        self._felt_n = self._drag_n = 0.0  # what contacts are felt to do along the body, and what they mostly do
         self._waits = False
         self._search = ContactSearch(robot, after_s=settings.search_after_s, for_s=settings.search_s)
 
@@ -171,17 +162,42 @@ class ObstacleAided:
         ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
         at = located.on_path.at
         here = self._body.all_angles(at(located.tail_s_m))
-        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here
-        leads_m = self._leads_m(located, np.array(view.joints.angle_rad) - here, slope / SLOPE_M)
-        reference = self._body.all_angles(at(located.tail_s_m + leads_m + ahead_m))
-        torques = scale * self._push_nm(located, slope / SLOPE_M, view.period_s)
-        reference = reference + torques / self._stiffness
+        turns_per_m = (self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here) / SLOPE_M
+        torques = scale * self._push_nm(located, turns_per_m, view.period_s)
+        if self._soft and self._balanced(view.time_s):
+            return self._press(view, located, here, turns_per_m, torques)
+        reference = self._body.all_angles(at(located.tail_s_m + ahead_m)) + torques / self._stiffness
         restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
         if restarted and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
         set_points, self._waits = self._bumpless.to(view, reference, restarted=restarted), False
-        force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
+        force_n = ahead_m * float(self._stiffness @ turns_per_m**2)
         return Action(set_points, self._report(view, located, force_n, reference))
+
+    def _balanced(self, time_s: float) -> bool:
+        """Whether the obstacles beside the body have been able to hold a push for a while."""
+        if self._last_push is None or self._last_push.push.rest > SOFT_REST:
+            self._unbalanced_s = time_s
+        return time_s - self._unbalanced_s > SOFT_AFTER_S
+
+    def _press(
+        self, view: View, located: Located, reference: Floats, turns_per_m: Floats, torques_nm: Floats
+    ) -> Action:
+        """Torques of the wanted forces, and a soft shape, less all that it would do along the path."""
+        joints, bends, config = view.joints, self._bends, self._set
+        off_rad = reference - np.array(joints.angle_rad)
+        slower_rad_s = turns_per_m * located.speed_m_s - np.array(joints.velocity_rad_s)
+        holding_nm = config.shape_nm_per_rad * off_rad + config.shape_nm_s_per_rad * slower_rad_s
+        along = turns_per_m[bends]
+        holding_nm = holding_nm - turns_per_m * float(along @ holding_nm[bends]) / (along @ along + STRAIGHT_PER_M2)
+        set_points = self._bumpless.to(view, reference)
+        self._bumpless.reference_rad = None  # position mode will start from the torques that are there then
+        self._integral_m, self._waits = min(self._integral_m, config.fresh_look_ahead_m), False
+        for i in bends:
+            limit_nm = set_points.torque_limit_nm[i]
+            set_points.mode[i] = Mode.TORQUE
+            set_points.target[i] = min(max(float(holding_nm[i] + torques_nm[i]), -limit_nm), limit_nm)
+        return Action(set_points, self._report(view, located, 0.0, reference))
 
     def _undulate(self, view: View, wave: LateralUndulation) -> Action:
         """In search of something to push off."""
@@ -222,18 +238,6 @@ class ObstacleAided:
             jammed=bool(why) and jammed,
         )
 
-    def _leads_m(self, located: Located, off_rad: Floats, turns_per_m: Floats) -> float:
-        """How far ahead of the measured place the shape is that pushes nothing along the path.
-
-        off_rad: measured angles, less those of that place. A shape that is a millimetre off along the path pushes with
-        the stiffness of all joints that turn there, some 20 N in `peg_row`; so it is where the joints say that it is.
-        """
-        bends = self._bends
-        stiff = float(turns_per_m[bends] @ turns_per_m[bends])
-        slid_m = float(turns_per_m[bends] @ off_rad[bends]) / (stiff + STRAIGHT_PER_M2)
-        slid_m = self._set.slides * min(max(slid_m, -LARGEST_SLIDE_M), LARGEST_SLIDE_M)
-        return slid_m + self._set.servo_lag_s * located.trajectory.speed_m_s
-
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
         largest_m = self._set.largest_look_ahead_m
         wanted_m_s = located.trajectory.speed_m_s
@@ -251,9 +255,6 @@ class ObstacleAided:
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
         self._push_n += config.push_n_m * error * period_s
-        if config.felt_push_s > 0.0 and located.speed_m_s > AS_WANTED * wanted_m_s:
-            self._drag_n += (self._felt_n - self._drag_n) * min(period_s / DRAG_S, 1.0)
-            self._push_n += (self._drag_n - self._push_n) * min(period_s / config.felt_push_s, 1.0)
         self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
         force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
         self._look(located, turns_per_m)
@@ -270,15 +271,14 @@ class ObstacleAided:
             return
         config = self._set
         outlines, friction = Outlines.of(located.world.obstacles), located.trajectory.peg_friction
-        touches = find_touches(
-            located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction
-        )
+        at, then_s_m = located.on_path.at, located.tail_s_m + ACTS_AFTER_S * located.speed_m_s
+        nodes_w = located.nodes_w + at(then_s_m).nodes_w - at(located.measured_s_m).nodes_w
+        touches = find_touches(nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction)
         felt = self._felt.forces_w([located.world.obstacles[k].name for k in touches.obstacle.tolist()])
         felt_w = np.array(felt).reshape(-1, 2)  # none without a sensor
-        self._felt_n = float((felt_w * touches.tangents_w).sum()) if felt else self._push_n
         dearer = config.empty_price * np.exp(-np.hypot(*felt_w.T) / FELT_N) if felt else 0.0
         turns_per_m = turns_per_m[self._bends]
-        push = push_forward(located.nodes_w, touches, turns_per_m, loose_m=config.loose_m, dearer=dearer)
+        push = push_forward(nodes_w, touches, turns_per_m, loose_m=config.loose_m, dearer=dearer)
         self._last_push = PushSnapshot(located.world, touches, push)
         self._unit_nm, self._max_force_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))

@@ -27,6 +27,7 @@ class Located:
     tail_s_m: float  # arc length of the tail end
     speed_m_s: float
     nodes_w: Floats  # (2, n_nodes), last measurement
+    measured_s_m: float  # arc length of the tail end then
     fresh: bool  # there is a new world model
     restarted: bool  # on a new path, or localised again after it was unknown: the position may have jumped
     world: World
@@ -80,7 +81,7 @@ class Progress:
         s = self._s_m + self._speed_m_s * _seconds(view.joints.stamp_ns - self._measured_ns, view)
         restarted = new_path or before_ns is None
         fresh, self._world_tick = world.tick != self._world_tick, world.tick
-        return Located(body, s, self._speed_m_s, self._nodes, fresh, restarted, world, trajectory)
+        return Located(body, s, self._speed_m_s, self._nodes, self._s_m, fresh, restarted, world, trajectory)
 
     def _filter(self, body: BodyOnPath, passed_s: float) -> None:
         """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""
