@@ -10,8 +10,10 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from snakesim_hal.process import die_with_parent
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import parts_of, processes_of
 from tests.harness.wait import LIMIT_S, wait_until
@@ -162,6 +164,7 @@ def running(
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=subprocess.STDOUT,
+            preexec_fn=partial(die_with_parent, os.getpid()),  # also when the tests are killed
         )
     try:
         yield Running(process, out, asked, more, inside)
