@@ -66,6 +66,14 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     nothing_left(tmp_path / "run")
 
 
+def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
+    flags = ["--pace", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
+    assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
+    nothing_left(tmp_path / "run")
+
+
 def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
     """A backend that does not say that it is emulated counts as real."""
     (tmp_path / "bench.py").write_text(
