@@ -1,28 +1,42 @@
-"""`obstacle_aided` and what it pushes off: forces that are felt, and no obstacle at all."""
+"""`obstacle_aided` and what it pushes off: forces that come true, and no obstacle at all."""
+
+from typing import Any
+
+import pytest
 
 import snakesim
+from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.came_true import came_true
 
-LISTENING = {
-    "control.slides": 1.0,
-    "control.servo_lag_s": 0.045,
-    "control.empty_price": 40.0,
-    "control.felt_push_s": 0.3,
-    "control.push_ns_m": 15.0,
-    "control.largest_look_ahead_m": 0.02,
-    "control.lead_s": 0.02,
-    "control.integral_per_s": 0.1,
-    "control.speed_filter_s": 0.15,
-}
+FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
 
 
-def test_a_slow_body_that_feels_its_contacts_asks_hardly_anything_of_those_that_are_empty():
-    slow = {"mission.speed_m_s": 0.05, **LISTENING}
-    result = snakesim.run("peg_row", controller="obstacle_aided", duration=7, set=slow)
+@pytest.mark.parametrize(
+    ("scenario", "also", "correlation", "error", "empty"),
+    [
+        ("triplet", {}, 0.9, 0.2, 0.05),
+        ("triplet", {"backend": "can"}, 0.9, 0.2, 0.05),
+        ("peg_row", {}, 0.65, 0.3, 0.05),
+        ("peg_row", {"mission.speed_m_s": 0.1}, 0.9, 0.2, 0.05),
+        ("surveyed_clutter", FIELD, 0.6, 0.4, 0.2),
+    ],
+)
+def test_what_is_asked_of_obstacles_comes_true_while_the_body_moves(
+    scenario: str, also: dict[str, Any], correlation: float, error: float, empty: float
+):
+    result = snakesim.run(scenario, controller="obstacle_aided", duration=6, set=also)
     found = came_true(result.record.control)
-    assert found is not None
-    assert found.empty < 0.1  # 0.45 without
-    assert (result.summary.advance_m or 0.0) > 0.2
+    assert found is not None and found.correlation is not None
+    assert found.correlation > correlation
+    assert found.median_error < error
+    assert found.empty < empty
+
+
+def test_drives_without_torque_mode_push_by_their_shape():
+    only_position = {"robot.drive.modes": ["position"]}
+    found = snakesim.run("peg_row", controller="obstacle_aided", duration=4, set=only_position)
+    assert (found.summary.advance_m or 0.0) > 0.7
+    assert Mode.TORQUE not in found.record.mode
 
 
 def test_a_body_that_nothing_can_push_moves_on_towards_its_goal():
