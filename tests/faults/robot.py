@@ -100,7 +100,7 @@ class Robot:
     def last_words(self) -> str:
         """Of those that are gone."""
         ended = [child for child in self.running.values() if child.how_it_ended()]
-        return " | ".join(line for child in ended for line in child.last_words())
+        return " | ".join(line for child in ended for line in child.words.last())
 
     def signal(self, name: str, number: signal.Signals) -> int:
         """Send a signal to one of its processes; when, by the monotonic clock."""

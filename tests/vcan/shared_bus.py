@@ -95,7 +95,7 @@ def shared_bus(channel: str) -> Iterator[SharedBus]:
     modules_end = SocketCanWire(channel, FROM_HOST)
     server = TwinServer(
         [modules_end],
-        ModuleChain(run, settings, make_plant(run, "can", settings.plant, settings.plant_settings), stepped=False),
+        ModuleChain(run, settings, make_plant(run, settings, "can"), stepped=False),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))

@@ -105,7 +105,7 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
         with Robot(folder, config) as made:
             host = made.start("host")
             host.process.wait(START_LIMIT_S)
-            words = "\n".join(host.last_words())
+            words = "\n".join(host.words.last())
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
         yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.set_points(frames)), failure=failure)
