@@ -42,7 +42,7 @@ LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little,
 STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where on its path it is
 FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
 ACTS_AFTER_S = 0.03  # command and motor are on their way for so long
-SOFT_REST, SOFT_AFTER_S = 0.1, 0.1  # what may be out of balance of a push with a soft shape, and for how long before
+SOFT_REST, SOFT_AFTER_S = 0.03, 0.1  # what may be out of balance of a push with a soft shape, and for how long before
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
