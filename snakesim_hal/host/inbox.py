@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from queue import Empty
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from snakesim_hal.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
@@ -25,9 +25,6 @@ from snakesim_hal.wire.messages import (
     SimulatorRequest,
 )
 
-if TYPE_CHECKING:
-    from snakesim_hal.host.host import Host
-
 STOPS, PRESENCE, SAMPLES, REQUESTS = range(4)  # lanes
 LIMITS = (64, None, 4096, 64)  # presence is limited to known services, so that lane needs no bound
 
@@ -43,13 +40,37 @@ class LocalRequest:
     reply: Reply
 
 
+class Receiver(Protocol):
+    """Handles the input."""
+
+    def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
+        """A command, and its time of arrival."""
+        ...
+
+    def take_done(self, service: str, tick: int) -> None:
+        """A service has completed a tick."""
+        ...
+
+    def presence_changed(self, service: str, present: bool) -> None:
+        """A service's liveliness token has appeared or vanished."""
+        ...
+
+    def answer(self, request: Request, reply: Reply) -> None:
+        """A request; reply once, from any thread."""
+        ...
+
+    def refuse(self, error: WireError) -> Answer:
+        """A message cannot be decoded; returns the answer if it was a query."""
+        ...
+
+
 class Inbox:
     """Queues filled by other threads and emptied by the host."""
 
     def __init__(
         self,
         session: Session,
-        receiver: "Host",
+        receiver: Receiver,
         services: Collection[str],
         reply: Callable[[Question, Answer], None],
     ) -> None:

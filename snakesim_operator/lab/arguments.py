@@ -88,6 +88,5 @@ def _lab(arguments: argparse.Namespace) -> "Lab":
     from snakesim_operator import extras
     from snakesim_operator.lab.lab_file import load_lab
 
-    lab = load_lab(arguments.lab)
     extras.check("lab", "`snakesim deploy`")
-    return lab
+    return load_lab(arguments.lab)
