@@ -10,15 +10,14 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from snakesim_hal.process import die_with_parent
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import parts_of, processes_of
 from tests.harness.wait import LIMIT_S, wait_until
 
 SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
+WITH_TESTS = ["setpriv", "--pdeathsig", "KILL"]  # ends when the tests are killed, too
 TOO_LONG = 124  # as timeout(1) has it: no exit code of ours
 HANDED_DOWN = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS", "QUICK"}
 
@@ -158,13 +157,12 @@ def running(
     network = ["--endpoint", asked] if asked is not None and "--router" not in arguments else []
     with out.with_suffix(".said").open("wb") as said:
         process = subprocess.Popen(
-            [*inside, *SNAKESIM, "run", *arguments, "--out", str(out), *network],
+            [*inside, *WITH_TESTS, *SNAKESIM, "run", *arguments, "--out", str(out), *network],
             cwd=out.parent,
             env=environment(out.parent, **(more or {})),
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=subprocess.STDOUT,
-            preexec_fn=partial(die_with_parent, os.getpid()),  # also when the tests are killed
         )
     try:
         yield Running(process, out, asked, more, inside)
