@@ -41,7 +41,9 @@ def period_s(actions: list[Action]) -> float:
 def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again() -> None:
     stage = make_stage()
     pegs, stage.pegs = stage.pegs, []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.2, search_s=2.0))
+    controller = ObstacleAided(
+        stage.robot, ObstacleAided.Settings(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
+    )
     alone = stands(controller, stage, range(300))
     searches = [SEARCHES in action.report.why for action in alone]
     assert not any(searches[:115]) and all(searches[125:])
@@ -59,7 +61,7 @@ def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again(
 def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) -> None:
     stage = make_stage()
     stage.pegs = stage.pegs if among_pegs else []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0))
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, shape_nm_per_rad=0.0))
     seen = stands(controller, stage, range(1010))
     periods = [period_s(seen[first : first + 240]) for first in (150, 450, 750)]
     felt, to_head = pytest.approx(math.tau / 5.39, rel=0.15), pytest.approx(0.8, rel=0.05)

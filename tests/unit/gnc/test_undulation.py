@@ -13,6 +13,7 @@ from snakesim_hal.model.route import Route
 from tests.unit.gnc.stage import make_stage
 
 TAIL_S_M = 0.3
+BY_SHAPE = {"shape_nm_per_rad": 0.0}  # in position mode, whose targets show the push
 
 
 def references(controller, stage, ticks: int) -> np.ndarray:
@@ -39,7 +40,9 @@ def test_the_head_steers_towards_the_path_and_against_its_bend_if_the_wave_goes_
 
 def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> None:
     stage = make_stage()
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(largest_torque_nm=2.0, search_after_s=0.0))
+    controller = ObstacleAided(
+        stage.robot, ObstacleAided.Settings(largest_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE)
+    )
     first = controller.update(stage.view(0, TAIL_S_M))
     start = np.array(first.set_points.target)
     last = first
@@ -55,7 +58,7 @@ def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> Non
 def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
     """References of a body that stays where it is."""
     stage = make_stage()
-    settings = ObstacleAided.Settings(push_scale=push_scale, push_sign_s=push_sign_s, search_after_s=0.0)
+    settings = ObstacleAided.Settings(push_scale=push_scale, push_sign_s=push_sign_s, search_after_s=0.0, **BY_SHAPE)
     return references(ObstacleAided(stage.robot, settings), stage, 300)
 
 
