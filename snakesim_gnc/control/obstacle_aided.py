@@ -118,7 +118,7 @@ class ObstacleAided:
             float,
             from_zero(1000, "N*m/rad"),
             about("stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are"),
-        ] = 2.0
+        ] = 1.5
         shape_nm_s_per_rad: Annotated[
             float, from_zero(1000, "N*m*s/rad"), about("damping of the shape in torque mode")
         ] = 0.1
