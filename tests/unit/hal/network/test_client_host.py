@@ -273,17 +273,18 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
 
 
 def test_realtime_keeps_its_deadlines_on_average() -> None:
-    """Late ticks are made up, and others answered; how many are late is for the computer to say."""
+    """As many periods pass as there is time for, and are answered; how many are late is for the computer to say."""
     config = run_config(pace="realtime", rate_hz=50.0)
     with running(config, max_ticks=50) as run, following(run.link, Follower()):
         run.arm()
         wait_until(run.ended, "the end of the run")
         assert run.host.wall_s == pytest.approx(1.0, rel=0.1)
-        assert run.host.statistics.ticks == 50 and not run.host.authority.faults
-        assert run.host.statistics.answered_ticks + run.host.statistics.overruns >= 35
-        latency = run.host.statistics.state_to_command
+        assert not run.host.authority.faults
+        found = run.host.statistics
+        assert found.answered_ticks + found.overruns >= 0.7 * found.ticks
+        latency = found.state_to_command
         median_us = latency.percentile_us(50)
-        assert latency.count == run.host.statistics.answered_ticks > 0
+        assert latency.count >= found.answered_ticks > 0  # late answers count, too
         assert median_us is not None and 0 < median_us < 20_000
 
 
