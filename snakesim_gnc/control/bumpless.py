@@ -86,6 +86,10 @@ class BumplessReference:
         self._hand_over.fade(view.period_s / self._blend_s)
         return positions(self._robot, self._hand_over.positions_rad(reference_rad).tolist())
 
+    def let_go(self) -> None:
+        """Joints leave position mode; when they are back in it, they start from the torques that are there then."""
+        self.reference_rad = None
+
     def hold(self, view: View, why: str) -> Action:
         """Every joint keeps its reference, or its pose before there was one."""
         reference = np.array(view.joints.angle_rad) if self.reference_rad is None else self.reference_rad

@@ -145,7 +145,7 @@ class ObstacleAided:
         self._search = ContactSearch(robot, after_s=settings.search_after_s, for_s=settings.search_s)
 
     def update(self, view: View) -> Action:
-        """Angles of the body further along the path, as far as the wanted speed needs it."""
+        """Torques, or angles of the body further along the path, as far as the wanted speed needs it."""
         located = self._progress.update(view)
         if isinstance(located, str):
             self._waits = True
@@ -191,7 +191,7 @@ class ObstacleAided:
         along = turns_per_m[bends]
         holding_nm = holding_nm - turns_per_m * float(along @ holding_nm[bends]) / (along @ along + STRAIGHT_PER_M2)
         set_points = self._bumpless.to(view, reference)
-        self._bumpless.reference_rad = None  # position mode will start from the torques that are there then
+        self._bumpless.let_go()
         self._integral_m, self._waits = min(self._integral_m, config.fresh_look_ahead_m), False
         for i in bends:
             limit_nm = set_points.torque_limit_nm[i]
