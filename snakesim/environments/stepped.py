@@ -10,11 +10,11 @@ from snakesim_hal.backend import Backend, Samples, SetPoints
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError
 from snakesim_hal.fault_plan import planned
 from snakesim_hal.host.guarded_backend import GuardedBackend
-from snakesim_hal.host_process import backend_settings
 from snakesim_hal.injection import CONTROL
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, Service
 from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.plugin_check import backend_settings
 from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.safety.authority import Authority, Decision
 from snakesim_hal.wire import keys

@@ -21,11 +21,11 @@ def add_commands(commands: Any) -> None:
     verbs = joints.add_subparsers(dest="verb", required=True, metavar="VERB")
     zero = _by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")
     zero.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
-    for verb, about in (
-        ("direction", "turn joints by hand: which count the wrong way round, or have another's id"),
-        ("limits", "move joints by hand from end to end: their limits"),
+    for verb, act, about in (
+        ("direction", _direction, "turn joints by hand: which count the wrong way round, or have another's id"),
+        ("limits", _limits, "move joints by hand from end to end: their limits"),
     ):
-        command = _by_hand(verbs, verb, _move, about)
+        command = _by_hand(verbs, verb, act, about)
         command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
     _add_jog(verbs)
     judge = verbs.add_parser(
@@ -84,11 +84,16 @@ def _jog(arguments: argparse.Namespace) -> int:
     return jog(arguments.file, selection_of(arguments), wanted)
 
 
-def _move(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.commissioning.by_hand import direction, limits
+def _direction(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import direction
 
-    find = direction if arguments.verb == "direction" else limits
-    return find(arguments.file, selection_of(arguments), arguments.joints)
+    return direction(arguments.file, selection_of(arguments), arguments.joints)
+
+
+def _limits(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import limits
+
+    return limits(arguments.file, selection_of(arguments), arguments.joints)
 
 
 def _check(arguments: argparse.Namespace) -> int:

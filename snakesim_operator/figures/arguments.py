@@ -38,6 +38,12 @@ def _plot(arguments: argparse.Namespace) -> int:
     extras.check("plot", "`snakesim plot`")
     from snakesim_operator.figures.drawn import plot
 
-    span_s = (arguments.from_s, arguments.to_s)
-    look = {"paper": arguments.paper, "width_in": arguments.width, "span_s": span_s, "dark": arguments.dark}
-    return plot(arguments.run, arguments.signals, arguments.out, **look)
+    return plot(
+        arguments.run,
+        arguments.signals,
+        arguments.out,
+        paper=arguments.paper,
+        width_in=arguments.width,
+        span_s=(arguments.from_s, arguments.to_s),
+        dark=arguments.dark,
+    )

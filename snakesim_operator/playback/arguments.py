@@ -181,8 +181,15 @@ def _replay(arguments: argparse.Namespace) -> int:
         check_endpoint(arguments.endpoint, "--endpoint")
     if arguments.namespace is not None:
         check_namespace(arguments.namespace, "--namespace")
-    where = {"endpoint": arguments.endpoint, "namespace": arguments.namespace}
     try:
-        return play(path, iter(sys.stdin), say, **where, rate=arguments.rate, step=arguments.step)
+        return play(
+            path,
+            iter(sys.stdin),
+            say,
+            endpoint=arguments.endpoint,
+            namespace=arguments.namespace,
+            rate=arguments.rate,
+            step=arguments.step,
+        )
     except KeyboardInterrupt:
         return 130

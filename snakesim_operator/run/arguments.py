@@ -94,10 +94,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
     from snakesim_operator.run.run import RunRequest, run
 
-    names = "out endpoint router namespace stay unchecked with_router insecure raw_only console"
-    given = {name: getattr(arguments, name) for name in names.split()}
+    request = RunRequest(
+        config,
+        out=arguments.out,
+        endpoint=arguments.endpoint,
+        router=arguments.router,
+        session=session_given(arguments),
+        namespace=arguments.namespace,
+        stay=arguments.stay,
+        unchecked=arguments.unchecked,
+        with_router=arguments.with_router,
+        insecure=arguments.insecure,
+        record=not arguments.no_record,
+        raw_only=arguments.raw_only,
+        console=arguments.console,
+    )
     with output_may_fail():
-        return run(RunRequest(config, session=session_given(arguments), record=not arguments.no_record, **given))
+        return run(request)
 
 
 def _host(arguments: argparse.Namespace) -> int:

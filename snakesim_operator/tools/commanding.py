@@ -8,7 +8,7 @@ from typing import Any
 
 from snakesim_hal.arguments import add_network, add_unchecked
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.tools.robot_selection import selection_of
+from snakesim_operator.tools.robot_selection import RobotSelection, selection_of
 from snakesim_operator.tools.simulator_order import add_command as add_sim
 from snakesim_operator.tools.simulator_order import order_of
 
@@ -24,8 +24,8 @@ def add_commands(commands: Any) -> None:
     add_network(arm)
     arm.set_defaults(act=_arm)
     for name, act, about in (
-        ("disarm", _disarm_or_clear, "make a robot's joints passive"),
-        ("clear", _disarm_or_clear, "clear a fault or an emergency stop; the robot is disarmed then"),
+        ("disarm", _disarm, "make a robot's joints passive"),
+        ("clear", _clear, "clear a fault or an emergency stop; the robot is disarmed then"),
         ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
     ):
         command = commands.add_parser(name, help=about)
@@ -66,10 +66,10 @@ def add_commands(commands: Any) -> None:
 def _add_param(commands: Any) -> None:
     param = commands.add_parser("param", help="list, get and set parameters of the running controller")
     verbs = param.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for verb, about in (
-        ("list", "all of them: value, unit, range, what each is"),
-        ("get", "the value of one"),
-        ("set", "change them, all or none; the controller goes on with them, and they are recorded"),
+    for verb, act, about in (
+        ("list", _param_list, "all of them: value, unit, range, what each is"),
+        ("get", _param_get, "the value of one"),
+        ("set", _param_set, "change them, all or none; the controller goes on with them, and they are recorded"),
     ):
         command = verbs.add_parser(verb, help=about)
         command.add_argument("robot", metavar="ROBOT", help="its namespace, as printed by `snakesim status`")
@@ -78,7 +78,7 @@ def _add_param(commands: Any) -> None:
         if verb == "set":
             command.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.lead_s=0.3")
         add_network(command)
-    param.set_defaults(act=_param)
+        command.set_defaults(act=act)
 
 
 def _arm(arguments: argparse.Namespace) -> int:
@@ -87,10 +87,16 @@ def _arm(arguments: argparse.Namespace) -> int:
     return arm(arguments.robot, arguments.backend, selection_of(arguments), unchecked=arguments.unchecked)
 
 
-def _disarm_or_clear(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.tools.command import clear, disarm
+def _disarm(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.command import disarm
 
-    return (disarm if arguments.command == "disarm" else clear)(selection_of(arguments))
+    return disarm(selection_of(arguments))
+
+
+def _clear(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.command import clear
+
+    return clear(selection_of(arguments))
 
 
 def _estop(arguments: argparse.Namespace) -> int:
@@ -125,14 +131,27 @@ def _fault(arguments: argparse.Namespace) -> int:
     return fault(order, selection_of(arguments))
 
 
-def _param(arguments: argparse.Namespace) -> int:
-    """Of the robot that is named, by its namespace."""
-    from snakesim_operator.tools.parameters import get_parameter, list_parameters, set_parameters
+def _param_list(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.parameters import list_parameters
 
+    return list_parameters(_robot_of(arguments))
+
+
+def _param_get(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.parameters import get_parameter
+
+    return get_parameter(arguments.name, _robot_of(arguments))
+
+
+def _param_set(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.parameters import set_parameters
+
+    return set_parameters(arguments.values, _robot_of(arguments))
+
+
+def _robot_of(arguments: argparse.Namespace) -> RobotSelection:
+    """The robot that is named, by its namespace."""
     if arguments.namespace not in (None, arguments.robot):
         raise ConfigError(f"{arguments.robot} and --namespace {arguments.namespace}: name one robot; leave one out")
     arguments.namespace = arguments.robot
-    where = selection_of(arguments)
-    if arguments.verb == "get":
-        return get_parameter(arguments.name, where)
-    return list_parameters(where) if arguments.verb == "list" else set_parameters(arguments.values, where)
+    return selection_of(arguments)
