@@ -31,11 +31,12 @@ METRICS = {  # number of the summary -> its name, digits, and of which runs the 
     "jam_ratio": ("jam ratio", 3, OF_ALL),
     "impulse_n_s_per_m": ("contact impulse, N·s/m", 1, OF_CROSSED),
     "torque_headroom": ("torque headroom", 2, OF_ALL),
+    "form_closure": ("form-closure margin", 3, OF_ALL),
+    "planning_share": ("planning, share of turns", 2, OF_ALL),
     "solved_force_correlation": ("solved forces: correlation with measured", 2, OF_ALL),
     "solved_force_error": ("solved forces: median error", 2, OF_ALL),
     "empty_push_points": ("solved forces: push-points that carried nothing", 2, OF_ALL),
 }
-NOT_MEASURED = "not measured: form-closure margin; planning time (charged in robot time by its work, docs/poal.md)"
 
 
 class Crossing(msgspec.Struct, frozen=True):
@@ -143,7 +144,6 @@ def text(card: Card, pairs: Sequence[Paired]) -> list[str]:
         for key, (name, digits, _) in METRICS.items():
             value = score.medians[key]
             found.append(f"    {name:<48}{'unknown' if value is None else f'{value:z.{digits}f}'}")
-    found.append(NOT_MEASURED)
     for one in pairs:
         words = f"{one.only_one} fields only by the first, {one.only_other} only by the second, of {one.fields}"
         found.append(f"  {one.row}: {one.one} against {one.other}: {words}; p = {one.p:.2g}")

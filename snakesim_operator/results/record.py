@@ -57,6 +57,7 @@ class RunRecord:
     orientation_wxyz: Floats  # (n, 4)
     contact_peak_n: Floats  # (n,) strongest contact, mean over 50 ms
     contact_count: Floats  # (n,) obstacles touched
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a turn of navigation -> work in it
     own: dict[str, Floats] = field(default_factory=dict[str, Floats])  # of sensors with a message of their own
     lacks: list[str] = field(default_factory=list[str])  # missing data, as text
     unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
@@ -147,6 +148,7 @@ class RunRecord:
             *streams,
             **known,
             own=own,
+            searched_nodes=contents.searched_nodes,
             lacks=lacks + unwritten(host) + contents.unreached + contents.lacks,
             unreached=contents.unreached,
             replay_of=contents.replay_of,

@@ -59,6 +59,7 @@ class Contents:
     own: dict[str, list[RecordedMessage]] = field(
         default_factory=dict[str, list[RecordedMessage]]
     )  # of own sensors, by key
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a turn of navigation -> work in it
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
@@ -94,6 +95,8 @@ class Contents:
             case Clock(paused=True):
                 pass  # no tick
             case World() | Trajectory() | ControlState():
+                if isinstance(message, Trajectory):
+                    self.searched_nodes[message.tick] = message.searched_nodes
                 kept = self.streams[key]
                 if not kept or _is_news(kept[-1], message):
                     kept.append(message)

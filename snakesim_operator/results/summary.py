@@ -116,6 +116,13 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     torque_headroom: Annotated[
         float | None, _number("1", "share of its limit that every joint had left in 95 % of the ticks until then")
     ] = None
+    form_closure: Annotated[
+        float | None,
+        _number("1", "median margin of form closure of what was felt until then; above 0: contacts hold a stiff body"),
+    ] = None
+    planning_share: Annotated[
+        float | None, _number("1", "share of navigation's turns until then in which it searched for a path")
+    ] = None
     state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
     tick_times: Annotated[
         dict[str, Timing],
