@@ -22,17 +22,22 @@ MAX_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
 
 def bounded(low: float, high: float, unit: str) -> Meta:
     """Of a number with a unit."""
-    return Meta(ge=low, le=high, extra_json_schema={"unit": unit})
+    return Meta(ge=_same(low), le=_same(high), extra_json_schema={"unit": unit})
 
 
 def above(high: float, unit: str) -> Meta:
     """For a setting: more than zero, at most `high`."""
-    return Meta(gt=0, le=high, extra_json_schema={"unit": unit})
+    return Meta(gt=0, le=_same(high), extra_json_schema={"unit": unit})
 
 
 def from_zero(high: float, unit: str) -> Meta:
     """For a setting: from zero to `high`."""
-    return Meta(ge=0, le=high, extra_json_schema={"unit": unit})
+    return Meta(ge=0, le=_same(high), extra_json_schema={"unit": unit})
+
+
+def _same(number: float) -> float:
+    """2 and 2.0 as one: types that are equal are made once, by whoever is imported first, and schemas show which."""
+    return int(number) if number == int(number) else number
 
 
 def about(text: str) -> Meta:
