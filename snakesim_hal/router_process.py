@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from snakesim_hal.arguments import add_insecure, add_network, add_parent, add_scenario
-from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.session import open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import process_options
-from snakesim_hal.terminal import report_error
+from snakesim_hal.serve import ProcessOptions, process_options
+from snakesim_hal.terminal import exit_code
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,15 +20,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_network(parser)
     add_insecure(parser)
     add_parent(parser)
-    try:
-        given = process_options(parser.parse_args(argv), hosts=True)
-        stopped = threading.Event()
-        on_stop_signal(stopped.set)
-        with open_session(replace(given.link, namespace=None)):
-            stopped.wait()
-    except SnakesimError as error:
-        report_error(error, "snakesim router")
-        return 1
+    arguments = parser.parse_args(argv)
+    return exit_code("snakesim router", lambda: _forward(process_options(arguments, hosts=True)))
+
+
+def _forward(given: ProcessOptions) -> int:
+    stopped = threading.Event()
+    on_stop_signal(stopped.set)
+    with open_session(replace(given.link, namespace=None)):
+        stopped.wait()
     return 0
 
 

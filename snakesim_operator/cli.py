@@ -12,8 +12,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from snakesim_hal.errors import ConfigError, SnakesimError, did_you_mean, short
-from snakesim_hal.terminal import discard, print_stderr, report_error, say
+from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.terminal import discard, exit_code, print_stderr, report_error, say
 from snakesim_operator.playback import arguments as playback
 from snakesim_operator.run import arguments as run
 from snakesim_operator.tools import commanding, setup, watching
@@ -26,13 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 3 an incomplete record, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _act(given)
-    except ConfigError as error:
-        report_error(error, "snakesim")
-        return BAD_INPUT
-    except SnakesimError as error:
-        report_error(error, "snakesim")
-        return FAILED
+        return exit_code("snakesim", lambda: _act(given))
     except ModuleNotFoundError as error:
         from snakesim_operator.extras import explained
 

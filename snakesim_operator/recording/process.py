@@ -17,15 +17,15 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.arguments import add_network, add_parent, add_scenario
-from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import process_options
+from snakesim_hal.serve import ProcessOptions, process_options
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import print_stderr, report_error
+from snakesim_hal.terminal import exit_code, print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
@@ -151,24 +151,24 @@ def _turn(tap: Tap, recorder: Recorder) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Record a run into its folder until told to end. Exit code 1 when it could not go on."""
+    """Record a run into its folder until told to end. Exit code 1 when it could not go on, 2 for wrong input."""
     parser = argparse.ArgumentParser(description="Record a run.")
     parser.add_argument("--out", type=Path, default=Path(), help="folder of the run")
     parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
     add_scenario(parser)
     add_network(parser, "")
     add_parent(parser)
-    given = process_options(parser.parse_args(argv))
+    arguments = parser.parse_args(argv)
+    return exit_code(f"snakesim {RECORDER}", lambda: _record(process_options(arguments)))
+
+
+def _record(given: ProcessOptions) -> int:
     ended: list[bool] = []
     on_stop_signal(lambda: ended.append(True))
     os.nice(NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # its threads, woken by each message, displace nobody
-    try:
-        file, raw_only = given.arguments.out / RECORDING, given.arguments.raw_only
-        recorder = record(given.link, file, lambda: not ended, raw_only=raw_only, after_host=True)
-    except SnakesimError as error:
-        report_error(error, f"snakesim {RECORDER}")
-        return 1
+    file, raw_only = given.arguments.out / RECORDING, given.arguments.raw_only
+    recorder = record(given.link, file, lambda: not ended, raw_only=raw_only, after_host=True)
     return FULL if recorder.recording.failure else 0
 
 
