@@ -9,6 +9,9 @@ There are two waves. One feels its way (`felt_wave.py`) and pushes off whatever 
 backward, because on ground whose friction is the same in every direction a body moves the way that its wave travels.
 The other one travels from tail to head; by itself it comes on at 8 cm/s, and obstacles hold it. A search begins with
 the first if obstacles are near, and changes to the other one whenever the goal has come no nearer for a while.
+
+A body that has come on by pushing lies bent among obstacles. There the wave that feels its way begins at half its
+speed, which takes less energy; once that has led nowhere, it goes on as fast as it was trained.
 """
 
 import math
@@ -25,6 +28,8 @@ from snakesim_hal.wire.messages import Description
 MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
 LEADS_M, LEADS_S = 0.05, 3.0  # nearer to the goal within this time; a wave that does less leads nowhere
+PUSHED_M = 0.1  # a body that has come so far since the last search has come on by pushing
+SLOWER = 2.0
 TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
 
 
@@ -34,9 +39,11 @@ class ContactSearch:
     def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
         """after_s: of standing; 0: never."""
         self._after_s, self._for_s = after_s, for_s
-        self._felt, self._to_head = FeltWave(robot), HeadSteeredUndulation(robot, TO_HEAD)
+        self._felt, self._slow = FeltWave(robot), FeltWave(robot, slower=SLOWER)
+        self._to_head = HeadSteeredUndulation(robot, TO_HEAD)
         self._wave: LateralUndulation | None = None  # by which the body moves
         self._middle_w: Floats | None = None
+        self._from_w: Floats | None = None  # where it was when the last search had ended
         self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
         self._since_s = 0.0  # when the search began
         self._led_s, self._left_m = 0.0, math.inf  # when the wave last led nearer to the goal, and how near that was
@@ -48,13 +55,17 @@ class ContactSearch:
         if before is None:
             if self._stands(view, middle_w, abs(wanted_m_s)):
                 self._since_s = view.time_s
-                self._begin(self._felt if near else self._to_head, view)
+                self._begin(self._first(middle_w) if near else self._to_head, view)
         elif view.time_s - self._since_s >= self._for_s:
             self.stop()
         elif not self._leads(view, middle_w):
-            self._begin(self._to_head if before is self._felt else self._felt, view)
+            self._begin(self._felt if before is self._to_head else self._to_head, view)
         self.changed = self._wave is not before
         return self._wave
+
+    def _first(self, middle_w: Floats) -> FeltWave:
+        pushed = self._from_w is not None and math.dist(middle_w, self._from_w) > PUSHED_M
+        return self._slow if pushed else self._felt
 
     def _begin(self, wave: LateralUndulation, view: View) -> None:
         self._wave, self._led_s, self._left_m = wave, view.time_s, math.inf
@@ -75,6 +86,8 @@ class ContactSearch:
             return False
         if self._middle_w is None:
             self._middle_w = middle_w
+        if self._from_w is None:
+            self._from_w = middle_w
         self._middle_w = self._middle_w + min(view.period_s / MIDDLE_S, 1.0) * (middle_w - self._middle_w)
         self._way.append((view.time_s, self._middle_w))
         while len(self._way) > 1 and view.time_s - self._way[1][0] >= after_s:
@@ -85,5 +98,7 @@ class ContactSearch:
 
     def stop(self) -> None:
         """Not before the body has stood for a while again."""
+        if self._wave is not None:
+            self._from_w = None
         self._wave = self._middle_w = None
         self._way.clear()

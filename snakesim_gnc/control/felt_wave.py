@@ -32,13 +32,15 @@ CONTACT_GAINS = np.array([0.335405, 0.117568]) / 50.0  # rad/N, of the links beh
 class FeltWave(LateralUndulation):
     """A wave bent towards the goal, largest at the head, that feels its way."""
 
-    def __init__(self, robot: Description) -> None:
-        wave = LateralUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=PERIOD_S, lag_rad=LAG_RAD)
+    def __init__(self, robot: Description, *, slower: float = 1.0) -> None:
+        """slower: how many times as long all that it does takes."""
+        wave = LateralUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=slower * PERIOD_S, lag_rad=LAG_RAD)
         super().__init__(robot, wave)
         count = len(self._body.bends)
         share = np.arange(count)[::-1] / max(count - 1, 1)
         self._swing_rad = AMPLITUDE_RAD + GROWTH_RAD * share
         self._felt_rad: NDArray[np.float64] | None = None
+        self._felt_rad_s = FELT_RAD_S / slower
         self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - share)) / count
 
     def start_from(self, angles_rad: NDArray[np.float64]) -> None:
@@ -57,7 +59,7 @@ class FeltWave(LateralUndulation):
         ):
             beside = np.pad(np.array(measured)[bends], 1)
             felt += gains[0] * beside[:-2] + gains[1] * beside[1:-1] + gains[2] * beside[2:]
-        felt, most_rad = FELT_RAD * np.tanh(felt), FELT_RAD_S * passed_s
+        felt, most_rad = FELT_RAD * np.tanh(felt), self._felt_rad_s * passed_s
         if self._felt_rad is not None:
             felt = self._felt_rad + np.clip(felt - self._felt_rad, -most_rad, most_rad)
         self._felt_rad = felt

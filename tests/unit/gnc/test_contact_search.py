@@ -69,6 +69,17 @@ def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) 
     assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
 
 
+def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_with_the_fast_one() -> None:
+    stage = make_stage()
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, shape_nm_per_rad=0.0))
+    for tick in range(100):
+        controller.update(stage.view(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
+    seen = stands(controller, stage, range(100, 1150))
+    slow, fast = pytest.approx(2 * math.tau / 5.39, rel=0.15), pytest.approx(math.tau / 5.39, rel=0.15)
+    assert [period_s(seen[first : first + 240]) for first in (150, 750)] == [slow, fast]
+    assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
+
+
 def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
     stage = make_stage()
     stage.pegs = []
