@@ -31,7 +31,7 @@ METRICS = {  # number of the summary -> its name, digits, and of which runs the 
     "jam_ratio": ("jam ratio", 3, OF_ALL),
     "impulse_n_s_per_m": ("contact impulse, N·s/m", 1, OF_CROSSED),
     "torque_headroom": ("torque headroom", 2, OF_ALL),
-    "form_closure": ("form-closure margin", 3, OF_ALL),
+    "form_closure": ("form closure, share of time", 3, OF_ALL),
     "planning_share": ("planning, share of turns", 2, OF_ALL),
     "solved_force_correlation": ("solved forces: correlation with measured", 2, OF_ALL),
     "solved_force_error": ("solved forces: median error", 2, OF_ALL),

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_hal.wire.messages import World
 from snakesim_operator.results.advance import MIN_DISTANCE_M, Advance, energy_j_per_m
-from snakesim_operator.results.form_closure import form_closure_margin
+from snakesim_operator.results.form_closure import contacts_beside, form_closure_margin
 from snakesim_operator.results.record import RunRecord
 
 
@@ -21,7 +21,7 @@ class Effort:
     jam_ratio: float | None = None  # share of the time in which it stood
     impulse_n_s_per_m: float | None = None  # of all contacts, over the advance
     torque_headroom: float | None = None  # share of its limit that the joint with least had left, in 95 % of the ticks
-    form_closure: float | None = None  # median margin of what was felt
+    form_closure: float | None = None  # share of the time in which obstacles held it, had its joints been stiff
     planning_share: float | None = None  # of navigation's turns: in which it searched for a path
 
     @staticmethod
@@ -41,31 +41,34 @@ class Effort:
             jam_ratio=min(advance.stalled_s / advance.until_s, 1.0),
             impulse_n_s_per_m=_impulse_n_s_per_m(record, advance),
             torque_headroom=_headroom(record, advance),
-            form_closure=_form_closure(record, advance, length_m),
+            form_closure=_form_closure(record, advance),
             planning_share=_planning_share(record, advance),
         )
 
 
 def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
-    """None without a sensor of contacts."""
-    worlds = _felt(record, advance)
-    if advance.reached_m < MIN_DISTANCE_M or len(worlds) < 2:
+    """From the contacts in guidance's worlds, twenty a second; None without a sensor of contacts."""
+    if not record.feels_contacts or advance.reached_m < MIN_DISTANCE_M:
+        return None
+    begin_ns = record.time_s[0] * 1e9
+    worlds = [one for one in record.worlds if 0 <= (one.stamp_ns - begin_ns) * 1e-9 <= advance.until_s]
+    if len(worlds) < 2:
         return None
     sums_n = [sum(float(np.linalg.norm(contact.force_w)) for contact in one.contacts) for one in worlds]
     return float(np.trapezoid(sums_n, [one.stamp_ns * 1e-9 for one in worlds])) / advance.reached_m
 
 
-def _form_closure(record: RunRecord, advance: Advance, length_m: float) -> float | None:
-    margins = [form_closure_margin(world.contacts, 0.5 * length_m) for world in _felt(record, advance)]
-    return float(np.median(margins)) if margins else None
-
-
-def _felt(record: RunRecord, advance: Advance) -> list[World]:
-    """Guidance's worlds until then, twenty a second; none without a sensor of contacts."""
-    if not record.feels_contacts:
-        return []
-    begin_ns = record.time_s[0] * 1e9
-    return [one for one in record.worlds if 0 <= (one.stamp_ns - begin_ns) * 1e-9 <= advance.until_s]
+def _form_closure(record: RunRecord, advance: Advance) -> float | None:
+    """Of the obstacles where the scene places them, ten times a second."""
+    links = record.description.links
+    radius_m, half_m = links[0].radius_m, 0.5 * sum(link.length_m for link in links)
+    outlines = Outlines.of([placed.obstacle for placed in record.placed if not placed.walkable])
+    if not len(outlines):
+        return 0.0
+    rows = np.searchsorted(record.time_s, record.time_s[0] + np.arange(0.0, advance.until_s, 0.1))
+    known = [nodes[:, :2] for row in rows.tolist() if (nodes := record.nodes_w(row)) is not None]
+    margins = [form_closure_margin(*contacts_beside(nodes, radius_m, outlines), half_m) for nodes in known]
+    return sum(margin > 0.0 for margin in margins) / len(margins) if margins else None
 
 
 def _planning_share(record: RunRecord, advance: Advance) -> float | None:

@@ -1,4 +1,4 @@
-"""How well contacts hold a body whose joints hold: the margin of first-order form closure, in the plane. Pure.
+"""Whether obstacles hold a body whose joints hold: first-order form closure, in the plane, without friction. Pure.
 
 A contact with place o and normal n allows the twists x for which w.x >= 0, with w = [n ; o x n / l]. Contacts close
 the form when they allow no twist at all. Where they allow some, then also one that leaves two of them alone, as a turn
@@ -7,27 +7,39 @@ body turn about its pole; the margin is the least, over all pairs, of -(max w_k.
 closed.
 """
 
-from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 
-from snakesim_hal.wire.messages import WorldContact
+from snakesim_hal.arrays import Floats
+from snakesim_hal.model.outlines import Outlines
 
+REACH_M = 0.02  # an obstacle so near to the body counts
 SINGULAR = 1e-6  # |x| of two contacts whose normals are on one line
+SHARES = (np.arange(5) + 0.5) / 5  # of a link: where it is held against obstacles
 
 
-def form_closure_margin(contacts: Sequence[WorldContact], length_m: float) -> float:
-    """Without unit, between -1 and 1; 0: fewer than four contacts, which cannot close it. length_m: l, of moments."""
-    if len(contacts) < 4:
+def contacts_beside(nodes_w: Floats, radius_m: float, outlines: Outlines) -> tuple[Floats, Floats]:
+    """Places and normals (k, 2) of the obstacles beside a chain with nodes (n, 2): each where it is nearest."""
+    rear, run = nodes_w[:-1, None], np.diff(nodes_w, axis=0)[:, None]
+    points = (rear + SHARES[:, None] * run).reshape(-1, 2)
+    gaps_m = outlines.distance_m(points) - radius_m
+    nearest = gaps_m.argmin(axis=0)
+    which = np.flatnonzero(gaps_m[nearest, np.arange(len(outlines))] < REACH_M)
+    at = points[nearest[which]]
+    _, normals = outlines.towards(at, which)
+    return at - radius_m * normals, normals
+
+
+def form_closure_margin(places_w: Floats, normals_w: Floats, length_m: float) -> float:
+    """Without unit, at most 1, of contacts (k, 2); 0: fewer than four, which close nothing. length_m: l, of moments."""
+    if len(places_w) < 4:
         return 0.0
-    places = np.array([contact.position_w[:2] for contact in contacts])
-    normals = np.array([contact.normal_w[:2] for contact in contacts])
-    arms = (places - places.mean(axis=0)) / length_m
-    wrenches = np.column_stack([normals, arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]])
-    first, second = np.array(list(combinations(range(len(contacts)), 2))).T
+    arms = (places_w - places_w.mean(axis=0)) / length_m
+    wrenches = np.column_stack([normals_w, arms[:, 0] * normals_w[:, 1] - arms[:, 1] * normals_w[:, 0]])
+    first, second = np.array(list(combinations(range(len(wrenches)), 2))).T
     twists = np.cross(wrenches[first], wrenches[second])
-    sizes = np.hypot(np.hypot(*twists[:, :2].T), twists[:, 2])
+    sizes = np.linalg.norm(twists, axis=1)
     turns = (twists[sizes > SINGULAR] / sizes[sizes > SINGULAR, None]) @ wrenches.T
     turns[np.abs(turns) < SINGULAR] = 0.0  # the pair's own
-    return float(np.min(-turns.max(axis=1) * turns.min(axis=1), initial=1.0)) if len(turns) else 0.0
+    return float(np.min(-turns.max(axis=1) * turns.min(axis=1))) if len(turns) else 0.0

@@ -118,7 +118,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     form_closure: Annotated[
         float | None,
-        _number("1", "median margin of form closure of what was felt until then; above 0: contacts hold a stiff body"),
+        _number("1", "share of the time until then in which obstacles within 2 cm would hold a stiff body"),
     ] = None
     planning_share: Annotated[
         float | None, _number("1", "share of navigation's turns until then in which it searched for a path")

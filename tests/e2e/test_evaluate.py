@@ -126,7 +126,7 @@ def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> No
     assert done(out) == CASES and all((out / name).is_file() for name in TABLES)
     scores = json.loads((out / "card.json").read_bytes())["scores"]
     assert all(0 < score["medians"]["planning_share"] <= 1 for score in scores)
-    assert all(-1 <= score["medians"]["form_closure"] <= 1 for score in scores)
+    assert all(0 <= score["medians"]["form_closure"] <= 1 for score in scores)
 
 
 @pytest.mark.slow

@@ -3,23 +3,15 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import WorldContact
-from snakesim_operator.results.form_closure import form_closure_margin
+from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.wire.messages import Obstacle
+from snakesim_operator.results.form_closure import contacts_beside, form_closure_margin
 
 
-def touched(*places_and_normals: tuple[float, float, float, float]) -> list[WorldContact]:
-    return [
-        WorldContact(
-            link=0,
-            obstacle=None,
-            body_s_m=0.0,
-            position_w=(x, y, 0.0),
-            normal_w=(nx, ny, 0.0),
-            tangent_w=(-ny, nx, 0.0),
-            force_w=(0.0, 0.0, 0.0),
-        )
-        for x, y, nx, ny in places_and_normals
-    ]
+def margin(contacts: object, length_m: float) -> float:
+    """contacts: a row each, place and normal."""
+    rows = np.array(contacts, dtype=float).reshape(-1, 4)
+    return form_closure_margin(rows[:, :2], rows[:, 2:], length_m)
 
 
 # A square of 0.2 m, touched on each side beside its middle, so that none of its turns is free.
@@ -28,21 +20,31 @@ HELD = ((0.1, 0.05, -1, 0), (-0.1, -0.05, 1, 0), (0.05, -0.1, 0, 1), (-0.05, 0.1
 
 def test_a_square_that_cannot_turn_is_held_until_one_contact_is_gone() -> None:
     wound = [*HELD[:2], (-0.05, -0.1, 0, 1), (0.05, 0.1, 0, -1)]  # two contacts turn it one way, two the other way
-    assert form_closure_margin(touched(*wound), 0.1) > 0.05
-    assert form_closure_margin(touched(*HELD), 0.1) <= 0.0  # all four turn it the same way
+    assert margin(wound, 0.1) > 0.05
+    assert margin(HELD, 0.1) <= 0.0  # all four turn it the same way
     for gone in range(4):
-        assert form_closure_margin(touched(*wound[:gone], *wound[gone + 1 :]), 0.1) <= 0.0
+        assert margin([*wound[:gone], *wound[gone + 1 :]], 0.1) <= 0.0
 
 
 def test_a_body_between_two_walls_may_slide_along_them() -> None:
-    assert form_closure_margin(touched(*((x, y, 0, -10 * y) for x in (-0.4, 0.0, 0.4) for y in (-0.1, 0.1))), 0.5) <= 0
+    assert margin([(x, y, 0, -10 * y) for x in (-0.4, 0.0, 0.4) for y in (-0.1, 0.1)], 0.5) <= 0
 
 
 def test_pegs_on_both_sides_of_a_wave_hold_it_wherever_it_lies() -> None:
     normals = np.repeat([[-0.6, 0.8], [0.6, 0.8], [-0.6, 0.8]], 2, axis=0) * np.resize([[1.0], [-1.0]], (6, 1))
     places = np.repeat([[0.0, 0.0], [0.3, 0.0], [0.6, 0.0]], 2, axis=0) - 0.04 * normals
-    held = form_closure_margin(touched(*np.column_stack([places, normals]).tolist()), 0.5)
+    held = form_closure_margin(places, normals, 0.5)
     assert held > 0.05
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    moved = np.column_stack([places @ turn.T + (3.0, -2.0), normals @ turn.T])
-    assert form_closure_margin(touched(*moved.tolist()), 0.5) == pytest.approx(held)
+    assert form_closure_margin(places @ turn.T + (3.0, -2.0), normals @ turn.T, 0.5) == pytest.approx(held)
+
+
+def test_an_obstacle_counts_once_where_it_is_nearest_to_the_body() -> None:
+    pegs = [
+        Obstacle(name=f"{x} {y}", shape="cylinder", position_w=(x, y, 0.1), radius_m=0.05)
+        for x, y in ((0.3, 0.105), (0.55, -0.1), (0.8, 0.2))
+    ]
+    chain = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
+    places, normals = contacts_beside(chain, 0.04, Outlines.of(pegs))
+    assert places == pytest.approx(np.array([[0.3, 0.04], [0.55, -0.04]]), abs=0.011)
+    assert normals == pytest.approx(np.array([[0.0, -1.0], [0.0, 1.0]]), abs=0.11)
