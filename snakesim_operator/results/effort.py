@@ -65,8 +65,9 @@ def _form_closure(record: RunRecord, advance: Advance) -> float | None:
     outlines = Outlines.of([placed.obstacle for placed in record.placed if not placed.walkable])
     if not len(outlines):
         return 0.0
-    rows = np.searchsorted(record.time_s, record.time_s[0] + np.arange(0.0, advance.until_s, 0.1))
-    known = [nodes[:, :2] for row in rows.tolist() if (nodes := record.nodes_w(row)) is not None]
+    last = int(np.searchsorted(record.time_s, record.time_s[0] + advance.until_s))
+    rows = range(0, last, max(round(0.1e9 / record.description.period_ns), 1))
+    known = [nodes[:, :2] for row in rows if (nodes := record.nodes_w(row)) is not None]
     margins = [form_closure_margin(*contacts_beside(nodes, radius_m, outlines), half_m) for nodes in known]
     return sum(margin > 0.0 for margin in margins) / len(margins) if margins else None
 
