@@ -29,7 +29,7 @@ MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the 
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
 LEADS_M, LEADS_S = 0.05, 3.0  # nearer to the goal within this time; a wave that does less leads nowhere
 PUSHED_M = 0.1  # a body that has come so far since the last search has come on by pushing
-SLOWER = 2.0
+SLOWER = 2.0  # times as long takes what the first wave of such a body does
 TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
 
 

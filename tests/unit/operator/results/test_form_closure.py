@@ -14,14 +14,14 @@ def margin(contacts: object, length_m: float) -> float:
     return form_closure_margin(rows[:, :2], rows[:, 2:], length_m)
 
 
-# A square of 0.2 m, touched on each side beside its middle, so that none of its turns is free.
-HELD = ((0.1, 0.05, -1, 0), (-0.1, -0.05, 1, 0), (0.05, -0.1, 0, 1), (-0.05, 0.1, 0, -1))
+# A square of 0.2 m, touched on each side beside its middle: it cannot shift, and may turn one way.
+TURNS = ((0.1, 0.05, -1, 0), (-0.1, -0.05, 1, 0), (0.05, -0.1, 0, 1), (-0.05, 0.1, 0, -1))
 
 
 def test_a_square_that_cannot_turn_is_held_until_one_contact_is_gone() -> None:
-    wound = [*HELD[:2], (-0.05, -0.1, 0, 1), (0.05, 0.1, 0, -1)]  # two contacts turn it one way, two the other way
+    wound = [*TURNS[:2], (-0.05, -0.1, 0, 1), (0.05, 0.1, 0, -1)]  # two contacts turn it one way, two the other way
     assert margin(wound, 0.1) > 0.05
-    assert margin(HELD, 0.1) <= 0.0  # all four turn it the same way
+    assert margin(TURNS, 0.1) <= 0.0  # all four turn it the same way
     for gone in range(4):
         assert margin([*wound[:gone], *wound[gone + 1 :]], 0.1) <= 0.0
 
