@@ -180,7 +180,7 @@ class SimBackend:
         angles_rad, velocities_rad_s = of_joints(data, self._motors.count)
         contacts = [
             TrueContact(t.body - sim.first_link_body, t.obstacle, *map(np.array, (t.position_w, t.normal_w, t.force_w)))
-            for t in TouchReader(sim, data).read()
+            for t in TouchReader(sim, data, self._physics).read()
         ]
         return TrueState(
             time_s=data.time,

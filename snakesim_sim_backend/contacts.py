@@ -12,6 +12,9 @@ import mujoco
 
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.physics import Physics
+
+NO_FORCE = (0.0, 0.0, 0.0)
 
 
 class Touch(NamedTuple):
@@ -27,57 +30,34 @@ class Touch(NamedTuple):
 class TouchReader:
     """Finds the contacts in a simulation's data."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
-        self._data, self._contact = data, data.contact
+    def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
+        self._contact, self._made = data.contact, physics.contacts
         self._obstacles = sim.obstacle_of_geom
         self._struck = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
         self._bodies: list[int] = sim.model.geom_bodyid.tolist()
 
     def read(self) -> Iterator[Touch]:
         """All contacts, in MuJoCo's order."""
-        struck, contact = self._struck, self._contact
-        pairs = contact.geom.tolist()
-        found = [i for i, (first, second) in enumerate(pairs) if (first in struck) != (second in struck)]
+        struck, made = self._struck, self._made
+        found = [i for i, (first, second) in enumerate(made.pairs) if (first in struck) != (second in struck)]
         if not found:
             return
         # Whole columns at once: a view of each contact would cost more.
-        frames, places = contact.frame.tolist(), contact.pos.tolist()
-        starts, sizes = contact.efc_address.tolist(), contact.dim.tolist()
+        frames, places = self._contact.frame.tolist(), self._contact.pos.tolist()
         for i in found:
-            first, second = pairs[i]
-            forces = self._data.efc_force[starts[i] : starts[i] + sizes[i]].tolist()
+            first, second = made.pairs[i]
             link, obstacle, sign = (second, first, 1.0) if first in struck else (first, second, -1.0)
-            yield self._touch(frames[i], places[i], forces, link, self._obstacles[obstacle], sign)
+            x, y, z = (sign * along for along in frames[i][:3])  # MuJoCo's is from the first geom to the second
+            push_n, (fx, fy, fz) = made.push_n[i], made.rub_w.get(i, NO_FORCE)
+            force_w = (fx + push_n * x, fy + push_n * y, fz + push_n * z)
+            yield Touch(self._bodies[link], self._obstacles[obstacle] or "", tuple(places[i]), (x, y, z), force_w)
 
     def sizes_n(self) -> dict[object, float]:
         """Size of the force between each link and each obstacle that it touches; for every physics step, so quick."""
-        contact = self._contact
-        if not len(contact):
-            return {}
         found: dict[object, float] = {}
-        forces = self._data.efc_force
-        rows = zip(contact.geom.tolist(), contact.efc_address.tolist(), contact.dim.tolist(), strict=True)
-        for (first, second), start, size in rows:
-            if start >= 0 and (first in self._struck) != (second in self._struck):
-                push_n = float(forces[start])
-                if size > 1:
-                    push_n = math.hypot(push_n, forces[start + 1], forces[start + 2])
-                found[first, second] = found.get((first, second), 0.0) + push_n
+        rub_w, struck = self._made.rub_w, self._struck
+        for i, ((first, second), push_n) in enumerate(zip(self._made.pairs, self._made.push_n, strict=True)):
+            if push_n > 0.0 and (first in struck) != (second in struck):
+                size_n = math.hypot(push_n, *rub_w[i]) if i in rub_w else push_n
+                found[first, second] = found.get((first, second), 0.0) + size_n
         return found
-
-    def _touch(
-        self, frame: list[float], place: list[float], forces: list[float], link: int, obstacle: str | None, sign: float
-    ) -> Touch:
-        """MuJoCo's frame has the normal from the first geom to the second, then two tangents, as rows.
-
-        sign: 1 if that is from the obstacle into the body, -1 if the other way round.
-        """
-        nx, ny, nz, ax, ay, az, bx, by, bz = frame
-        x, y, z = place
-        push, *rub = forces
-        push *= sign
-        fx, fy, fz = push * nx, push * ny, push * nz
-        if rub:
-            a, b = sign * rub[0], sign * rub[1]
-            fx, fy, fz = fx + a * ax + b * bx, fy + a * ay + b * by, fz + a * az + b * bz
-        return Touch(self._bodies[link], obstacle or "", (x, y, z), (sign * nx, sign * ny, sign * nz), (fx, fy, fz))

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
+from snakesim_sim_backend.chain import Chain
 
 SINK_M = 2e-4  # of a foot under its share of the weight
 MAX_PHASE = 0.7  # of that spring's vibration in one physics step; long steps get softer ground
@@ -50,10 +51,10 @@ def soles_of(model: mujoco.MjModel, first_body: int, links: int, radius_m: float
 class FlatGround:
     """The ground at height 0 of one simulation. `apply` comes between `mj_step1` and `mj_step2`."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, soles: Soles) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, soles: Soles) -> None:
         gravity, step_s = -float(model.opt.gravity[2]), float(model.opt.timestep)
         sink_m = max(SINK_M, gravity * (step_s / MAX_PHASE) ** 2)
-        self.friction = soles.friction
+        self._friction, self.least = soles.friction, 0.0  # least: while a robot settles
         self.push_n = np.zeros(len(soles.geoms))  # on every foot, in the last step
         self._geoms, self._radius_m, self._step_s = soles.geoms, soles.radius_m, step_s
         self._stiffness = soles.shares_kg * gravity / sink_m  # N/m
@@ -61,8 +62,7 @@ class FlatGround:
         first, count = soles.first_body, len(soles.geoms)
         self._bodies = np.minimum(np.arange(count) + first, first + count - 2)
         self._positions, self._velocities = data.geom_xpos, data.cvel
-        dofs = 6 + count - 2  # of the base and the joints
-        self._reference, self._axes, self._out = data.subtree_com[first], data.cdof[:dofs], data.qfrc_passive[:dofs]
+        self._reference, self._chain = data.subtree_com[first], chain
         kept = data.userdata[: KEPT * count].reshape(KEPT, count)
         self._slip, self._before = kept[:2].reshape(-1).view(np.complex128), kept[2:]
 
@@ -81,7 +81,7 @@ class FlatGround:
         slipped = moved[0] + 1j * moved[1] + rolled_m * (1j * turning[:, 0] - turning[:, 1])
         # N = k depth - d (dz/dt), and never a pull
         self.push_n = push = np.maximum(self._stiffness * (self._radius_m - z) - self._damping * moved[2], 0.0)
-        most = self.friction * push
+        most = max(self._friction, self.least) * push
         slip = self._slip
         slip += slipped
         slip *= np.minimum(1.0, most / np.maximum(self._stiffness * np.abs(slip), 1e-12))
@@ -100,6 +100,5 @@ class FlatGround:
                 push,
             )
         )
-        beyond = wrenches[:, ::-1].cumsum(axis=1)[:, ::-1]  # a joint turns all that is nearer to the head
-        self._out[:6] += np.einsum("ij,j->i", self._axes[:6], beyond[:, 0])
-        self._out[6:] += np.einsum("ij,ji->i", self._axes[6:], beyond[:, 1:-1])
+        wrenches[:, -2] += wrenches[:, -1]  # both feet of the head's link
+        self._chain.push_links(wrenches[:, :-1])

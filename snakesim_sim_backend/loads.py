@@ -7,6 +7,7 @@ import mujoco
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.frames import into
 
 Sums = tuple[float, float, float, float, float, float, float]
@@ -15,8 +16,8 @@ Sums = tuple[float, float, float, float, float, float, float]
 class LoadReader:
     """Adds up the contacts in a simulation's data."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
-        self._touches = TouchReader(sim, data)
+    def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
+        self._touches = TouchReader(sim, data, physics)
         self._first_body = sim.first_link_body
         self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
 

@@ -22,17 +22,18 @@ from snakesim_hal.model.scene import Placed
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
+from snakesim_sim_backend.chain import FREE_DOFS
+from snakesim_sim_backend.contact_friction import numbers_kept
 from snakesim_sim_backend.flat_ground import KEPT, Soles, soles_of
-from snakesim_sim_backend.ground import GROUND, add_ground
+from snakesim_sim_backend.ground import add_ground
 from snakesim_sim_backend.imu import add_imus
-from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
+from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle, geom_name
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.surface import PairSurface, link_skin, pair_surface
+from snakesim_sim_backend.surface import Skin, skin
 from snakesim_sim_backend.tether import add_tether
 from snakesim_sim_backend.yielding import FREEDOMS, check_yielding
 
 FREE_QPOS = 7  # of the base: position and quaternion
-FREE_DOFS = 6
 CLAMP_KG = 1e6  # as rotor inertia and as damping, of all six degrees of freedom
 FOOT_GROUP = 3  # MuJoCo geom group of the feet, which are inside of the links' capsules
 ORANGE = [0.87, 0.45, 0.12, 1.0]  # colour of the robot
@@ -47,7 +48,9 @@ class SimModel:
     steps_per_tick: int
     first_link_body: int  # bodies of the links are consecutive
     obstacle_of_geom: list[str | None]  # (ngeom,); None: link, ground or step
-    soles: Soles | None  # None: MuJoCo has the contacts with the ground, which is not flat
+    soles: Soles | None  # None: MuJoCo finds the contacts with the ground, which is not flat
+    link_geoms: list[int]
+    friction: Floats  # (ngeom,) of what a link touches
     hung: bool  # its tail link is clamped
     yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
 
@@ -70,19 +73,28 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
             f"{2 * step_s:g} s; raise it or lower `timestep_s`"
         )
     spec = mujoco.MjSpec()
-    _set_options(spec, step_s, settings)
+    _set_options(spec, step_s)
     placed = place_all(config)
     yielding = [item for item in placed if item.yields]
     check_yielding(yielding, config.scene.name, step_s)
-    _add_ground(spec, config, settings)
-    add = partial(_add_obstacle, spec, config, settings, strike=bool(yielding))
+    ground, links, hard = config.scene.ground, config.robot.chain.modules + 1, skin(settings)
+    add = partial(
+        add_obstacle,
+        spec,
+        skin=hard,
+        body_radius_m=config.robot.module.radius_m,
+        hills_m=ground.uneven.height_m if ground.uneven else 0.0,
+        strike=bool(yielding),
+    )
+    rough = dict.fromkeys(add_ground(spec, ground, hard), ground.friction)
+    rough |= {geom_name(item): item.friction for item in placed}
     for item in placed:
         if not item.yields:
             add(item)
-    _add_snake(spec, config.robot, settings)
+    _add_snake(spec, config.robot, settings, hard)
     for item in yielding:
         add(item)
-    spec.nuserdata = KEPT * (config.robot.chain.modules + 2) + FREEDOMS * len(yielding)
+    spec.nuserdata = KEPT * (links + 1) + numbers_kept(links) + FREEDOMS * len(yielding)
     if motors:
         check_gains(config.robot)
         for joint in config.robot.joint_table:
@@ -95,12 +107,11 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         model = spec.compile()
     except ValueError as error:
         raise ConfigError(f"MuJoCo cannot build robot {config.robot.name!r} in this scene: {error}") from error
-    first_link_body, ground = model.body("link_0").id, config.scene.ground
-    soles = None
+    first_link_body, soles = model.body("link_0").id, None
     if ground.uneven is None:
-        links = config.robot.chain.modules + 1
         soles = soles_of(model, first_link_body, links, config.robot.module.radius_m, ground.friction)
     names = [model.geom(i).name for i in range(model.ngeom)]
+    rough |= dict.fromkeys((f"link_{i}" for i in range(links)), settings.self_friction)
     obstacles = [name.removeprefix(OBSTACLE) if name.startswith(OBSTACLE) else None for name in names]
     return SimModel(
         model=model,
@@ -108,62 +119,27 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         first_link_body=first_link_body,
         obstacle_of_geom=obstacles,
         soles=soles,
+        link_geoms=[model.geom(f"link_{i}").id for i in range(links)],
+        friction=np.array([rough.get(name, 0.0) for name in names]),
         hung=settings.hung,
         yielding=yielding,
     )
 
 
-def _set_options(spec: mujoco.MjSpec, step_s: float, settings: SimSettings) -> None:
+def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
     spec.compiler.degree = False
     option = spec.option
     option.timestep = step_s
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # damping of the joints is taken implicitly
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would grip less along its diagonals
-    option.impratio = settings.friction_hold
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake; 4.0.0's sparse Newton factor has a defect
     # A diverged run is reported, not silently restarted. One snake is one constraint island.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
-def _add_ground(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings) -> None:
-    """The ground, paired with the links that are added later.
-
-    Level ground supports a chain of capsules only at the spheres around joints and ends. Each sphere is there once,
-    while capsules would have two of them at every joint. Hills, steps and obstacles have contacts with the capsules.
-    Flat ground has no contacts in MuJoCo: see flat_ground.py.
-    """
-    scene, robot = config.scene, config.robot
-    feet = [f"foot_{i}" for i in range(robot.chain.modules + 2)]
-    for name in add_ground(spec, scene.ground):
-        if scene.ground.uneven is None:
-            continue
-        sole = pair_surface(scene.ground.friction, settings, bears_weight=True)
-        _pair(spec, name, feet if name == GROUND else _links(robot), sole)
-
-
-def _add_obstacle(
-    spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, placed: Placed, *, strike: bool
-) -> None:
-    uneven, radius_m = config.scene.ground.uneven, config.robot.module.radius_m
-    hills_m = uneven.height_m if uneven else 0.0
-    rough = add_obstacle(spec, placed, settings, body_radius_m=radius_m, hills_m=hills_m, strike=strike)
-    if rough is not None:
-        _pair(spec, rough, _links(config.robot), pair_surface(placed.friction, settings, bears_weight=placed.walkable))
-
-
-def _links(robot: RobotFile) -> list[str]:
-    return [f"link_{i}" for i in range(robot.chain.modules + 1)]
-
-
-def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: PairSurface) -> None:
-    for other in others:
-        spec.add_pair(geomname1=name, geomname2=other, **with_grip)
-
-
-def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings) -> None:
+def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, hard: Skin) -> None:
+    """Capsules. Flat ground carries them at their feet: spheres at joints and ends, where capsules would have two."""
     lengths, masses, joints = robot.link_lengths_m, robot.link_masses_kg, robot.joint_table
-    skin = link_skin(settings)
     body = spec.worldbody
     for i, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
         rear = [0.0, 0.0, robot.module.radius_m] if i == 0 else [lengths[i - 1], 0.0, 0.0]
@@ -183,7 +159,7 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings) -> 
             fromto=[0.0, 0.0, 0.0, length, 0.0, 0.0],
             mass=mass * settings.mass_scale,
             rgba=ORANGE,
-            **skin,
+            **hard,
         )
         _add_foot(body, f"foot_{i}", 0.0, robot)
     _add_foot(body, f"foot_{len(lengths)}", lengths[-1], robot)

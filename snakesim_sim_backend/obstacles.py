@@ -9,8 +9,7 @@ import numpy as np
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scene import Placed
 from snakesim_sim_backend.ground import GROUND_GROUP, SAND
-from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.surface import frictionless_skin
+from snakesim_sim_backend.surface import Skin
 from snakesim_sim_backend.yielding import AXES, mass_kg
 
 OBSTACLE = "obstacle:"
@@ -29,23 +28,24 @@ class Shape(TypedDict):
     quat: list[float]
 
 
+def geom_name(placed: Placed) -> str:
+    """Of an obstacle."""
+    return f"{STEP if placed.walkable else OBSTACLE}{placed.obstacle.name}"
+
+
 def add_obstacle(
-    spec: mujoco.MjSpec, placed: Placed, settings: SimSettings, *, body_radius_m: float, hills_m: float, strike: bool
-) -> str | None:
+    spec: mujoco.MjSpec, placed: Placed, skin: Skin, *, body_radius_m: float, hills_m: float, strike: bool
+) -> None:
     """Add an obstacle to a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
 
-    Returns the geom's name when it has no contacts with links until it is paired: a walkable or a rough one. A smooth
-    one has contacts with the links by default, which keeps large fields of pegs fast.
     body_radius_m: of the snake; hills_m: from the ground's lowest to its highest point; strike: obstacles meet each
     other, because one of them moves.
     """
-    shape = _shape(placed, body_radius_m, hills_m)
-    name = f"{STEP if placed.walkable else OBSTACLE}{placed.obstacle.name}"
+    shape, name = _shape(placed, body_radius_m, hills_m), geom_name(placed)
     if placed.walkable:
-        spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=GROUND_GROUP, rgba=SAND, **shape)
-        return name
-    rough = placed.friction > 0
-    meets = (0 if rough else LINKS) | (OBSTACLES if strike else 0)
+        spec.worldbody.add_geom(name=name, group=GROUND_GROUP, rgba=SAND, **shape, **skin)
+        return
+    meets = LINKS | (OBSTACLES if strike else 0)
     if not placed.yields:
         body = spec.worldbody
     else:
@@ -62,9 +62,8 @@ def add_obstacle(
         rgba=BLUE,
         mass=mass_kg(placed) if placed.yields else 0.0,
         **shape,
-        **frictionless_skin(settings),
+        **skin,
     )
-    return name if rough else None
 
 
 def _shape(placed: Placed, body_radius_m: float, hills_m: float) -> Shape:

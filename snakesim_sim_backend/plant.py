@@ -60,7 +60,7 @@ class MujocoPlant:
         # Of all constraints MuJoCo lists equalities first, of which there are none, then the friction of the joints.
         self._rubbing = [i for i, joint in enumerate(config.robot.joint_table) if joint.motor.friction_nm > 0]
         self._speeds, self._speeds_before = data.qvel, data.qvel.copy()
-        self._loads = LoadReader(self._sim, data)
+        self._loads = LoadReader(self._sim, data, self._physics)
         self._pose = PoseReader(data, PoseSensor(), np.zeros)
         self._imu = None
         if config.robot.sensors.imu is not None:
@@ -159,6 +159,11 @@ class MujocoPlant:
     def sim(self) -> SimModel:
         """The compiled model."""
         return self._sim
+
+    @property
+    def physics(self) -> Physics:
+        """The steps, and the forces that MuJoCo does not compute."""
+        return self._physics
 
     @property
     def data(self) -> mujoco.MjData:

@@ -28,10 +28,6 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.002
     # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
     contact_time_s: Annotated[float, bounded(1e-4, 0.1, "s")] = 0.005
-    # How fast friction of obstacles, hills and steps brings slip to rest. Short: sliding bodies hop, see surface.py.
-    slip_time_s: Annotated[float, bounded(1e-4, 1, "s")] = 0.03
-    # How much stiffer friction holds than normals push: higher values slide less at rest, and cost time.
-    friction_hold: Annotated[float, bounded(1, 1000, "1")] = 100.0
     # Between links of the snake itself.
     self_friction: Annotated[float, from_zero(5, "1 (Coulomb coefficient)")] = 0.3
     # What the simulated body has, over what the robot file says, which everybody else goes by.

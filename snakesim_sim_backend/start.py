@@ -18,9 +18,7 @@ REST = 1e-3  # m/s and rad/s: slower is at rest
 REST_ROUNDS = 5
 ROUND_S = 0.01
 CLEAR_M = 0.2  # below the head of a hung robot
-# Friction of the ground while settling (sliding, torsion and rolling): the snake stays in place.
-GRIP = np.array([2.0, 2.0, 0.1, 0.1, 0.1])
-ALL_FRICTION = 6  # condim with which all three act
+GRIP = 2.0  # friction while settling, so that the snake stays in place
 
 
 def place_robot(
@@ -86,9 +84,7 @@ def _settle(
     count = motors.count
     limits = [joint.limits.torque_nm for joint in config.robot.joint_table]
     motors.enact(SetPoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
-    friction, condim = model.pair_friction.copy(), model.pair_dim.copy()
-    model.pair_friction[:], model.pair_dim[:] = np.maximum(friction, GRIP), ALL_FRICTION
-    physics.friction = max(flat_friction := physics.friction, GRIP[0])
+    physics.grip(GRIP)
     steps = max(round(ROUND_S / model.opt.timestep), 1)
     at_rest = 0
     for _ in range(round(settle_s / (steps * model.opt.timestep))):
@@ -96,5 +92,4 @@ def _settle(
         at_rest = at_rest + 1 if np.abs(data.qvel).max() < REST else 0
         if at_rest == REST_ROUNDS:
             break
-    model.pair_friction[:], model.pair_dim[:] = friction, condim
-    physics.friction = flat_friction
+    physics.grip(0.0)

@@ -25,7 +25,7 @@ class ContactReader:
     def __init__(
         self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
     ) -> None:
-        self._touches = TouchReader(sim, data)
+        self._touches = TouchReader(sim, data, physics)
         self._first_body = sim.first_link_body
         self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
         self._threshold_n = sensor.threshold_n

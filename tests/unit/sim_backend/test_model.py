@@ -75,25 +75,3 @@ def test_neighbours_pass_through_each_other_and_distant_links_do_not():
     pairs = {tuple(sorted(pair)) for pair in data.contact.geom.tolist() if min(pair) > 0}
     assert pairs
     assert all(second - first > 1 for first, second in pairs)
-
-
-@pytest.mark.parametrize("walls", [[0.0, 0.7], [0.7, 0.0]])
-def test_each_obstacle_has_its_friction(walls):
-    boxes = [
-        {"position_m": [0.5, side * 0.0901], "size_m": [0.4, 0.1, 0.2], "friction": mu}
-        for side, mu in zip((-1, 1), walls, strict=True)
-    ]
-    run = Run(make_config(scene={"box": boxes}), self_friction=2.0)
-    data, model = run.sim.data, run.sim.sim.model
-    seen = set()
-    for aside in (-0.001, 0.001):
-        data.qpos[1] = aside
-        mujoco.mj_forward(model, data)
-        for contact in data.contact:
-            name = next(n for n in (model.geom(g).name for g in contact.geom) if not n.startswith("link"))
-            mu = {"obstacle:box_0": walls[0], "obstacle:box_1": walls[1]}[name]
-            assert contact.dim == (3 if mu else 1)
-            if mu:
-                assert contact.friction[:2] == pytest.approx(mu)
-            seen.add(name)
-    assert seen == {"obstacle:box_0", "obstacle:box_1"}

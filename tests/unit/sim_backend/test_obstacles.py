@@ -39,7 +39,7 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
     """Link 0's rear cap, a sphere of the body's radius, moved in along a line."""
     config = make_config(scene=scene)
     run = Run(config)
-    data, model = run.sim.data, run.sim.sim.model
+    data = run.sim.data
     (placed,) = place_all(config)
     centre = np.array(placed.obstacle.position_w[:2])
     radius = config.robot.module.radius_m
@@ -52,7 +52,7 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
         touching = float(np.interp(radius, gaps, reach[::20]))
         for offset, expected in ((1e-3, 0), (-1e-3, 1)):
             data.qpos[:3] = [*(centre + (touching + offset) * outward), radius]
-            mujoco.mj_forward(model, data)
+            run.sim.physics.forward()
             assert (len(run.sim.true_state().contacts) > 0) == bool(expected)
 
 
@@ -63,7 +63,7 @@ def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
     assert run.sim.data.ncon > 0
     assert run.sim.true_state().contacts == []
     run.sim.data.qpos[7:] = 1.0
-    mujoco.mj_forward(run.sim.sim.model, run.sim.data)
+    run.sim.physics.forward()
     assert run.sim.true_state().contacts == []
 
 

@@ -37,8 +37,8 @@ def pass_time(plant, torque_nm: ArrayLike = 0.0, seconds=0.0):
 
 
 def touches_of(plant):
-    """Link -> (position, force) in the world's frame of every touch by an obstacle, by MuJoCo's own account."""
-    model, data = plant.sim.model, plant.data
+    """Link -> (position, force) in the world's frame of every touch by an obstacle, pushed as MuJoCo says."""
+    model, data, rub_w = plant.sim.model, plant.data, plant.physics.contacts.rub_w
     found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     wrench = np.zeros(6)
     for i in range(data.ncon):
@@ -49,7 +49,8 @@ def touches_of(plant):
         force = data.contact[i].frame.reshape(3, 3).T @ wrench[:3]  # on the second geom
         (which,) = (k for k in (0, 1) if names[k].startswith("link_"))
         link = int(names[which].removeprefix("link_"))
-        found.setdefault(link, []).append((data.contact[i].pos.copy(), force if which else -force))
+        force = (force if which else -force) + rub_w.get(i, 0.0)
+        found.setdefault(link, []).append((data.contact[i].pos.copy(), force))
     return found
 
 

@@ -58,10 +58,10 @@ def test_contacts_in_link_frames_are_the_true_contacts():
     for felt, true in zip(message.contacts, truth, strict=True):
         rotation = rotations[felt.link]
         assert (felt.link, felt.obstacle) == (true.link, true.obstacle) == (2, "post")
-        # Positions are those at the beginning of the last physics step.
-        assert origins[felt.link] + rotation @ felt.position_l == pytest.approx(true.position_w, abs=1e-4)
-        assert rotation @ felt.normal_l == pytest.approx(true.normal_w, abs=1e-3)
-        assert rotation @ felt.force_l == pytest.approx(true.force_w, abs=0.05)
+        # The contact is that at the beginning of the last physics step, in which the link slides and turns on.
+        assert origins[felt.link] + rotation @ felt.position_l == pytest.approx(true.position_w, abs=1e-3)
+        assert rotation @ felt.normal_l == pytest.approx(true.normal_w, abs=5e-3)
+        assert rotation @ felt.force_l == pytest.approx(true.force_w, abs=0.1)
         axes = np.array([felt.normal_l, felt.tangent_1_l, felt.tangent_2_l])
         assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
         assert np.linalg.det(axes) == pytest.approx(1.0)

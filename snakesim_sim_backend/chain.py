@@ -1,0 +1,48 @@
+"""Forces on the links of a simulated snake: collected, and added to MuJoCo's passive ones at once."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.wire.quantities import Vector
+
+FREE_DOFS = 6  # of the base
+
+
+class Chain:
+    """The links of one simulation, tail to head."""
+
+    def __init__(self, data: mujoco.MjData, first_body: int, links: int) -> None:
+        self._first, self._count = first_body, links
+        dofs = FREE_DOFS + links - 1
+        self._about, self._axes, self._out = data.subtree_com[first_body], data.cdof[:dofs], data.qfrc_passive[:dofs]
+        self._wrenches: Floats | None = None
+
+    def push(self, forces_w: Sequence[Vector], places_w: Sequence[Vector], bodies: Sequence[int]) -> None:
+        """Collect forces on bodies."""
+        wrenches = [[0.0] * 6 for _ in range(self._count)]
+        cx, cy, cz = self._about.tolist()
+        for (fx, fy, fz), (x, y, z), body in zip(forces_w, places_w, bodies, strict=True):
+            x, y, z, sums = x - cx, y - cy, z - cz, wrenches[body - self._first]
+            sums[0] += y * fz - z * fy
+            sums[1] += z * fx - x * fz
+            sums[2] += x * fy - y * fx
+            sums[3] += fx
+            sums[4] += fy
+            sums[5] += fz
+        self.push_links(np.array(wrenches).T)
+
+    def push_links(self, wrenches: Floats) -> None:
+        """Collect moments about the centre of mass, and forces, (6, n_links)."""
+        self._wrenches = wrenches if self._wrenches is None else self._wrenches + wrenches
+
+    def apply(self) -> None:
+        """Add what was collected."""
+        if self._wrenches is None:
+            return
+        beyond = self._wrenches[:, ::-1].cumsum(axis=1)[:, ::-1]  # a joint turns all that is nearer to the head
+        self._out[:FREE_DOFS] += np.einsum("ij,j->i", self._axes[:FREE_DOFS], beyond[:, 0])
+        self._out[FREE_DOFS:] += np.einsum("ij,ji->i", self._axes[FREE_DOFS:], beyond[:, 1:])
+        self._wrenches = None
