@@ -26,7 +26,7 @@ from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress, SpeedFilter
-from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
+from snakesim_gnc.control.push import Push, PushFilter, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_hal.arrays import Floats
@@ -43,6 +43,7 @@ STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where
 FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
 ACTS_AFTER_S = 0.03  # command and motor are on their way for so long
 SOFT_REST, SOFT_AFTER_S = 0.03, 0.1  # what may be out of balance of a push with a soft shape, and for how long before
+CREEPS_M_S, SETS_OFF = 0.05, 2.0  # slower than this, the push on obstacles grows so many times as fast
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -83,10 +84,10 @@ class ObstacleAided:
         ] = 0.0
         push_ns_m: Annotated[
             float, from_zero(1000, "N*s/m"), about("push on obstacles for each m/s that the speed is too low")
-        ] = 40.0
+        ] = 25.0
         push_n_m: Annotated[
             float, from_zero(1000, "N/m"), about("push on obstacles for each metre that the body has fallen behind")
-        ] = 120.0
+        ] = 60.0
         largest_push_n: Annotated[float, from_zero(1000, "N"), about("bound of the push along the path")] = 60.0
         largest_torque_nm: Annotated[
             float,
@@ -98,6 +99,9 @@ class ObstacleAided:
         ] = 60.0
         reach_m: Annotated[float, above(1, "m"), about("an obstacle so near to the body is pushed")] = 0.03
         loose_m: Annotated[float, above(1, "m"), about("gap to an obstacle at which a contact counts half")] = 0.005
+        push_filter_s: Annotated[
+            float, above(5, "s"), about("time constant of the filter of how the push is shared among contacts")
+        ] = 0.05
         torque_filter_s: Annotated[
             float, above(5, "s"), about("time constant of the filter of the pushing torques")
         ] = 0.03
@@ -128,7 +132,7 @@ class ObstacleAided:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._felt = FeltContacts()
+        self._felt, self._filter = FeltContacts(), PushFilter(settings.push_filter_s)
         self._bumpless = BumplessReference(robot, settings.blend_s)
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         self._integral_m = 0.0
@@ -163,7 +167,7 @@ class ObstacleAided:
         at = located.on_path.at
         here = self._body.all_angles(at(located.tail_s_m))
         turns_per_m = (self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here) / SLOPE_M
-        torques = scale * self._push_nm(located, turns_per_m, view.period_s)
+        torques = scale * self._push_nm(view, located, turns_per_m)
         if self._soft and self._balanced(view.time_s):
             return self._press(view, located, here, turns_per_m, torques)
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m)) + torques / self._stiffness
@@ -246,18 +250,19 @@ class ObstacleAided:
         self._integral_m = min(max(self._integral_m, -largest_m), largest_m)
         return min(max(self._integral_m + self._set.lead_s * error_m_s, -largest_m), largest_m)
 
-    def _push_nm(self, located: Located, turns_per_m: Floats, period_s: float) -> Floats:
+    def _push_nm(self, view: View, located: Located, turns_per_m: Floats) -> Floats:
         """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
-        config, wanted_m_s = self._set, located.trajectory.speed_m_s
+        config, wanted_m_s, period_s = self._set, located.trajectory.speed_m_s, view.period_s
         if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
             self._push_n = self._force_n = 0.0
             self._last_push = None
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
-        self._push_n += config.push_n_m * error * period_s
+        sooner = SETS_OFF if abs(located.speed_m_s) < CREEPS_M_S else 1.0
+        self._push_n += sooner * config.push_n_m * error * period_s
         self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
         force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
-        self._look(located, turns_per_m)
+        self._look(view.time_s, located, turns_per_m)
         self._push_n = min(self._push_n, self._max_force_n)  # who cannot push stores no force up for later
         self._force_n = force_n = min(force_n, self._max_force_n)
         keep = np.exp(-period_s / config.torque_filter_s)
@@ -265,7 +270,7 @@ class ObstacleAided:
         bound = config.largest_torque_nm
         return np.clip(self._torques_nm, -bound, bound)
 
-    def _look(self, located: Located, turns_per_m: Floats) -> None:
+    def _look(self, time_s: float, located: Located, turns_per_m: Floats) -> None:
         """What the body could push off by the newest world model, and how hard."""
         if not located.fresh:
             return
@@ -274,11 +279,13 @@ class ObstacleAided:
         at, then_s_m = located.on_path.at, located.tail_s_m + ACTS_AFTER_S * located.speed_m_s
         nodes_w = located.nodes_w + at(then_s_m).nodes_w - at(located.measured_s_m).nodes_w
         touches = find_touches(nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction)
-        felt = self._felt.forces_w([located.world.obstacles[k].name for k in touches.obstacle.tolist()])
+        names = [located.world.obstacles[k].name for k in touches.obstacle.tolist()]
+        felt = self._felt.forces_w(names)
         felt_w = np.array(felt).reshape(-1, 2)  # none without a sensor
         dearer = config.empty_price * np.exp(-np.hypot(*felt_w.T) / FELT_N) if felt else 0.0
         turns_per_m = turns_per_m[self._bends]
         push = push_forward(nodes_w, touches, turns_per_m, loose_m=config.loose_m, dearer=dearer)
+        push = self._filter.take(time_s, push, names)
         self._last_push = PushSnapshot(located.world, touches, push)
         self._unit_nm, self._max_force_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))

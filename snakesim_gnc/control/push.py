@@ -11,6 +11,7 @@ all of it and others take it out again. Of all such forces those of least square
 the smallest; a contact's weight grows with its gap.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +55,26 @@ class Push:
     def balanced(self) -> bool:
         """Whether these contacts can push at all."""
         return self.rest < BALANCED and bool((self.lambdas > 0.0).any())
+
+
+class PushFilter:
+    """A low-pass of pushes: noise of the pose moves much force from one contact to another at every look."""
+
+    def __init__(self, filter_s: float) -> None:
+        self._filter_s = filter_s
+        self._time_s, self._lambdas, self._torques_nm, self._rest = -np.inf, dict[str, float](), np.zeros(0), 0.0
+
+    def take(self, time_s: float, push: Push, obstacles: Sequence[str]) -> Push:
+        """The filtered push. obstacles: of its contacts."""
+        kept = float(np.exp((self._time_s - time_s) / self._filter_s))
+        was, new = self._lambdas, 1.0 - kept
+        lambdas = [new * now + kept * was.get(name, 0.0) for name, now in zip(obstacles, push.lambdas, strict=True)]
+        torques_nm, rest = new * push.torques_nm, new * push.rest
+        if kept > 0.0:
+            torques_nm, rest = torques_nm + kept * self._torques_nm, rest + kept * self._rest
+        self._time_s, self._lambdas = time_s, dict(zip(obstacles, lambdas, strict=True))
+        self._torques_nm, self._rest = torques_nm, rest
+        return Push(np.array(lambdas), torques_nm, rest)
 
 
 def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:

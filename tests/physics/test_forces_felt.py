@@ -8,6 +8,7 @@ import snakesim
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.came_true import came_true
 
+ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.peg_friction": 0.3}
 FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
 
 
@@ -18,7 +19,8 @@ FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
         ("triplet", {"backend": "can"}, 0.9, 0.2, 0.05),
         ("peg_row", {}, 0.65, 0.3, 0.05),
         ("peg_row", {"mission.speed_m_s": 0.1}, 0.9, 0.2, 0.05),
-        ("surveyed_clutter", FIELD, 0.6, 0.4, 0.2),
+        ("peg_row", ROUGH, 0.8, 0.23, 0.05),
+        ("surveyed_clutter", FIELD, 0.3, 0.35, 0.15),
     ],
 )
 def test_what_is_asked_of_obstacles_comes_true_while_the_body_moves(

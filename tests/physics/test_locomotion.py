@@ -278,5 +278,5 @@ def test_in_clutter_without_its_search_for_contacts_nothing_but_the_push_moves_i
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")
     alone = (f"control.push_scale={scale}", "control.search_after_s=0")
     whole = run(configure("surveyed_clutter", *field, *alone), duration_s=5.0)
-    assert len(whole.record.trajectories) >= 3
+    assert len(whole.record.trajectories) >= 2
     assert whole.moved_m < 0.1  # pushed as shipped: 1.16 m
