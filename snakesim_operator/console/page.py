@@ -172,7 +172,7 @@ class Page:
         """What a viewer's page shows can be changed until it closes, which may be now: then viser raises."""
         try:
             yield
-        except RuntimeError:
+        except (RuntimeError, KeyError):  # the latter of what stands in a folder that is gone
             if client.client_id in self._server.get_clients():
                 raise
 
