@@ -104,7 +104,7 @@ class ContactFriction:
     def remember(self) -> None:
         """Take up the contacts of the step that was made."""
         if not self._data.ncon:
-            if self.pairs:
+            if self.pairs or self._kept[0]:
                 self._kept[0], self.pairs, self.push_n, self.rub_w = 0.0, [], [], {}
             return
         contact, before = self._contact, self._now
@@ -129,19 +129,10 @@ class ContactFriction:
             key, stretch = float(MOST * pair + nth), NOTHING
             if (was := before.get(key)) is not None:
                 stretch, self.rub_w[i] = was
-            nx, ny, nz = frames[i][:3]  # from the first geom to the second
+            normal = [sign * along for along in frames[i][:3]]  # MuJoCo's is from the first geom to the second
             mass = 1.0 / (owners.count(own) * (looseness[own] + looseness[other]))
-            flat += (
-                key,
-                own,
-                other,
-                mass,
-                max(friction[geom], least) * self.push_n[i],
-                sign * nx,
-                sign * ny,
-                sign * nz,
-            )
-            flat += (*stretch, *self._on_body(own, *places[i]), *self._on_body(other, *places[i]))
+            flat += (key, own, other, mass, max(friction[geom], least) * self.push_n[i], *normal, *stretch)
+            flat += (*self._on_body(own, *places[i]), *self._on_body(other, *places[i]))
         self._kept[1 : 1 + len(flat)] = flat
         self._kept[0] = len(found)
 

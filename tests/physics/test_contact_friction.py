@@ -111,6 +111,22 @@ def test_a_state_that_was_saved_goes_on_as_if_it_had_never_been() -> None:
     assert other.qpos.tolist() == body.data.qpos.tolist()
 
 
+def test_nothing_rubs_any_more_on_a_body_that_is_put_elsewhere_after_its_state_was_restored() -> None:
+    body = Pressed()
+    body.data.qvel[0] = 0.5
+    body.for_s(0.1)
+    other = mujoco.MjData(body.model)
+    mujoco.mj_copyData(other, body.model, body.data)
+    other.xfrc_applied[:] = 0.0
+    other.qpos[1] += 0.01
+    physics = Physics(body.sim, other)
+    physics.step(2)
+    before = float(other.qvel[0])
+    physics.step(50)
+    assert len(other.contact) == 0
+    assert other.qvel[0] == pytest.approx(before, abs=1e-3)
+
+
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_rolled_up_a_snake_whose_links_rub_comes_to_rest(friction: float) -> None:
     config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}}, {"ground": {"friction": 0.0}})
