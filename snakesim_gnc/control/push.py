@@ -62,16 +62,15 @@ class PushFilter:
 
     def __init__(self, filter_s: float) -> None:
         self._filter_s = filter_s
-        self._time_s, self._lambdas, self._torques_nm, self._rest = -np.inf, dict[str, float](), np.zeros(0), 0.0
+        self._time_s, self._lambdas, self._rest = -np.inf, dict[str, float](), 0.0
+        self._torques_nm: Floats | float = 0.0
 
     def take(self, time_s: float, push: Push, obstacles: Sequence[str]) -> Push:
         """The filtered push. obstacles: of its contacts."""
         kept = float(np.exp((self._time_s - time_s) / self._filter_s))
         was, new = self._lambdas, 1.0 - kept
         lambdas = [new * now + kept * was.get(name, 0.0) for name, now in zip(obstacles, push.lambdas, strict=True)]
-        torques_nm, rest = new * push.torques_nm, new * push.rest
-        if kept > 0.0:
-            torques_nm, rest = torques_nm + kept * self._torques_nm, rest + kept * self._rest
+        torques_nm, rest = new * push.torques_nm + kept * self._torques_nm, new * push.rest + kept * self._rest
         self._time_s, self._lambdas = time_s, dict(zip(obstacles, lambdas, strict=True))
         self._torques_nm, self._rest = torques_nm, rest
         return Push(np.array(lambdas), torques_nm, rest)
