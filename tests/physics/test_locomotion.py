@@ -141,7 +141,7 @@ def test_other_noise_gives_the_same_picture(seed):
 # --- triplets that are not neighbours -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("clearance_m", [0.02, 0.05])
+@pytest.mark.parametrize("clearance_m", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushing(clearance_m: float):
     config = configure("triplet")
     route = known(route_of(config.scene))
@@ -220,7 +220,8 @@ def test_each_triplet_is_handed_over_backward():
 
 
 @pytest.mark.parametrize(
-    ("modules", "min_advance_m"), [(8, 0.8), (13, 0.8), pytest.param(30, 0.5, marks=pytest.mark.slow)]
+    ("modules", "min_advance_m"),
+    [(8, 0.8), pytest.param(13, 0.8, marks=pytest.mark.slow), pytest.param(30, 0.5, marks=pytest.mark.slow)],
 )
 def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
     whole = run(configure("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0)

@@ -28,7 +28,7 @@ from tests.whole_run import configure
 PROPULSION_N = 35.0
 PEG_RADIUS_M = 0.05
 RISE_S, HOLD_S = 0.5, 2.5
-WANTED = 10
+WANTED, A_FEW = 10, 4
 
 
 @dataclass(frozen=True)
@@ -161,6 +161,13 @@ def with_shipped(bench: Bench, **more: object) -> Bench:
 
 BENCHES = feasible_benches()
 each_bench = pytest.mark.parametrize("bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in BENCHES])
+a_few_benches = pytest.mark.parametrize(
+    "bench",
+    [
+        pytest.param(bench, id=f"seed{seed}", marks=pytest.mark.slow if k >= A_FEW else ())
+        for k, (seed, bench) in enumerate(BENCHES)
+    ],
+)
 
 
 @each_bench
@@ -170,7 +177,7 @@ def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
     assert force == pytest.approx(bench.solved.forces_n, rel=0.10)
 
 
-@each_bench
+@a_few_benches
 def test_so_they_are_with_shipped_servos_whose_targets_lead_by_the_load(bench: Bench):
     shipped = with_shipped(bench)
     gives_way, _ = settle(shipped)

@@ -130,6 +130,7 @@ def test_a_leaning_peg_is_where_its_foot_is_and_leans_as_far_as_it_says() -> Non
             assert way_m == pytest.approx(0.5 - radius_m, abs=1e-6)
 
 
+@pytest.mark.slow  # posts and blocks alone stand above
 def test_a_snake_gets_on_where_what_it_pushes_holds_and_pushes_away_what_does_not() -> None:
     peg = "scene.pegs_along_route.0."
     fixed, held, pushed = (

@@ -54,7 +54,7 @@ def episode(env: SnakeEnv, seed: int | None = 1, action=wave) -> dict[str, Any]:
     return info
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", [IDS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in IDS[1:])])
 def test_the_checker_of_gymnasium_has_nothing_to_say(name: str) -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -5,12 +5,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parents[2] / "docs" / "families.py"
 LINE = re.compile(
     r"(\w+) +moved ([0-9.]+) m, propulsion joints ([0-9 ]+|none), torque correlation (-?[0-9.]+), complete"
 )
 
 
+@pytest.mark.slow  # each family alone is in tests/contract, several at once in test_mounted_drives.py
 def test_a_controller_gets_as_far_on_every_family_by_the_same_joints() -> None:
     ended = subprocess.run([sys.executable, str(SCRIPT), "2"], capture_output=True, text=True, check=False, timeout=110)
     assert ended.returncode == 0, ended.stderr

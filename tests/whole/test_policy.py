@@ -105,9 +105,7 @@ EPISODES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case", [*list(EPISODES)[:2], *(pytest.param(n, marks=pytest.mark.slow) for n in list(EPISODES)[2:])]
-)
+@pytest.mark.parametrize("case", ["simulator", *(pytest.param(n, marks=pytest.mark.slow) for n in list(EPISODES)[1:])])
 def test_a_policy_sees_as_a_controller_what_it_saw_in_its_environment(tmp_path: Path, case: str) -> None:
     """To the bit: targets that depend on every number of the observation have one digest."""
     env: Any = SnakeEnv(

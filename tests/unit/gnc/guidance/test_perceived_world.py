@@ -2,6 +2,7 @@
 
 import msgspec
 import numpy as np
+import pytest
 
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
@@ -37,6 +38,7 @@ def test_a_field_is_mapped_to_millimetres():
     assert np.median(total.in_sd) < 1.5 and np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be
 
 
+@pytest.mark.slow  # a whole run on hills is in tests/physics/test_locomotion.py
 def test_so_it_is_on_hills():
     total = scored(Drive(random_field(2), ground=hills(0.02, 1.5)), 200)
     assert np.median(total.position_m) < 0.008

@@ -33,6 +33,7 @@ def test_without_a_recording(record: RunRecord) -> None:
     assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
 
 
+@pytest.mark.slow  # the limit of its size holds above, too
 def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
     """Ten runs a minute, for ten minutes."""
     times = 60
