@@ -1,9 +1,7 @@
 """Search for contacts: a body that does not come on moves by waves for a while, to where it may push again.
 
-That it stands is told from the way that its middle has come, not from a speed: with 5 mm of noise in a pose, a speed
-along the path is hardly ever below 1 cm/s for a whole second. Whether contacts would allow a push does not matter: a
-body that they hold does not come on either, and one that could push where it lies mostly stands again a moment later.
-Navigation plans a new path from wherever the wave leads.
+Whether contacts would allow a push does not matter: a body that they hold does not come on either, and one that could
+push where it lies mostly stands again a moment later. Navigation plans a new path from wherever the wave leads.
 
 There are two waves. One feels its way (`felt_wave.py`) and pushes off whatever it meets; where it meets nothing it goes
 backward, because on ground whose friction is the same in every direction a body moves the way that its wave travels.
@@ -15,17 +13,16 @@ speed, which takes less energy; once that has led nowhere, it goes on as fast as
 """
 
 import math
-from collections import deque
 
 import numpy as np
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.felt_wave import FeltWave
+from snakesim_gnc.control.standstill import Standstill
 from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
-MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
 LEADS_M, LEADS_S = 0.05, 3.0  # nearer to the goal within this time; a wave that does less leads nowhere
 PUSHED_M = 0.1  # a body that has come so far since the last search has come on by pushing
@@ -38,13 +35,12 @@ class ContactSearch:
 
     def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
         """after_s: of standing; 0: never."""
+        self._standstill = Standstill(after_s) if after_s > 0.0 else None
         self._after_s, self._for_s = after_s, for_s
         self._felt, self._slow = FeltWave(robot), FeltWave(robot, slower=SLOWER)
         self._to_head = HeadSteeredUndulation(robot, TO_HEAD)
         self._wave: LateralUndulation | None = None  # by which the body moves
-        self._middle_w: Floats | None = None
         self._from_w: Floats | None = None  # where it was when the last search had ended
-        self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
         self._since_s = 0.0  # when the search began
         self._led_s, self._left_m = 0.0, math.inf  # when the wave last led nearer to the goal, and how near that was
         self.changed = False  # a wave has begun or ended at this tick
@@ -81,24 +77,17 @@ class ContactSearch:
         return view.time_s - self._led_s < LEADS_S
 
     def _stands(self, view: View, middle_w: Floats, wanted_m_s: float) -> bool:
-        after_s = self._after_s
-        if after_s == 0.0:
+        if self._standstill is None:
             return False
-        if self._middle_w is None:
-            self._middle_w = middle_w
         if self._from_w is None:
             self._from_w = middle_w
-        self._middle_w = self._middle_w + min(view.period_s / MIDDLE_S, 1.0) * (middle_w - self._middle_w)
-        self._way.append((view.time_s, self._middle_w))
-        while len(self._way) > 1 and view.time_s - self._way[1][0] >= after_s:
-            self._way.popleft()
-        then_s, then_w = self._way[0]
-        stands_m = min(STANDS_M, 0.5 * wanted_m_s * after_s)
-        return view.time_s - then_s >= after_s and float(np.hypot(*(self._middle_w - then_w))) < stands_m
+        stands_m = min(STANDS_M, 0.5 * wanted_m_s * self._after_s)
+        return self._standstill.seen(view.time_s, view.period_s, middle_w, stands_m)
 
     def stop(self) -> None:
         """Not before the body has stood for a while again."""
         if self._wave is not None:
             self._from_w = None
-        self._wave = self._middle_w = None
-        self._way.clear()
+        self._wave = None
+        if self._standstill is not None:
+            self._standstill.forget()

@@ -2,7 +2,8 @@
 
 Lateral undulation is the serpenoid curve: every joint swings by `amplitude_rad`, a phase `lag_rad` behind the one ahead
 of it. Head-steered undulation adds a bend to all joints in proportion to the direction of the path, seen from the head.
-Compliant undulation lets obstacles change the amplitude of the wave: body-shape compliance (Travers et al. 2018).
+Compliant undulation lets obstacles change the amplitude of the wave: body-shape compliance (Travers et al. 2018). It
+may resolve jams: where the body stands, the wave travels the other way for a while.
 """
 
 import math
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.standstill import Standstill
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, above, bounded, from_zero
 
 AIM_M = 1.0  # how far ahead on the path the head steers for
+JAMMED_M = 0.02
 Steering = Annotated[
     float,
     from_zero(2, "1"),
@@ -116,10 +119,31 @@ class CompliantUndulation(HeadSteeredUndulation):
             about("how far the amplitude yields to the torque that obstacles put on the wave"),
         ] = 0.05
         yield_s: Annotated[float, above(10, "s"), about("time constant with which it yields")] = 0.2
+        jam_after_s: Annotated[
+            float,
+            from_zero(1000, "s"),
+            about("in which a jammed body comes no 2 cm on, until its wave travels the other way; 0: never"),
+        ] = 0.0
+        back_s: Annotated[float, above(1000, "s"), about("how long it then does so")] = 1.0
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         super().__init__(robot, settings)
         self._now_rad = settings.amplitude_rad
+        self._back_s = settings.back_s
+        self._jam = Standstill(settings.jam_after_s) if settings.jam_after_s > 0.0 else None
+        self._back_until_s = -math.inf
+
+    def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
+        """Angles of all joints, a time later than before, or earlier while a jam is resolved."""
+        if self._jam is not None and view.world is not None and passed_s > 0.0:
+            if view.time_s < self._back_until_s:
+                passed_s = -passed_s
+            else:
+                middle_w = self._body.nodes_w(view.world, view.joints.angle_rad).mean(axis=1)
+                if self._jam.seen(view.time_s, passed_s, middle_w, JAMMED_M):
+                    self._back_until_s = view.time_s + self._back_s
+                    self._jam.forget()
+        return super().reference_rad(view, passed_s)
 
     def _amplitude_rad(self, view: View, waves: NDArray[np.float64], passed_s: float) -> float:
         config = self._set
@@ -127,5 +151,5 @@ class CompliantUndulation(HeadSteeredUndulation):
         from_outside_nm = -float(waves @ np.array(view.joints.torque_nm)[self._body.bends])
         wanted = config.amplitude_rad + config.softness_rad_per_nm * from_outside_nm
         bounded = min(max(wanted, 0.0), 2.0 * config.amplitude_rad)
-        self._now_rad += (1.0 - math.exp(-passed_s / config.yield_s)) * (bounded - self._now_rad)
+        self._now_rad += (1.0 - math.exp(-abs(passed_s) / config.yield_s)) * (bounded - self._now_rad)
         return self._now_rad

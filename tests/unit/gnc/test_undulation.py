@@ -109,3 +109,18 @@ def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
     views = [stage.view(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)]
     held = [controller.update(view).report.reference_rad for view in views]
     assert all(one == held[0] for one in held)
+
+
+def test_a_jammed_wave_travels_the_other_way_for_a_while_and_one_that_comes_on_does_not() -> None:
+    settings = CompliantUndulation.Settings(softness_rad_per_nm=0.0, steering=0.0, jam_after_s=0.5, back_s=0.3)
+
+    def phases(speed_m_s: float) -> np.ndarray:
+        stage = make_stage()
+        controller = CompliantUndulation(stage.robot, settings)
+        views = [stage.view(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(200)]
+        return np.array([controller.update(view).report.reference_rad for view in views])
+
+    jammed, free = phases(0.0), phases(0.2)
+    assert np.abs(jammed[:50] - free[:50]).max() < 1e-9
+    assert np.abs(jammed[80] - free[20]).max() < 0.05  # 0.5 s on, 0.3 s back
+    assert np.abs(jammed[110] - free[50]).max() < 0.05  # and on again
