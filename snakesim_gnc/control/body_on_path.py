@@ -7,8 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from snakesim_gnc.control.climb import line_height_m
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route, next_on_route
+from snakesim_hal.wire.messages import Rise
 
 SPACING_M = 0.01  # of the rows; the interpolation error is 0.005 rad on paths that bend once in 0.15 m
 CHORD_SPACING_M = 0.005
@@ -31,11 +33,12 @@ class BodyPose:
 class BodyOnPath:
     """Lays one body on one path; results are cached, in rows `SPACING_M` apart.
 
-    segments_m: lengths of the straight pieces between the joints that bend, tail to head.
+    segments_m: lengths of the straight pieces between the joints that bend, tail to head. rises: of the path, which a
+    body climbs: on a ramp a piece is shorter, seen from above.
     """
 
-    def __init__(self, route: Route, segments_m: list[float]) -> None:
-        self.route = route
+    def __init__(self, route: Route, segments_m: list[float], rises: Sequence[Rise] = ()) -> None:
+        self.route, self._rises = route, rises
         self.segments_m = segments_m
         self._bends = len(segments_m) - 1
         self._nodes = len(segments_m) + 1
@@ -111,7 +114,9 @@ class BodyOnPath:
         end = ends.get(k)
         if end is None:
             s = k * CHORD_SPACING_M
-            end = ends[k] = next_on_route(self.route, self.route.at(s), s, length_m)
+            climbed_m = line_height_m(self._rises, s + length_m) - line_height_m(self._rises, s)
+            level_m = math.sqrt(length_m**2 - min(climbed_m**2, 0.5 * length_m**2)) if climbed_m else length_m
+            end = ends[k] = next_on_route(self.route, self.route.at(s), s, level_m)
         return end
 
 

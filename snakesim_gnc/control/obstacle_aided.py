@@ -22,6 +22,7 @@ from msgspec import Meta
 
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.carried import FeltContacts
+from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
@@ -130,7 +131,7 @@ class ObstacleAided:
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
         self._set = settings
-        self._body = PlanarBody(robot)
+        self._body, self._climb = PlanarBody(robot), Climb(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
         self._felt, self._filter = FeltContacts(), PushFilter(settings.push_filter_s)
         self._bumpless = BumplessReference(robot, settings.blend_s)
@@ -157,10 +158,11 @@ class ObstacleAided:
         self._felt.take(located.world)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
+        lifted = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
         middle_w, wanted_m_s = located.nodes_w.mean(axis=1), located.trajectory.speed_m_s
         near = self._last_push is not None and len(self._last_push.touches) > 0
         if (wave := self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near)) is not None:
-            return self._undulate(view, wave)
+            return self._undulate(view, wave, lifted)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
         ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
@@ -168,9 +170,9 @@ class ObstacleAided:
         here = self._body.all_angles(at(located.tail_s_m))
         turns_per_m = (self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here) / SLOPE_M
         torques = scale * self._push_nm(view, located, turns_per_m)
-        if self._soft and self._balanced(view.time_s):
-            return self._press(view, located, here, turns_per_m, torques)
-        reference = self._body.all_angles(at(located.tail_s_m + ahead_m)) + torques / self._stiffness
+        if self._soft and self._balanced(view.time_s) and not lifted.any():
+            return self._press(view, located, here + lifted, turns_per_m, torques)
+        reference = self._body.all_angles(at(located.tail_s_m + ahead_m)) + torques / self._stiffness + lifted
         restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
         if restarted and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
@@ -203,10 +205,10 @@ class ObstacleAided:
             set_points.target[i] = min(max(float(holding_nm[i] + torques_nm[i]), -limit_nm), limit_nm)
         return Action(set_points, self._report(view, located, 0.0, reference))
 
-    def _undulate(self, view: View, wave: LateralUndulation) -> Action:
+    def _undulate(self, view: View, wave: LateralUndulation, lifted: Floats) -> Action:
         """In search of something to push off."""
         self._torques_nm[:] = self._push_n = self._force_n = 0.0
-        reference = wave.reference_rad(view, view.period_s)
+        reference = wave.reference_rad(view, view.period_s) + lifted
         set_points = self._bumpless.to(view, reference, restarted=self._search.changed)
         why = "it does not come on: it moves by a wave, in search of contacts"
         return Action(set_points, Report(why=why, reference_rad=reference.tolist()))

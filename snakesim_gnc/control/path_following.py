@@ -7,6 +7,7 @@ The obstacles turn the change of shape into motion. The reference moves with the
 from typing import Annotated
 
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
+from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Progress, SpeedFilter
@@ -31,7 +32,7 @@ class PathFollowing:
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._set = settings
-        self._body = PlanarBody(robot)
+        self._body, self._climb = PlanarBody(robot), Climb(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
         self._bumpless = BumplessReference(robot, settings.blend_s)
         self._ahead_s_m = 0.0
@@ -47,5 +48,6 @@ class PathFollowing:
         advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
         self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
         reference = self._body.all_angles(located.on_path.at(self._ahead_s_m))
+        reference = reference + self._climb.angles_rad(located.trajectory.rises, self._ahead_s_m)
         set_points = self._bumpless.to(view, reference, restarted=located.restarted)
         return Action(set_points, Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))

@@ -9,6 +9,7 @@ import numpy as np
 
 from snakesim_gnc.control.body_on_path import BodyPose, chain_nodes, heading_of
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
@@ -33,6 +34,7 @@ class PlanarBody:
         self.joint_s_m = np.cumsum(lengths)[:-1]
         self._joint_s: list[float] = self.joint_s_m.tolist()
         self._all_bend = len(self.bends) == len(axes)
+        self._robot, self._node_rows = robot, [0, *(i + 1 for i in self.bends), len(lengths)]
 
     def all_angles(self, body_pose: BodyPose) -> Floats:
         """Angles of all joints, (n_joints,): those that bend as on the path, the others straight."""
@@ -44,6 +46,9 @@ class PlanarBody:
 
     def nodes_w(self, world: World, angles_rad: Sequence[float]) -> Floats:
         """Nodes (2, n_nodes) of the measured body; angles_rad: of all joints, at the instant of the world's pose."""
+        if not self._all_bend:  # a link that is turned up is shorter, seen from above
+            chain_w = nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
+            return chain_w[self._node_rows, :2].T
         bending = [angles_rad[i] for i in self.bends]
         heading = heading_of(world.base_orientation_wxyz)
         return chain_nodes(world.base_position_w[:2], heading, bending, self.segments_m)

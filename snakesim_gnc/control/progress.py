@@ -63,7 +63,7 @@ class Progress:
             return "no world model" if world is None else "no trajectory"
         new_path = self._body is None or trajectory.path_id != self._path_id
         if new_path:
-            self._body = BodyOnPath(Route(trajectory.path_w), self._planar.segments_m)
+            self._body = BodyOnPath(Route(trajectory.path_w), self._planar.segments_m, trajectory.rises)
             self._path_id = trajectory.path_id
         body = self._body
         assert body is not None

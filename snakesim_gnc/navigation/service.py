@@ -1,5 +1,6 @@
 """The navigation process: world model and intent in, `navigation/trajectory` out."""
 
+import msgspec
 import numpy as np
 
 from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_instant_ns
@@ -7,6 +8,7 @@ from snakesim_gnc.navigation.beam import Search
 from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.navigation.intents import Intents
+from snakesim_gnc.navigation.rises import Rises
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, start_of, surveyed
 from snakesim_hal.model.scenario import Service as Schedule
@@ -14,7 +16,7 @@ from snakesim_hal.model.scene import route_of
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description, Intent, JointState, Message, Obstacle, World
+from snakesim_hal.wire.messages import Clock, Description, Intent, JointState, Message, Obstacle, Trajectory, World
 
 NO_ROUTE_LENGTH_M = 100.0
 
@@ -43,6 +45,9 @@ class Navigation(Service):
         self._intents.start_over()
         self._body, self._recent = PlanarBody(robot), RecentAngles()
         known = surveyed(config)
+        climbs = config.mission.map == "known" and any(joint.axis == "pitch" for joint in robot.joints)
+        platforms = surveyed(config, walkable=True) if climbs else []
+        self._rises = Rises([one for one in platforms if one.height_m <= config.mission.largest_climb_m])
         self._along = _along_route(config, known) if config.mission.goal is None else None
         search = Search(
             body_length_m=self._body.length_m,
@@ -67,14 +72,18 @@ class Navigation(Service):
         if self._along is not None and desired.heading_w_rad is None:
             trajectory = self._along.update(clock.tick, world, desired)
             self._planner.follow(self._along.route, trajectory.push_points)
-            return [(keys.TRAJECTORY, trajectory)]
+            return [(keys.TRAJECTORY, self._with_rises(trajectory))]
         if world is None or not self._recent:
             return None
         nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
         trajectory = self._planner.update(clock.tick, world, nodes.T, desired)
         if not self._planner.ready and clock.pace == "lockstep" and clock.arming == 0:
             return None  # time stands until the robot is armed, and nobody arms it before there is a path
-        return [(keys.TRAJECTORY, trajectory)]
+        return [(keys.TRAJECTORY, self._with_rises(trajectory))]
+
+    def _with_rises(self, trajectory: Trajectory) -> Trajectory:
+        rises = self._rises.along(trajectory.path_id, trajectory.path_w)
+        return msgspec.structs.replace(trajectory, rises=rises) if rises else trajectory
 
 
 def _along_route(config: RunConfig, known: list[Obstacle]) -> KnownPath:

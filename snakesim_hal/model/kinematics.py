@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import Vector
 
 
@@ -78,6 +79,14 @@ def link_frames(
         origins[i + 1] = origins[i] + rotations[i][:, 0] * link_lengths_m[i]
         rotations[i + 1] = rotations[i] @ joint_rotation(axis, float(angles_rad[i]))
     return origins, rotations
+
+
+def nodes_w(robot: Description, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats) -> Floats:
+    """Tail end, joints and head end in the world, (joints + 2, 3), of one pose."""
+    lengths_m = [link.length_m for link in robot.links]
+    axes = [joint.axis for joint in robot.joints]
+    origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), angles_rad, axes, lengths_m)
+    return np.vstack([origins, origins[-1] + lengths_m[-1] * rotations[-1][:, 0]])
 
 
 def _yaw_only_frames(

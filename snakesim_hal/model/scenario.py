@@ -71,6 +71,8 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
     # Of obstacles, as navigation reckons with it where it plans, and the controller where it pushes.
     peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
+    # Of a known map: a robot whose joints turn up and down, too, climbs a `step` of the scene up to this height.
+    largest_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1
     # By the pose sensor where there is one; or by joints, IMU, contacts and the map alone.
     localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
 
@@ -375,14 +377,14 @@ def place_all(config: RunConfig) -> list[Placed]:
     return placed
 
 
-def surveyed(config: RunConfig) -> list[Obstacle]:
-    """The obstacles that stand in the way, where the survey has them: off by the map's error."""
-    known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+def surveyed(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
+    """The obstacles that stand in the way, or what a snake may lie on, where the survey has it: off by its error."""
+    known = [placed.obstacle for placed in place_all(config) if placed.walkable == walkable]
     error_m = config.mission.map_error_m
     if error_m == 0.0:
         return known
     found: list[Obstacle] = []
-    errors = np.random.default_rng((config.seed, SURVEY)).normal(0.0, error_m, (len(known), 2))
+    errors = np.random.default_rng((config.seed, SURVEY + walkable)).normal(0.0, error_m, (len(known), 2))
     for obstacle, (off_x, off_y) in zip(known, errors.tolist(), strict=True):
         x, y, z = obstacle.position_w
         found.append(msgspec.structs.replace(obstacle, position_w=(x + off_x, y + off_y, z)))

@@ -716,6 +716,14 @@ class World(Message, frozen=True, kw_only=True):
     ] = None
 
 
+class Rise(Message, frozen=True, kw_only=True):
+    """A stretch of a path that lies on a platform."""
+
+    from_s_m: Annotated[q.Distance, about("where it begins, arc length from the begin of the path")]
+    to_s_m: Annotated[q.Distance, about("where it ends")]
+    height_m: Annotated[q.Distance, about("of the platform's top above the ground")]
+
+
 class Trajectory(Message, frozen=True, kw_only=True):
     """`navigation/trajectory`: path, speed, and the push-points expected along it."""
 
@@ -739,6 +747,11 @@ class Trajectory(Message, frozen=True, kw_only=True):
     goal_w: Annotated[
         tuple[q.Length, q.Length] | None, about("x and y to which the mission leads the head; null: along the path")
     ] = None
+    rises: Annotated[
+        list[Rise],
+        Meta(max_length=64),
+        about("where the path leads over platforms of a map; elsewhere ground is level"),
+    ] = []
 
 
 class ControlState(Message, frozen=True, kw_only=True):

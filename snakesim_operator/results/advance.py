@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_operator.results.record import RunRecord, nodes_w
+from snakesim_operator.results.record import RunRecord
 
 SAMPLE_S = 0.1
 STOOD_M, STOOD_S = 0.02, 1.0  # it stands while the body's centre has moved less than this within this time

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.wire.messages import World
-from snakesim_operator.results.record import RunRecord, nodes_w
+from snakesim_operator.results.record import RunRecord
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import RunConfig, place_all, read
 from snakesim_hal.model.scene import Placed, route_of
@@ -186,11 +186,3 @@ class RunRecord:
         if len(self.time_s) == 0 or not self.posed[row]:
             return None
         return nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])
-
-
-def nodes_w(robot: Description, position_w: Floats, orientation_wxyz: Floats, angle_rad: Floats) -> Floats:
-    """Tail end, joints and head end in the world, (joints + 2, 3), of one pose."""
-    lengths = [link.length_m for link in robot.links]
-    rotation = rotation_from_quaternion(orientation_wxyz)
-    origins, rotations = link_frames(position_w, rotation, angle_rad, [joint.axis for joint in robot.joints], lengths)
-    return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])

@@ -26,6 +26,7 @@ import numpy as np
 from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.carried import FeltContacts
+from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
@@ -63,7 +64,7 @@ class ObstacleTriplet:
     def __init__(self, robot: Description, settings: TripletSettings) -> None:
         self._robot = robot
         self._set = settings
-        self._body = PlanarBody(robot)
+        self._body, self._climb = PlanarBody(robot), Climb(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
         self._hand_over = HandOver(robot)
         self._triplets = Triplets(
@@ -130,7 +131,8 @@ class ObstacleTriplet:
             max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
             followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + max_advance_m)
             body_pose = located.on_path.at(max(followed, s - set_.brake_m))
-        reference = self._body.all_angles(body_pose)
+        lifted = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
+        reference = self._body.all_angles(body_pose) + lifted
         if not len(self._reference):
             self._hand_over.start(view.joints, reference)
         elif located.restarted:
