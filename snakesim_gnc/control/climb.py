@@ -2,7 +2,8 @@
 
 The path gets a height over its arc length: the highest of all platforms' tops, with a ramp before and behind each.
 Every joint takes the bend of that line where it is, so the shape stays in its place in the world while the body slides
-on through it: the head is lifted before the edge, each link follows it, and the tail comes down last. Links are straight and servos give way under the weight of what they lift, so the line is a little higher than the top.
+on through it: the head is lifted before the edge, each link follows it, and the tail comes down last. Links are
+straight and servos give way under the weight of what they lift, so the line is a little higher than the top.
 """
 
 from collections.abc import Sequence
