@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.planar import cross
 from snakesim_hal.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import SHARES, Outlines, nearest_on_chain
 
-SAMPLES = 5  # of each link
 BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head
 BALANCED = 0.05  # share of the force that is left over
 MAX_STEPS = 30
@@ -81,26 +80,22 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     if not len(outlines):
         none = np.empty((0, 2))
         return Touches(np.empty(0, dtype=np.intp), none, none, none, np.empty(0), np.empty(0))
-    rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
+    number, nearest, distances = nearest_on_chain(nodes_w.T, outlines)
+    which = np.flatnonzero(distances - radius_m < reach_m)
+    at, (link, share) = nearest[which], np.divmod(number[which], len(SHARES))
+    run = np.diff(nodes_w, axis=1).T
     lengths = np.hypot(*run.T)
-    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    points = (rear[:, None, :] + share[:, None] * run[:, None, :]).reshape(-1, 2)
-    s = (np.concatenate(([0.0], np.cumsum(lengths)[:-1]))[:, None] + share * lengths[:, None]).ravel()
-    gaps = outlines.distance_m(points) - radius_m
-    best = gaps.argmin(axis=0)
-    which = np.flatnonzero(gaps[best, np.arange(len(outlines))] < reach_m)
-    at = points[best[which]]
     distance, normal = outlines.towards(at, which)
-    tangent = (run / lengths[:, None])[best[which] // SAMPLES]
-    beside = np.abs(np.einsum("ij,ij->i", normal, tangent)) < BUMP
-    keep = np.flatnonzero(beside)
+    tangent = (run / lengths[:, None])[link]
+    keep = np.flatnonzero(np.abs(np.einsum("ij,ij->i", normal, tangent)) < BUMP)
+    body_s_m = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))[link] + SHARES[share] * lengths[link]
     direction = normal - friction * tangent
     return Touches(
         which[keep],
         (at - radius_m * normal)[keep],
         direction[keep],
         tangent[keep],
-        s[best[which]][keep],
+        body_s_m[keep],
         (distance - radius_m)[keep],
     )
 

@@ -17,6 +17,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
+SHARES = (np.arange(5) + 0.5) / 5  # of a link: where it is held against obstacles
 CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
 
 
@@ -109,6 +110,15 @@ def gaps_m(one: Outlines, others: Outlines) -> Floats:
     from_one = others.distance_m(one.rims_w[0]).min(axis=0) - one.rounding_m[0]
     from_others = one.distance_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
     return np.minimum(from_one, from_others)
+
+
+def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Where a chain with nodes (n, 2) is nearest to each outline: which of `SHARES` of all links, point, distance."""
+    rear, run = nodes_w[:-1, None], np.diff(nodes_w, axis=0)[:, None]
+    points = (rear + SHARES[:, None] * run).reshape(-1, 2)
+    distances = outlines.distance_m(points)
+    best = distances.argmin(axis=0)
+    return best, points[best], distances[best, np.arange(len(outlines))]
 
 
 class Capsule(FileStruct, frozen=True, kw_only=True):

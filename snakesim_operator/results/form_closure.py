@@ -12,21 +12,17 @@ from itertools import combinations
 import numpy as np
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import Outlines, nearest_on_chain
 
 REACH_M = 0.02  # an obstacle so near to the body counts
 SINGULAR = 1e-6  # |x| of two contacts whose normals are on one line
-SHARES = (np.arange(5) + 0.5) / 5  # of a link: where it is held against obstacles
 
 
 def contacts_beside(nodes_w: Floats, radius_m: float, outlines: Outlines) -> tuple[Floats, Floats]:
     """Places and normals (k, 2) of the obstacles beside a chain with nodes (n, 2): each where it is nearest."""
-    rear, run = nodes_w[:-1, None], np.diff(nodes_w, axis=0)[:, None]
-    points = (rear + SHARES[:, None] * run).reshape(-1, 2)
-    gaps_m = outlines.distance_m(points) - radius_m
-    nearest = gaps_m.argmin(axis=0)
-    which = np.flatnonzero(gaps_m[nearest, np.arange(len(outlines))] < REACH_M)
-    at = points[nearest[which]]
+    _, nearest, distances = nearest_on_chain(nodes_w, outlines)
+    which = np.flatnonzero(distances - radius_m < REACH_M)
+    at = nearest[which]
     _, normals = outlines.towards(at, which)
     return at - radius_m * normals, normals
 
