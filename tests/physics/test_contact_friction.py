@@ -8,10 +8,9 @@ import pytest
 
 from snakesim_hal.arrays import Floats
 from snakesim_sim_backend.contacts import TouchReader
-from snakesim_sim_backend.model import build
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
-from tests.unit.sim_backend.rig import G, make_config
+from tests.unit.sim_backend.rig import G, lie_down, make_config
 
 MU, PRESS_N = 0.3, 2.0  # of the wall; on each link
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -23,11 +22,8 @@ class Pressed:
     def __init__(self, *, friction: float = MU, step_s: float = 0.002, **wall: Any) -> None:
         wall = {"position_m": [1.0, -0.09], "size_m": [8.0, 0.1, 0.2], "friction": friction, "name": "it"} | wall
         config = make_config(scene={"ground": {"friction": 0.0}, "box": [wall]})
-        self.sim = build(config, SimSettings(timestep_s=step_s), motors=False)
-        self.model, self.data = self.sim.model, mujoco.MjData(self.sim.model)
-        self.data.qpos[2] = config.robot.module.radius_m
-        self.physics = Physics(self.sim, self.data)
-        self.physics.begin()
+        self.sim, self.data, self.physics = lie_down(config, SimSettings(timestep_s=step_s))
+        self.model = self.sim.model
         self._touches = TouchReader(self.sim, self.data, self.physics)
         self.links = len(self.sim.link_geoms)
         first = self.sim.first_link_body
@@ -130,11 +126,7 @@ def test_nothing_rubs_any_more_on_a_body_that_is_put_elsewhere_after_its_state_w
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_rolled_up_a_snake_whose_links_rub_comes_to_rest(friction: float) -> None:
     config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}}, {"ground": {"friction": 0.0}})
-    sim = build(config, SimSettings(self_friction=friction), motors=False)
-    data = mujoco.MjData(sim.model)
-    physics = Physics(sim, data)
-    data.qpos[2], data.qpos[7:] = config.robot.module.radius_m, 0.75
-    physics.begin()
+    _, data, physics = lie_down(config, SimSettings(self_friction=friction), 0.75)
     data.qfrc_applied[6:] = 1.0
     physics.step(3000)
     assert len(data.contact) > 0
@@ -146,11 +138,7 @@ def test_on_a_slope_it_stands_below_the_ground_s_friction_and_slides_above(slope
     """The ground is level but for 10 um, and gravity is turned."""
     uneven = {"height_m": 1e-5, "wavelength_m": 0.8, "area_m": 6.0}
     config = make_config(scene={"ground": {"friction": 0.4, "uneven": uneven}})
-    sim = build(config, SimSettings(), motors=False)
-    data = mujoco.MjData(sim.model)
-    data.qpos[2] = config.robot.module.radius_m
-    physics = Physics(sim, data)
-    physics.begin()
+    sim, data, physics = lie_down(config, SimSettings())
     physics.step(250)
     sim.model.opt.gravity[0] = slope * G
     physics.step(250)

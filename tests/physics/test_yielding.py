@@ -10,10 +10,9 @@ import pytest
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_sim_backend.model import build
-from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.plant import MujocoPlant
 from snakesim_sim_backend.settings import PlantSettings, SimSettings
-from tests.unit.sim_backend.rig import G, make_config
+from tests.unit.sim_backend.rig import G, lie_down, make_config
 from tests.whole_run import configure, run
 
 AT = [3.0, 1.0]
@@ -27,12 +26,8 @@ class Pushed:
 
     def __init__(self, kind: str, obstacle: dict[str, Any], step_s: float = 0.002) -> None:
         config = make_config(scene={kind: [obstacle]})
-        sim = build(config, SimSettings(timestep_s=step_s), motors=False)
-        self._data = mujoco.MjData(sim.model)
-        self._data.qpos[2] = config.robot.module.radius_m
-        self._body = sim.model.body("obstacle:it").id
-        self._physics, self._step_s = Physics(sim, self._data), sim.model.opt.timestep
-        self._physics.begin()
+        sim, self._data, self._physics = lie_down(config, SimSettings(timestep_s=step_s))
+        self._body, self._step_s = sim.model.body("obstacle:it").id, sim.model.opt.timestep
 
     def for_s(self, time_s: float, force_w: tuple[float, float] = (0.0, 0.0), moment_nm: float = 0.0) -> Floats:
         """How far it is from where it stood: x, y in m and a turn in rad, (3,)."""

@@ -3,12 +3,15 @@
 from typing import Any, TypeVar
 
 import msgspec
+from mujoco import MjData
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.files import read_part
 from snakesim_hal.model.scenario import RunConfig, check
 from snakesim_hal.wire.messages import Message, Mode
 from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.model import SimModel, build, of_joints
+from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -91,3 +94,14 @@ class Run:
         for _ in range(max(round(seconds * 1e9 / self.config.period_ns), 1)):
             self.sim.advance()
             self.tick += 1
+
+
+def lie_down(config: RunConfig, settings: SimSettings, angle_rad: float = 0.0) -> tuple[SimModel, MjData, Physics]:
+    """A body without motors on the ground, every joint at this angle."""
+    sim = build(config, settings, motors=False)
+    data = MjData(sim.model)
+    data.qpos[2] = config.robot.module.radius_m
+    of_joints(data, config.robot.chain.modules)[0][:] = angle_rad
+    physics = Physics(sim, data)
+    physics.begin()
+    return sim, data, physics
