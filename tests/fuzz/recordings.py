@@ -143,7 +143,12 @@ def noise(chance: random.Random, content: bytes) -> bytes:
     return MCAP0_MAGIC + chance.randbytes(chance.choice((0, 1, 500, 100_000)))
 
 
-DAMAGES: tuple[Damage, ...] = (flips, cut, hole, swapped, lying_head, foreign, forged, noise)
+def untouched(_chance: random.Random, content: bytes) -> bytes:
+    """Whole: no command may find a loss in it."""
+    return content
+
+
+DAMAGES: tuple[Damage, ...] = (flips, cut, hole, swapped, lying_head, foreign, forged, noise, untouched)
 
 
 @dataclass
