@@ -1,6 +1,7 @@
 """How far the cables of joints without end stops are wound, over restarts: what the next host knows, and refuses."""
 
 import math
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -46,13 +47,19 @@ class Bench:
     def host(self, *angles_rad: float, now_s: float = NOW_S, ends: bool = True) -> list[str]:
         """One that sees joint_2 at these angles of its drive, one after the other; why it does not arm in the end."""
         serials = [msgspec.structs.replace(joint, serial=self.serial) for joint in self.robot.joints]
+        others = writers()
         kept = CableFile(self.folder, self.joints, msgspec.structs.replace(self.robot, joints=serials), now_s)
         for angle_rad in angles_rad:
             kept.take(state(angle_rad))
         against = kept.cables.against_arming()
         if ends:
-            kept.close()
+            kept.close()  # on a computer that stutters a disk may take longer than a host waits for it
+            wait_until(lambda: writers() <= others, "the file, written")
         return against
+
+
+def writers() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.name == "cables"}
 
 
 def state(angle_rad: float) -> JointState:
