@@ -35,7 +35,7 @@ class ContactSearch:
 
     def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
         """after_s: of standing; 0: never."""
-        self._standstill = Standstill(after_s) if after_s > 0.0 else None
+        self._standstill = Standstill(after_s)
         self._after_s, self._for_s = after_s, for_s
         self._felt, self._slow = FeltWave(robot), FeltWave(robot, slower=SLOWER)
         self._to_head = HeadSteeredUndulation(robot, TO_HEAD)
@@ -77,8 +77,6 @@ class ContactSearch:
         return view.time_s - self._led_s < LEADS_S
 
     def _stands(self, view: View, middle_w: Floats, wanted_m_s: float) -> bool:
-        if self._standstill is None:
-            return False
         if self._from_w is None:
             self._from_w = middle_w
         stands_m = min(STANDS_M, 0.5 * wanted_m_s * self._after_s)
@@ -89,5 +87,4 @@ class ContactSearch:
         if self._wave is not None:
             self._from_w = None
         self._wave = None
-        if self._standstill is not None:
-            self._standstill.forget()
+        self._standstill.forget()

@@ -171,7 +171,7 @@ class ObstacleAided:
         turns_per_m = (self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here) / SLOPE_M
         torques = scale * self._push_nm(view, located, turns_per_m)
         if self._soft and self._balanced(view.time_s) and not lifted.any():
-            return self._press(view, located, here + lifted, turns_per_m, torques)
+            return self._press(view, located, here, turns_per_m, torques)
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m)) + torques / self._stiffness + lifted
         restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
         if restarted and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:

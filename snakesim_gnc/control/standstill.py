@@ -16,6 +16,7 @@ class Standstill:
     """Watches the middle of a body for some time."""
 
     def __init__(self, after_s: float) -> None:
+        """after_s: in which it has to stand; 0: it is never seen to."""
         self._after_s = after_s
         self.forget()
 
@@ -26,6 +27,8 @@ class Standstill:
 
     def seen(self, time_s: float, period_s: float, middle_w: Floats, within_m: float) -> bool:
         """Whether the middle, (2,), has moved less than this for as long. To be asked at every tick."""
+        if self._after_s == 0.0:
+            return False
         if self._middle_w is None:
             self._middle_w = middle_w
         self._middle_w = self._middle_w + min(period_s / MIDDLE_S, 1.0) * (middle_w - self._middle_w)

@@ -65,5 +65,4 @@ def _moved_m(record: RunRecord, first: World, last: World) -> float | None:
 
 def _nodes_w(record: RunRecord, world: World) -> Floats:
     angles = record.angle_rad[record.row_at(world.stamp_ns * 1e-9)]
-    base, turn = np.array(world.base_position_w), np.array(world.base_orientation_wxyz)
-    return nodes_w(record.description, base, turn, angles)[:, :2]
+    return nodes_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles)[:, :2]
