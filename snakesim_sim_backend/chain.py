@@ -17,7 +17,15 @@ class Chain:
     def __init__(self, data: mujoco.MjData, first_body: int, links: int) -> None:
         self._first, self._count = first_body, links
         dofs = FREE_DOFS + links - 1
-        self._about, self._axes, self._out = data.subtree_com[first_body], data.cdof[:dofs], data.qfrc_passive[:dofs]
+        self._about, axes, out = data.subtree_com[first_body], data.cdof[:dofs], data.qfrc_passive[:dofs]
+        self._base_axes, self._axes, self._base, self._joints = (
+            axes[:FREE_DOFS],
+            axes[FREE_DOFS:],
+            out[:FREE_DOFS],
+            out[FREE_DOFS:],
+        )
+        self._beyond = np.empty((links, 6))  # head to tail: a joint turns all that is nearer to the head
+        self._whole, self._beyond_joint = self._beyond[-1], self._beyond[-2::-1]
         self._wrenches: Floats | None = None
 
     def push(self, forces_w: Sequence[Vector], places_w: Sequence[Vector], bodies: Sequence[int]) -> None:
@@ -42,7 +50,7 @@ class Chain:
         """Add what was collected."""
         if self._wrenches is None:
             return
-        beyond = self._wrenches[:, ::-1].cumsum(axis=1)[:, ::-1]  # a joint turns all that is nearer to the head
-        self._out[:FREE_DOFS] += np.einsum("ij,j->i", self._axes[:FREE_DOFS], beyond[:, 0])
-        self._out[FREE_DOFS:] += np.einsum("ij,ji->i", self._axes[FREE_DOFS:], beyond[:, 1:])
+        np.add.accumulate(self._wrenches.T[::-1], 0, None, self._beyond)
+        self._base += np.vecdot(self._base_axes, self._whole)
+        self._joints += np.vecdot(self._axes, self._beyond_joint)
         self._wrenches = None

@@ -49,56 +49,73 @@ def soles_of(model: mujoco.MjModel, first_body: int, links: int, radius_m: float
 
 
 class FlatGround:
-    """The ground at height 0 of one simulation. `apply` comes between `mj_step1` and `mj_step2`."""
+    """The ground at height 0 of one simulation. `apply` comes between `mj_step1` and `mj_step2`.
+
+    For so few feet a call of numpy costs more than what it computes, and a step is a millisecond or two. So `apply`
+    makes few calls, on arrays and views that are there already. `_xy`: x and y of a foot, then those of the next, so
+    that a complex number is a vector.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, soles: Soles) -> None:
         gravity, step_s = -float(model.opt.gravity[2]), float(model.opt.timestep)
         sink_m = max(SINK_M, gravity * (step_s / MAX_PHASE) ** 2)
         self._friction, self.least = soles.friction, 0.0  # least: while a robot settles
         self.push_n = np.zeros(len(soles.geoms))  # on every foot, in the last step
-        self._geoms, self._radius_m, self._step_s = soles.geoms, soles.radius_m, step_s
-        self._stiffness = soles.shares_kg * gravity / sink_m  # N/m
-        self._damping = 2.0 * DAMPING * soles.shares_kg * math.sqrt(gravity / sink_m) / step_s  # N per m in one step
-        first, count = soles.first_body, len(soles.geoms)
-        self._bodies = np.minimum(np.arange(count) + first, first + count - 2)
-        self._positions, self._velocities = data.geom_xpos, data.cvel
-        self._reference, self._chain = data.subtree_com[first], chain
-        kept = data.userdata[: KEPT * count].reshape(KEPT, count)
-        self._slip, self._before = kept[:2].reshape(-1).view(np.complex128), kept[2:]
+        self._stiffness = stiffness = soles.shares_kg * gravity / sink_m  # N/m
+        damping = 2.0 * DAMPING * soles.shares_kg * math.sqrt(gravity / sink_m) / step_s  # N per m in one step
+        self._lift, self._lift_damping = -stiffness, -damping
+        self._pull_xy, self._drag_xy = -stiffness.repeat(2), -damping.repeat(2)
+        first, count, both = soles.first_body, len(soles.geoms), 2 * len(soles.geoms)
+        bodies = np.minimum(np.arange(count) + first, first + count - 2)
+        xy, z = np.add.outer(3 * soles.geoms, [0, 1]).ravel(), 3 * soles.geoms + 2
+        self._positions, self._places = data.geom_xpos.reshape(-1), np.concatenate((xy, z))
+        self._twists, self._turning_yx = data.cvel.reshape(-1), np.add.outer(6 * bodies, [1, 0]).ravel()
+        self._rolled_xy = np.tile([-soles.radius_m * step_s, soles.radius_m * step_s], count)  # m for 1 rad/s
+        self._about_xy, self._about_z = data.subtree_com[first, :2, None], data.subtree_com[first, 2:]
+        self._radius_m, self._nothing, self._hardly = (np.full(count, value) for value in (soles.radius_m, 0.0, 1e-12))
+        self._slip_xy, self._before = data.userdata[:both], data.userdata[both : KEPT * count]
+        self._now, self._moved = np.empty(3 * count), np.empty(3 * count)
+        self._slipped_xy, self._rub_xy = np.empty(both), np.empty(both)
+        self._moved_xy, self._sunk, self._height = self._moved[:both], self._moved[both:], self._now[both:]
+        self._slip, self._rub = self._slip_xy.view(np.complex128), self._rub_xy.view(np.complex128)
+        self._rub_by_axis, self._now_by_axis = self._rub_xy.reshape(count, 2).T, self._now[:both].reshape(count, 2).T
+        # What a cross product needs, row by row: arms along x, y, z, x, y; moments, and forces along x, y, z, x, y.
+        self._arms, wrenches = np.empty((5, count)), np.zeros((8, count))
+        self._moments, self._forces, self._wrenches, self._chain = wrenches[:3], wrenches[3:], wrenches[:6], chain
 
     def begin(self) -> None:
         """Take the feet as standing where they are."""
-        self._slip[:] = 0.0
-        self._before[:] = self._positions[self._geoms].T
+        self._slip_xy[:] = 0.0
+        self._before[:] = self._positions[self._places]
 
     def apply(self) -> None:
         """Add the forces on the feet where they are now to MuJoCo's passive forces, which it computes in each step."""
-        x, y, z = now = self._positions.take(self._geoms, axis=0).T
-        turning = self._velocities.take(self._bodies, axis=0)
-        moved = now - self._before
+        now, moved, height, slipped_xy = self._now, self._moved, self._height, self._slipped_xy
+        self._positions.take(self._places, None, now, "clip")
+        np.subtract(now, self._before, moved)
         self._before[:] = now
-        rolled_m = self._radius_m * self._step_s
-        slipped = moved[0] + 1j * moved[1] + rolled_m * (1j * turning[:, 0] - turning[:, 1])
+        self._twists.take(self._turning_yx, None, slipped_xy, "clip")
+        slipped_xy *= self._rolled_xy
+        slipped_xy += self._moved_xy
+        height -= self._radius_m
         # N = k depth - d (dz/dt), and never a pull
-        self.push_n = push = np.maximum(self._stiffness * (self._radius_m - z) - self._damping * moved[2], 0.0)
+        self._sunk *= self._lift_damping
+        self._sunk += self._lift * height
+        self.push_n = push = np.maximum(self._sunk, self._nothing)
         most = max(self._friction, self.least) * push
-        slip = self._slip
-        slip += slipped
-        slip *= np.minimum(1.0, most / np.maximum(self._stiffness * np.abs(slip), 1e-12))
-        rub = self._stiffness * slip + self._damping * slipped
-        rub *= -np.minimum(1.0, most / np.maximum(np.abs(rub), 1e-12))
-        force_x, force_y = rub.real, rub.imag
-        at_x, at_y, at_z = self._reference.tolist()
-        x, y, z = x - at_x, y - at_y, z - self._radius_m - at_z
-        wrenches = np.array(
-            (
-                y * push - z * force_y,
-                z * force_x - x * push,
-                x * force_y - y * force_x,
-                force_x,
-                force_y,
-                push,
-            )
-        )
-        wrenches[:, -2] += wrenches[:, -1]  # both feet of the head's link
-        self._chain.push_links(wrenches[:, :-1])
+        bound = np.maximum(most, self._hardly)
+        self._slip_xy += slipped_xy
+        self._slip_xy *= (most / np.maximum(self._stiffness * np.abs(self._slip), bound)).repeat(2)
+        np.multiply(self._pull_xy, self._slip_xy, self._rub_xy)
+        slipped_xy *= self._drag_xy
+        self._rub_xy += slipped_xy
+        forces, arms, moments = self._forces, self._arms, self._moments
+        np.multiply(self._rub_by_axis, most / np.maximum(np.abs(self._rub), bound), forces[:2])
+        forces[2], forces[3:] = push, forces[:2]
+        np.subtract(self._now_by_axis, self._about_xy, arms[:2])
+        np.subtract(height, self._about_z, arms[2])
+        arms[3:] = arms[:2]
+        np.multiply(arms[1:4], forces[2:], moments)
+        moments -= arms[2:] * forces[1:4]
+        self._wrenches[:, -2] += self._wrenches[:, -1]  # both feet of the head's link
+        self._chain.push_links(self._wrenches[:, :-1])
