@@ -1,7 +1,10 @@
-"""The simulator in this process: with everything published, and as a bare loop of `mj_step`."""
+"""The simulator in this process: with everything published, its physics alone, and MuJoCo alone."""
 
 import time
 from collections.abc import Sequence
+
+import mujoco
+import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.plugins import plugin_settings
@@ -60,17 +63,32 @@ class BareLoop:
 
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
+        self._model, self._data = self._backend.sim.model, self._backend.data
+        self._state = np.empty(mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION))
 
-    def tick_us(self, points: Sequence[SetPoints]) -> float:
-        """Mean time of a control period over these set-points; handing them over is not counted."""
-        physics, steps = self._backend.physics, self._backend.sim.steps_per_tick
-        spent = 0.0
+    def tick_us(self, points: Sequence[SetPoints]) -> tuple[float, float]:
+        """Mean time of a control period over these set-points, and of what of it is MuJoCo's.
+
+        That is measured beside it, from the same states, by `mj_step`: without ground and friction, which are ours.
+        """
+        physics, steps, whole = (
+            self._backend.physics,
+            self._backend.sim.steps_per_tick,
+            mujoco.mjtState.mjSTATE_INTEGRATION,
+        )
+        spent = mujoco_alone = 0.0
         for now in points:
             self._backend.enact(now, "armed")
+            mujoco.mj_getState(self._model, self._data, self._state, whole)
+            begin = time.perf_counter()
+            for _ in range(steps):
+                mujoco.mj_step(self._model, self._data)
+            mujoco_alone += time.perf_counter() - begin
+            mujoco.mj_setState(self._model, self._data, self._state, whole)
             begin = time.perf_counter()
             physics.step(steps)
             spent += time.perf_counter() - begin
-        return spent / len(points) * 1e6
+        return spent / len(points) * 1e6, mujoco_alone / len(points) * 1e6
 
 
 def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
@@ -84,12 +102,12 @@ def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
     return points, sum(whole.update_us) / len(whole.update_us)
 
 
-def sensing(config: RunConfig) -> tuple[list[float], list[float]]:
-    """Per block, the time of a tick (in µs) with all sensors published, and of a tick of bare physics."""
-    full, bare = open_simulator(config), BareLoop(config)
+def sensing(config: RunConfig) -> tuple[list[float], list[float], list[float]]:
+    """Per block, the time of a tick (in µs) with all sensors published, of its physics alone, and of MuJoCo alone."""
+    full, loop = open_simulator(config), BareLoop(config)
     points, _ = motion(config)
-    ours: list[float] = []
-    theirs: list[float] = []
+    published: list[float] = []
+    bare: list[tuple[float, float]] = []
     endpoint = free_endpoint()  # what is published really goes over the wire
     with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
         first = full.sample(0, 0)
@@ -104,11 +122,11 @@ def sensing(config: RunConfig) -> tuple[list[float], list[float]]:
                 publishing.put(tick, full.sample(tick, tick * config.period_ns))
                 full.enact(now, "armed")
                 full.advance()
-            ours.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
-            theirs.append(bare.tick_us(block))
+            published.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
+            bare.append(loop.tick_us(block))
         assert all(reader.drain() for reader in readers), "nobody heard what was published"
     full.close()
-    return ours, theirs
+    return published, [physics for physics, _ in bare], [alone for _, alone in bare]
 
 
 def wire_bytes(config: RunConfig) -> tuple[bytes, bytes]:
