@@ -18,29 +18,25 @@ class Chain:
         self._first, self._count = first_body, links
         dofs = FREE_DOFS + links - 1
         self._about, axes, out = data.subtree_com[first_body], data.cdof[:dofs], data.qfrc_passive[:dofs]
-        self._base_axes, self._axes, self._base, self._joints = (
-            axes[:FREE_DOFS],
-            axes[FREE_DOFS:],
-            out[:FREE_DOFS],
-            out[FREE_DOFS:],
-        )
+        self._base_axes, self._axes = axes[:FREE_DOFS], axes[FREE_DOFS:]
+        self._base, self._joints = out[:FREE_DOFS], out[FREE_DOFS:]
         self._beyond = np.empty((links, 6))  # head to tail: a joint turns all that is nearer to the head
         self._whole, self._beyond_joint = self._beyond[-1], self._beyond[-2::-1]
         self._wrenches: Floats | None = None
 
     def push(self, forces_w: Sequence[Vector], places_w: Sequence[Vector], bodies: Sequence[int]) -> None:
         """Collect forces on bodies."""
-        wrenches = [[0.0] * 6 for _ in range(self._count)]
+        sums = [0.0] * (6 * self._count)
         cx, cy, cz = self._about.tolist()
         for (fx, fy, fz), (x, y, z), body in zip(forces_w, places_w, bodies, strict=True):
-            x, y, z, sums = x - cx, y - cy, z - cz, wrenches[body - self._first]
-            sums[0] += y * fz - z * fy
-            sums[1] += z * fx - x * fz
-            sums[2] += x * fy - y * fx
-            sums[3] += fx
-            sums[4] += fy
-            sums[5] += fz
-        self.push_links(np.array(wrenches).T)
+            x, y, z, at = x - cx, y - cy, z - cz, 6 * (body - self._first)
+            sums[at] += y * fz - z * fy
+            sums[at + 1] += z * fx - x * fz
+            sums[at + 2] += x * fy - y * fx
+            sums[at + 3] += fx
+            sums[at + 4] += fy
+            sums[at + 5] += fz
+        self.push_links(np.array(sums).reshape(-1, 6).T)
 
     def push_links(self, wrenches: Floats) -> None:
         """Collect moments about the centre of mass, and forces, (6, n_links)."""
