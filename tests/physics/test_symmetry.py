@@ -155,6 +155,7 @@ def test_a_reversed_wave_drifts_the_other_way_by_as_much(wave: Wave) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)  # 60 runs, in steps of down to 0.5 ms
 @pytest.mark.parametrize("step_s", [0.0005, 0.001, 0.002])
 def test_twenty_waves_drift_as_their_reverse_does_and_as_at_every_step(step_s: float) -> None:
     sums, differences, speeds = [], [], []
