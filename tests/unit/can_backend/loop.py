@@ -11,6 +11,7 @@ from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_can_backend.settings import CanSettings
+from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.scenario import RunConfig
@@ -79,9 +80,14 @@ class Loop:
     @property
     def plant(self) -> Plant:
         """What the twins' motors move."""
-        (wire,) = self.backend.modules.wires
-        assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
-        return wire.peer.server.chain.plant
+        return chain_of(self.backend).plant
+
+
+def chain_of(backend: CanBackend) -> ModuleChain:
+    """The twins at the other end of its virtual buses."""
+    wire = backend.modules.wires[0]
+    assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
+    return wire.peer.server.chain
 
 
 @contextmanager

@@ -11,13 +11,13 @@ import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
+from tests.unit.can_backend.loop import chain_of
 from tests.unit.hal.rig import run_config
 
 RATED_NM = 4.0
@@ -50,8 +50,7 @@ def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[Rig]:
 def windings(backend: SimBackend | CanBackend) -> Thermal:
     if isinstance(backend, SimBackend):
         return backend._windings
-    assert isinstance(backend.modules.local_twins, InProcessTwins)
-    return backend.modules.local_twins.server.chain.thermal
+    return chain_of(backend).thermal
 
 
 def until_told(rig: Rig, celsius: float) -> None:

@@ -15,14 +15,12 @@ from snakesim_can_backend.driver.module_monitor import CONCERNS_ALL
 from snakesim_can_backend.protocol.commands import command, emergency
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import PASSIVE
-from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.injection import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
-from tests.unit.can_backend.loop import JOINTS, config
+from tests.unit.can_backend.loop import JOINTS, chain_of, config
 
 FAILS = 2  # joint_3
 OTHERS = [i for i in range(JOINTS) if i != FAILS]
@@ -42,12 +40,6 @@ class Lame(Rig):
 
     def inject(self, text: str, *, begins: bool = True) -> None:
         assert self.can.inject(parse(f"{text}@0"), begins=begins)
-
-    @property
-    def chain(self) -> ModuleChain:
-        (wire,) = self.can.modules.wires
-        assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
-        return wire.peer.server.chain
 
     def ask(self, action: Literal["disarm", "clear"]) -> None:
         answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
@@ -142,7 +134,7 @@ def test_one_joint_too_many_stops_all() -> None:
 
 def swallowed(robot: Lame, *joints: int) -> None:
     """Modules fail with a fault that lasts until they are cleared, and a person clears before a period has passed."""
-    chain = robot.chain
+    chain = chain_of(robot.can)
     for joint in joints:
         chain.slots[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
     for _ in range(20):
@@ -212,4 +204,4 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
         robot.wave(3)
         robot.must_be_armed()
         assert robot.states()[FAILS] == ModuleState.DISARMED
-        assert robot.chain.slots[FAILS].module.demand == PASSIVE
+        assert chain_of(robot.can).slots[FAILS].module.demand == PASSIVE

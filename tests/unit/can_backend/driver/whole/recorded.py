@@ -3,13 +3,11 @@
 from collections.abc import Callable
 
 from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire
-from snakesim_can_backend.bus.log import LoggedWire
 from snakesim_can_backend.protocol.definitions import BROADCAST, Action, Frame, ModuleState, Opcode, node_of, opcode_of
 from snakesim_can_backend.twin.firmware import Module
-from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.frames import read
-from tests.unit.can_backend.loop import Loop
+from tests.unit.can_backend.loop import Loop, chain_of
 
 ARMED, DISARMED, EMERGENCY = ModuleState.ARMED, ModuleState.DISARMED, ModuleState.EMERGENCY
 Which = Callable[[Frame], bool]
@@ -74,10 +72,7 @@ def words(frames: list[Frame]) -> list[str]:
 
 
 def module_of(run: Loop, node: int) -> Module:
-    wire = run.backend.modules.wires[0]
-    wire = wire._wire if isinstance(wire, LoggedWire) else wire
-    assert isinstance(wire, RecordedWire) and isinstance(wire.peer, InProcessTwins)
-    return wire.peer.server.chain.slots[node - 1].module
+    return chain_of(run.backend).slots[node - 1].module
 
 
 def go(run: Loop, lifecycle: LifecycleState, ticks: int = 1) -> list[Frame]:

@@ -1,5 +1,6 @@
 """The whole driver on two buses."""
 
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,35 +14,14 @@ from snakesim_can_backend.protocol.commands import question
 from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, node_of, opcode_of
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import TwinServer
+from snakesim_can_backend.twin.server import InProcessTwins, TwinServer
 from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire, go, is_action, is_set_point, words
 from tests.unit.can_backend.loop import Loop, config
 
 # --- several buses -----------------------------------------------------------------------------------------
-
-
-class OneChain:
-    """Twins of one robot on several virtual buses; the first wire that is idle lets them all run."""
-
-    def __init__(self, server: TwinServer) -> None:
-        self.server = server
-        self.closed = False
-
-    def __call__(self) -> float | None:
-        return None if self.closed else self.server.run_due(0)
-
-    def inject(self, injection: Injection, *, begins: bool) -> None:
-        raise NotImplementedError
-
-    def close(self) -> None:
-        if not self.closed:
-            for wire in self.server.wires:
-                wire.close()
-        self.closed = True
 
 
 class NoProcess:
@@ -67,7 +47,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
     real = CanSettings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
-    end = OneChain(TwinServer([VirtualWire(name) for name in channels], chain))
+    end = InProcessTwins(TwinServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
     monkeypatch.setattr(backend_module, "check_channel", lambda _channel: None)
     monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
     monkeypatch.setattr(modules, "TwinProcess", NoProcess)
@@ -76,20 +56,12 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     def open_with(joints: list[int], **settings: Any) -> Loop:
         asked = CanSettings(channels=channels, joints_per_channel=joints, twins="process", **settings)
         opened.append(CanBackend(run, asked))
-        return TwoBusLoop(opened[-1], run)
+        return Loop(opened[-1], run)
 
     yield open_with
     for driver in opened:
         driver.close()
     end.close()
-
-
-class TwoBusLoop(Loop):
-    @property
-    def plant(self) -> Any:
-        wire = WIRES[0]
-        assert isinstance(wire.peer, OneChain)
-        return wire.peer.server.chain.plant
 
 
 def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]) -> None:
