@@ -58,24 +58,18 @@ def test_a_module_that_is_there_twice_is_found_before_anything_is_enabled() -> N
         pass
 
 
-def test_a_passing_fault_is_cleared_by_a_person_and_the_robot_arms_again_where_it_is() -> None:
-    with loop(faults=["leak:joint_1@0.3-0.5"]) as run:
+def test_a_fault_that_persists_is_told_again_after_clearing_and_once_it_has_passed_the_robot_arms_where_it_is() -> None:
+    with loop(faults=["leak:joint_1@0.3-0.8"]) as run:
         run.arm()
         run.run(60, run.waving)
         assert [fault.what for fault in run.faults] == ["module_leak"] and run.lifecycle == "fault"
         run.lifecycle = "disarmed"
+        run.run(20)
+        assert [fault.what for fault in run.faults] == ["module_leak", "module_leak"] and run.lifecycle == "fault"
+        run.lifecycle = "disarmed"
         run.run(10)
-        assert run.states() == [ModuleState.DISARMED] * 4 and len(run.faults) == 1
+        assert run.states() == [ModuleState.DISARMED] * 4 and len(run.faults) == 2
         before = list(run.samples[-1].joints.angle_rad)
         run.wanted = None
         run.arm()
         assert np.allclose(run.samples[-1].joints.angle_rad, before, atol=0.02)
-
-
-def test_a_fault_that_persists_is_told_again_after_clearing() -> None:
-    with loop(faults=["leak:joint_1@0.3"]) as run:
-        run.arm()
-        run.run(60, run.waving)
-        run.lifecycle = "disarmed"
-        run.run(10)
-        assert [fault.what for fault in run.faults] == ["module_leak", "module_leak"]

@@ -27,19 +27,6 @@ def inject(run: Loop, text: str, *, begins: bool = True) -> None:
 # --- modules -------------------------------------------------------------------------------------------------
 
 
-def test_every_module_may_fall_silent_and_come_back() -> None:
-    with loop() as run:
-        armed(run)
-        for joint in range(1, 5):
-            inject(run, f"mute:joint_{joint}")
-        run.run(10, run.waving)
-        assert {fault.what for fault in run.faults} == {"module_silent"}
-        for joint in range(1, 5):
-            inject(run, f"mute:joint_{joint}", begins=False)
-        run.run(5)
-        cleared_and_armed_again(run)
-
-
 def test_what_a_module_cannot_know_the_host_makes() -> None:
     with loop() as run:
         run.run(3)
@@ -103,17 +90,6 @@ def test_a_bus_that_fails_stops_the_joints_and_comes_back(
         assert [fault.what for fault in run.faults] == what + then and run.backend.modules.watch.seen.keys() == counted
         assert run.states() == [ModuleState.FAULT if then else ModuleState.DISARMED] * 4
         cleared_and_armed_again(run)
-
-
-def test_a_queue_that_is_full_for_a_moment_is_counted() -> None:
-    with loop() as run:
-        armed(run)
-        inject(run, "full:bus_1")
-        run.run(2, run.waving)
-        inject(run, "full:bus_1", begins=False)
-        run.run(30, run.waving)
-        assert not run.faults and run.states() == [ModuleState.ARMED] * 4
-        assert run.backend.modules.watch.seen["queue_full"] > 0
 
 
 def test_one_end_of_a_virtual_bus() -> None:

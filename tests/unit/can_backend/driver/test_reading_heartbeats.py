@@ -53,38 +53,22 @@ def test_an_imus_halves_are_of_one_sync() -> None:
 # --- heartbeats --------------------------------------------------------------------------------------------
 
 
-def test_an_uptime_that_goes_back_and_on_from_there_is_a_restart() -> None:
+UPTIMES = {  # s, and how many restarts they are by then
+    "back, and on from there: a restart": [(5.0, 0), (5.1, 0), (5.1, 0), (0.1, 0), (0.2, 1), (0.3, 1)],
+    "and the next restart": [(5.0, 0), (0.1, 0), (0.2, 1), (0.3, 1), (0.1, 1), (0.1, 2), (0.2, 2)],
+    "two clocks in turn: two modules": [(start_s + 0.1 * i, 0) for i in range(20) for start_s in (50.0, 0.0)],
+    "one that comes late": [(5.0, 0), (5.2, 0), (5.1, 0), (5.3, 0), (5.4, 0)],
+}
+
+
+@pytest.mark.parametrize("uptimes", UPTIMES.values(), ids=list(UPTIMES))
+def test_only_an_uptime_that_goes_back_and_on_from_there_is_a_restart(uptimes: list[tuple[float, int]]) -> None:
     made = reading()
-    for uptime_s, restarts in (
-        (5.0, 0),
-        (5.1, 0),
-        (5.1, 0),
-        (0.1, 0),
-        (0.2, 1),
-        (0.3, 1),
-        (0.1, 1),
-        (0.1, 2),
-        (0.2, 2),
-    ):
+    for uptime_s, restarts in uptimes:
         made.take(heartbeat(2, uptime_s))
         assert made.modules[1].restarts == restarts, uptime_s
         assert made.modules[1].uptime_ms == round(uptime_s * 1000)
     assert made.modules[0].restarts == 0
-
-
-def test_two_clocks_in_turn_are_two_modules_and_no_restart() -> None:
-    made = reading()
-    for i in range(20):
-        made.take(heartbeat(2, 50.0 + 0.1 * i))
-        made.take(heartbeat(2, 0.1 * i))
-    assert made.modules[1].restarts == 0
-
-
-def test_a_heartbeat_that_comes_late_is_no_restart() -> None:
-    made = reading()
-    for uptime_s in (5.0, 5.2, 5.1, 5.3, 5.4):
-        made.take(heartbeat(2, uptime_s))
-    assert made.modules[1].restarts == 0
 
 
 def test_a_heartbeat_tells_state_faults_and_reason() -> None:

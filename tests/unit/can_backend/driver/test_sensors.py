@@ -17,7 +17,6 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
 from snakesim_can_backend.twin.reports import touch
 from snakesim_hal.backend import Samples
-from snakesim_hal.drivers.mocap import MocapReceiver
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire import keys
@@ -35,11 +34,9 @@ EVERYTHING: dict[str, Any] = {
 }
 
 
-def sensors_of(
-    run: RunConfig, reports: Reports | None = None, mocap: MocapReceiver | None = None
-) -> tuple[Reading, Sensors]:
+def sensors_of(run: RunConfig, reports: Reports | None = None) -> tuple[Reading, Sensors]:
     reading = Reading(run.robot.chain.modules)
-    return reading, Sensors(run, reports or reports_of(run, CanSettings()), reading, mocap)
+    return reading, Sensors(run, reports or reports_of(run, CanSettings()), reading, None)
 
 
 def contacts_of(samples: Samples) -> Contacts:

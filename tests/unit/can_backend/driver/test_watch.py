@@ -6,14 +6,25 @@ from snakesim_can_backend.driver.module_monitor import ARM_GRACE, CLEAR_GRACE, C
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
-from tests.unit.can_backend.driver.watch_rig import PERIOD_S, WHO, Bench, Speak, faulty, quiet, said
+from tests.unit.can_backend.driver.watch_rig import (
+    HOT,
+    HOT_AND_WET,
+    PERIOD_S,
+    WHO,
+    Bench,
+    Speak,
+    answering,
+    quiet,
+    reporting,
+    said,
+)
 from tests.unit.can_backend.frames import answer, begin, corrupted, heartbeat, joint_state
 
 # --- what one module can do wrong --------------------------------------------------------------------------
 
 
-def frozen() -> Speak:
-    return lambda reading: reading.take(joint_state(2, 2))
+def frozen(reading: Reading) -> None:
+    reading.take(joint_state(2, 2))
 
 
 def miscounting(reading: Reading) -> None:
@@ -37,7 +48,7 @@ def babbling(reading: Reading) -> None:
 
 WRONGS = [
     (quiet, 3, "module_silent", "is silent: no state for 30 ms"),
-    (frozen(), 3, "module_frozen", "is frozen: it repeats its answer number 2 to every Sync"),
+    (frozen, 3, "module_frozen", "is frozen: it repeats its answer number 2 to every Sync"),
     (miscounting, 3, "wrong_counter", "answers Syncs that were not sent: 3 wrong counters in a row"),
     (corrupt, 3, "bad_checksum", "sends corrupt states: 3 wrong checksums in a row"),
     (doubled, 3, "duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id"),
@@ -58,7 +69,7 @@ def test_it_is_named_in_time_with_joint_and_cause_once_and_again_after_a_clearin
     assert bench.ticks(40, speak) == []
 
 
-@pytest.mark.parametrize("speak", [quiet, frozen(), miscounting, corrupt, doubled])
+@pytest.mark.parametrize("speak", [quiet, frozen, miscounting, corrupt, doubled])
 @pytest.mark.parametrize("length", [1, 2])
 def test_glitches_tell_nothing_however_often(speak: Speak, length: int) -> None:
     bench = Bench()
@@ -86,7 +97,7 @@ def test_a_silent_module_whose_heart_beats_is_told_from_a_dead_one() -> None:
     (found,) = bench.ticks(2, quiet)
     assert "it still sends heartbeats" in found.cause
     bench = Bench()
-    bench.tick(lambda reading: (answer(reading, [2]), reading.take(heartbeat(2, 1.0)))[0])
+    bench.tick(reporting())
     (found,) = bench.ticks(3, quiet)
     assert "no heartbeat either: power, cable or reset" in found.cause
 
@@ -139,59 +150,46 @@ def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
 
 
-def test_a_modules_fault_is_told_with_all_reasons() -> None:
-    bench = Bench()
-    reason = "reports overheat, leak; it stopped because of overheat"
-    assert bench.ticks(9, faulty) == [Finding("module_overheat", WHO + reason, 1)]
-
-
 def test_of_a_joint_that_is_set_aside_only_what_concerns_all_is_told() -> None:
     bench = Bench()
     bench.isolated = {1}
-    assert bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.FAULT)) == []
-    (found,) = bench.ticks(9, faulty)  # it leaks, too
+    assert bench.ticks(9, answering(ModuleState.FAULT)) == []
+    (found,) = bench.ticks(9, HOT_AND_WET)
     assert found.what == "module_overheat" and found.joint == 1 and not found.alone
 
 
 def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
-    def emergency(reading: Reading) -> None:
-        answer(reading, [2], state=ModuleState.EMERGENCY)
-        reading.take(heartbeat(2, 1.0, ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1))
-
     bench = Bench()
     bench.isolated = {1}
-    (found,) = bench.ticks(9, emergency)
+    stopped = reporting(ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1)
+    (found,) = bench.ticks(9, stopped)
     assert found.what == "module_overheat" and not found.alone
 
 
-def test_water_after_heat_is_told_again() -> None:
-    def hot(reading: Reading) -> None:
-        answer(reading, [2], state=ModuleState.FAULT)
-        reading.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1))
-
+def test_water_after_heat_is_told_again_with_all_reasons() -> None:
     bench = Bench()
-    (found,) = bench.ticks(9, hot)
+    (found,) = bench.ticks(9, HOT)
     assert found.alone
-    (found,) = bench.ticks(9, faulty)
-    assert not found.alone and "overheat, leak" in found.cause
+    reasons = "reports overheat, leak; it stopped because of overheat"
+    assert bench.ticks(9, HOT_AND_WET) == [Finding("module_overheat", WHO + reasons, 1, alone=False)]
 
 
 def test_a_fault_whose_heartbeat_is_lost_is_told_by_its_state() -> None:
     bench = Bench()
-    found = bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.FAULT))
+    found = bench.ticks(9, answering(ModuleState.FAULT))
     assert said(found) == [("module_fault", 1)]
 
 
 def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
     bench = Bench()
-    bench.tick(faulty)
+    bench.tick(HOT_AND_WET)
     bench.clear()
-    assert bench.ticks(CLEAR_GRACE - 1, faulty) == []
-    bench.tick(lambda reading: (answer(reading, [2]), reading.take(heartbeat(2, 1.0)))[0])
+    assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
+    bench.tick(reporting())
     assert bench.ticks(10) == []
     bench.clear()
-    assert bench.ticks(CLEAR_GRACE - 1, faulty) == []
-    assert said(bench.tick(faulty)) == [("module_overheat", 1)], "and is told again when it stays"
+    assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
+    assert said(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], "and is told again when it stays"
 
 
 @pytest.mark.parametrize(("lifecycle", "reported"), [("estop", []), ("disarmed", [("module_emergency", 1)])])
@@ -200,16 +198,13 @@ def test_an_emergency_is_as_it_should_be_only_in_one(
 ) -> None:
     bench = Bench()
     bench.lifecycle = lifecycle
-    assert said(bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.EMERGENCY))) == reported
+    assert said(bench.ticks(9, answering(ModuleState.EMERGENCY))) == reported
 
 
 def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
-    def refuses(reading: Reading) -> None:
-        answer(reading, [2], state=ModuleState.DISARMED)
-
     bench = Bench()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
-    found = [bench.tick(refuses) for _ in range(20)]
+    found = [bench.tick(answering(ModuleState.DISARMED)) for _ in range(20)]
     first = next(i for i, reported in enumerate(found) if reported)
     assert ARM_GRACE < first <= ARM_GRACE + 3
     assert [f for reported in found for f in reported] == [
@@ -223,7 +218,7 @@ def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:
     assert bench.ticks(ARM_GRACE) == []
     bench.state = ModuleState.ARMED
     assert bench.ticks(10) == []
-    assert bench.ticks(2, lambda reading: answer(reading, [2], state=ModuleState.STOPPING)) == []
+    assert bench.ticks(2, answering(ModuleState.STOPPING)) == []
     assert bench.ticks(10) == []
 
 
@@ -231,7 +226,7 @@ def test_who_was_armed_and_says_that_it_is_not_is_told_at_once() -> None:
     bench = Bench()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     assert bench.ticks(2) == [], "within the grace"
-    found = bench.tick(lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
+    found = bench.tick(answering(ModuleState.DISARMED))
     assert found == [Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, alone=True)]
 
 

@@ -47,13 +47,24 @@ class Bench:
         self.watch.forget(self.reading.sync)
 
 
+def answering(state: ModuleState) -> Speak:
+    """Node 2 answers, in this state."""
+    return lambda reading: answer(reading, [2], state=state)
+
+
+def reporting(state: ModuleState = ModuleState.DISARMED, **told: float) -> Speak:
+    """Node 2 answers in this state, and a heartbeat says more of it."""
+
+    def speak(reading: Reading) -> None:
+        answer(reading, [2], state=state)
+        reading.take(heartbeat(2, 1.0, state, **told))
+
+    return speak
+
+
+HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1)
+HOT_AND_WET = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1)
+
+
 def said(found: list[Finding]) -> list[tuple[str, int | None]]:
     return [(finding.what, finding.joint) for finding in found]
-
-
-# --- faults of modules -------------------------------------------------------------------------------------
-
-
-def faulty(reading: Reading) -> None:
-    answer(reading, [2], state=ModuleState.FAULT)
-    reading.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1))
