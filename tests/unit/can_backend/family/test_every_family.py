@@ -1,4 +1,7 @@
-"""Drivers of every family on CAN against emulated drives in lockstep, with the robot's lifecycle as the host has it."""
+"""Drivers of every family against emulated drives in lockstep, with the robot's lifecycle as the host has it.
+
+Dynamixel, on serial ports, is among them: what only its servos do is in `tests/unit/serial_backend/dynamixel`.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -8,30 +11,39 @@ from typing import Any
 import can
 import pytest
 
-from snakesim_can_backend.family.backend import CanDriveBackend
 from snakesim_can_backend.moteus.backend import MoteusBackend
 from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import State
+from snakesim_hal.drivers.family import FamilyBackend
 from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
 
 JOINTS = 4
 SHOWN = 20  # ticks in which a fault shows: a heartbeat takes ten
+CLEARED = 80  # and in which drives are cleared, some by a restart
 
 
 @dataclass(frozen=True)
 class Family:
     """What a test knows of one."""
 
-    backend: type[CanDriveBackend]
+    backend: type[FamilyBackend]
     drives: Callable[[Any], list[Any]]  # of a twin
     follows: Callable[[Any], bool]  # one of them
-    expired: str  # in the fault of an expired watchdog
+    settings: Callable[[Any, int], object]  # that the drive of a joint of a twin has in force
+    expired: tuple[str, str]  # the fault of an expired watchdog, and what its cause says
     overheated: str
-    unheard: str
-    too_fast_hz: float
+    unheard: str = ""
+    too_fast_hz: float = 0.0
+
+
+def law_of(twin: Any, joint: int) -> tuple[float, float]:
+    """The stiffness and the torque limit of a motor."""
+    return twin.body.motors._kp[joint], twin.body.motors._limit[joint]
 
 
 FAMILIES = {
@@ -39,7 +51,8 @@ FAMILIES = {
         OdriveBackend,
         lambda twin: twin.axes,
         lambda axis: axis.state == State.CLOSED_LOOP,
-        "watchdog_timer_expired",
+        law_of,
+        ("drive_fault", "watchdog_timer_expired"),
         "motor_over_temp",
         "does not say its version: .*another id",
         500,
@@ -48,12 +61,22 @@ FAMILIES = {
         MoteusBackend,
         lambda twin: twin.controllers,
         lambda controller: controller.mode == MoteusMode.POSITION,
-        "its watchdog expired",
+        law_of,
+        ("drive_fault", "its watchdog expired"),
         "fault 38, over-temperature",
         "does not say its register map: .*another id",
         2000,
     ),
+    "dynamixel": Family(
+        DynamixelBackend,
+        lambda twin: twin.servos,
+        lambda servo: servo.on and servo.table[at.WATCHDOG] != at.TRIPPED,
+        lambda twin, joint: (twin.servos[joint].table[at.GAINS : at.GAINS + 6], twin.servos[joint].table[at.WATCHDOG]),
+        ("drive_not_armed", "watchdog"),
+        "overheating",
+    ),
 }
+on_can = pytest.mark.parametrize("family", ["odrive", "moteus"], indirect=True)
 
 
 class Robot(DriveRig):
@@ -73,9 +96,9 @@ class Robot(DriveRig):
         return [self.family.follows(drive) for drive in self.family.drives(self.twin)]
 
 
-@pytest.fixture(params=FAMILIES.values(), ids=list(FAMILIES))
+@pytest.fixture(params=FAMILIES)
 def family(request: pytest.FixtureRequest) -> Family:
-    return request.param
+    return FAMILIES[request.param]
 
 
 @pytest.fixture
@@ -99,12 +122,12 @@ def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_aga
     fault = robot.run(SHOWN, "armed")[0]
     assert (fault.what, fault.joint) == ("drive_fault", "joint_2") and robot.family.overheated in fault.cause
     assert robot.run(50, "fault") == [] and robot.run(50, "estop") == [] and robot.following() == [False] * JOINTS
-    assert [fault.joint for fault in robot.run(SHOWN, "disarmed")] == ["joint_2"], "cleared while it was still hot"
+    assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], "cleared while it was still hot"
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
     robot.twin.body.thermal.winding_c[:] = 20.0
     robot.run(5, "fault")
-    assert robot.run(SHOWN, "disarmed") == []
-    assert robot.run(40, "armed") == [] and robot.joints is not None
+    assert robot.run(CLEARED, "disarmed") == []
+    assert robot.run(60, "armed") == [] and robot.joints is not None
     assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
 
 
@@ -118,8 +141,8 @@ def test_a_drive_that_restarts_in_motion_stays_off_until_the_clear_and_then_has_
     robot.run(40, "armed")
     assert robot.following() == [True] * JOINTS and robot.joints is not None
     assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
-    fresh, other = robot.twin.body.motors, 0
-    assert fresh._kp[2] == fresh._kp[other] and fresh._limit[2] == fresh._limit[other] == 1.0
+    settings = [robot.family.settings(robot.twin, joint) for joint in range(JOINTS)]
+    assert settings[2] == settings[0] and law_of(robot.twin, 2)[1] == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_drive_that_restarts_between_two_ticks_does_not_go_on_as_if_nothing_had_been(
@@ -133,10 +156,11 @@ def test_a_drive_that_restarts_between_two_ticks_does_not_go_on_as_if_nothing_ha
 
 def test_a_joint_that_was_lost_while_armed_is_left_alone_until_it_is_used_again(robot: Robot) -> None:
     robot.run(20, "armed")
-    robot.go_wrong("mute:joint_4@0")
-    robot.isolated = frozenset({3})
-    assert robot.run(60, "armed") == [] and robot.following() == [True, True, True, False]
-    robot.go_wrong("mute:joint_4@0", begins=False)
+    robot.go_wrong("mute:joint_1@0")
+    robot.isolated = frozenset({0})
+    assert robot.run(60, "armed") == [] and robot.following() == [False, True, True, True]
+    assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, "it silences nobody behind it"
+    robot.go_wrong("mute:joint_1@0", begins=False)
     robot.isolated = frozenset()
     assert robot.run(30, "disarmed") == [] and robot.run(20, "armed") == [] and robot.following() == [True] * JOINTS
 
@@ -145,16 +169,17 @@ def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_
     robot: Robot,
 ) -> None:
     robot.run(20, "armed")
-    robot.backend._clock.robot_ns += 150_000_000
+    robot.backend._clock.robot_ns += 190_000_000
     robot.twin()
     assert robot.following() == [False] * JOINTS
     faults = robot.run(SHOWN, "armed")
-    assert {fault.what for fault in faults} == {"drive_fault"}
-    assert all(robot.family.expired in fault.cause for fault in faults)
+    what, cause = robot.family.expired
+    assert {fault.what for fault in faults} == {what} and all(cause in fault.cause for fault in faults)
     robot.backend._drives.bring_up()
     assert robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
 
 
+@on_can
 def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +200,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
         Robot(robot.family)
 
 
+@on_can
 def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> None:
     robot.run(20, "armed")
     channel = drives_of(robot.backend).wire.channel
@@ -187,6 +213,7 @@ def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> N
         assert [fault.what for fault in robot.run(3, "armed")] == ["second_host"]
 
 
+@on_can
 def test_a_log_of_the_bus_is_read_by_python_can_as_it_was_sent(family: Family, tmp_path: Path) -> None:
     one = Robot(family, log=str(tmp_path / "bus.log"))
     one.run(5, "armed")
@@ -198,6 +225,7 @@ def test_a_log_of_the_bus_is_read_by_python_can_as_it_was_sent(family: Family, t
     assert all(frame.is_extended_id == (frame.arbitration_id > 0x7FF) for frame in frames)
 
 
+@on_can
 @pytest.mark.parametrize(
     ("dotted", "words"),
     [

@@ -1,4 +1,7 @@
-"""The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it."""
+"""The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
+
+Hardware errors, restarts and lost joints are in `tests/unit/can_backend/family/test_every_family.py`.
+"""
 
 import math
 from collections.abc import Iterator
@@ -18,7 +21,6 @@ from tests.unit.hal.rig import run_config
 
 JOINTS = 4
 NOTICED = 10  # ticks in which a fault shows: each servo says its health every fourth
-BOOTED = 60
 
 
 class Robot(DriveRig):
@@ -39,45 +41,6 @@ def robot() -> Iterator[Robot]:
     one = Robot()
     yield one
     one.backend.close()
-
-
-def test_a_hardware_error_stays_until_the_operators_clear_restarts_the_servo(robot: Robot) -> None:
-    assert robot.run(30, "disarmed") == [] and robot.run(30, "armed") == []
-    robot.go_wrong("overheat:joint_2@0-9")
-    fault = robot.run(NOTICED, "armed")[0]
-    assert (fault.what, fault.joint) == ("drive_fault", "joint_2") and "overheating" in fault.cause
-    assert robot.run(100, "fault") == [] and robot.twin.servos[1].table[at.HARDWARE_ERROR]
-    assert [fault.joint for fault in robot.run(BOOTED + NOTICED, "disarmed")] == ["joint_2"], "it was still hot"
-    robot.go_wrong("overheat:joint_2@0-9", begins=False)
-    robot.twin.body.thermal.winding_c[:] = 20.0
-    robot.run(5, "fault")
-    assert robot.run(BOOTED, "disarmed") == [] and not robot.twin.servos[1].table[at.HARDWARE_ERROR]
-    assert robot.run(60, "armed") == [] and robot.joints is not None
-    assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
-
-
-def test_a_servo_that_restarts_in_motion_is_enabled_with_its_settings_after_the_clear(robot: Robot) -> None:
-    robot.run(20, "armed")
-    robot.go_wrong("reboot:joint_3@0")
-    faults = robot.run(80, "armed")
-    assert [(fault.what, fault.joint) for fault in faults] == [("drive_silent", "joint_3")], "and of no other"
-    assert robot.run(10, "fault") == [] and robot.run(10, "disarmed") == []
-    assert robot.run(40, "armed") == []
-    fresh, other = robot.twin.servos[2], robot.twin.servos[0]
-    assert fresh.on and fresh.table[at.GAINS : at.GAINS + 6] == other.table[at.GAINS : at.GAINS + 6]
-    assert fresh.table[at.WATCHDOG] == other.table[at.WATCHDOG] == 5
-
-
-def test_a_joint_that_was_lost_is_left_alone_until_it_is_used_again(robot: Robot) -> None:
-    robot.run(20, "armed")
-    robot.go_wrong("mute:joint_1@0")
-    robot.isolated = frozenset({0})
-    assert robot.run(60, "armed") == [] and not robot.twin.servos[0].on
-    assert all(servo.on for servo in robot.twin.servos[1:])
-    assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, "it silences nobody behind it"
-    robot.go_wrong("mute:joint_1@0", begins=False)
-    robot.isolated = frozenset()
-    assert robot.run(30, "disarmed") == []
 
 
 def test_servos_stop_by_their_own_watchdog_when_the_driver_is_gone(robot: Robot) -> None:
