@@ -58,12 +58,6 @@ def contents(draw: st.DrawFn, layout: Layout) -> dict[str, int]:
     return numbers
 
 
-def by_cantools(layout: Layout, data: bytes) -> dict[str, Any]:
-    found = DATABASE.decode_message(layout.name, data, decode_choices=False)
-    assert isinstance(found, dict)
-    return found
-
-
 # --- signals -----------------------------------------------------------------------------------------------
 
 
@@ -103,7 +97,7 @@ def test_what_does_not_fit_is_refused_in_words(layout: Layout, signal: Signal, w
 
 @given(any_layout, st.data(), nodes)
 @often
-def test_cantools_writes_the_same_bytes_and_reads_them_alike(layout: Layout, data: st.DataObject, node: int) -> None:
+def test_cantools_writes_the_same_bytes(layout: Layout, data: st.DataObject, node: int) -> None:
     numbers = data.draw(contents(layout))
     values = {n: min(max(s.value(numbers[n]), s.low), s.high) for n, s in layout.signals.items() if n in numbers}
     frame = layout.frame(node, **values)
@@ -111,10 +105,6 @@ def test_cantools_writes_the_same_bytes_and_reads_them_alike(layout: Layout, dat
     if layout.opcode in WITH_CHECKSUM:
         theirs["checksum"] = frame.data[-1]
     assert DATABASE.encode_message(layout.name, theirs, strict=False) == frame.data
-    ours, read = layout.values(frame.data), by_cantools(layout, frame.data)
-    for name, value in read.items():
-        assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-15), name
-    assert set(read) == set(theirs)
 
 
 @given(any_layout, st.data())
@@ -123,8 +113,9 @@ def test_any_bytes_are_read_as_cantools_reads_them(layout: Layout, data: st.Data
     content = data.draw(st.binary(min_size=layout.length, max_size=layout.length))
     if layout.opcode == Opcode.SET_POINT:
         content = bytes((content[0] & 0xF0 | content[0] & 0x03,)) + content[1:]  # cantools knows no other mode
-    ours = layout.values(content)
-    for name, value in by_cantools(layout, content).items():
+    ours, theirs = layout.values(content), DATABASE.decode_message(layout.name, content, decode_choices=False)
+    assert isinstance(theirs, dict)
+    for name, value in theirs.items():
         assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-15, nan_ok=True), name
 
 

@@ -52,7 +52,7 @@ def send_tick(near: VirtualWire, tick: int) -> None:
         near.send(set_point(tick, Mode.POSITION, 0.2, node=node))
 
 
-def test_by_the_clock_modules_boot_answer_and_follow():
+def test_by_the_clock_modules_boot_answer_and_follow_and_are_passive_after_the_watchdog_s_time_without_set_points():
     made = chain(stepped=False)
     with served(made) as (near, _, until):
         assert until(0.09) == []
@@ -65,17 +65,9 @@ def test_by_the_clock_modules_boot_answer_and_follow():
         states = only(answers, Opcode.JOINT_STATE, 1)
         assert [s["count"] for s in states] == [tick % 16 for tick in range(50)]
         assert states[-1]["angle"] == pytest.approx(0.2, abs=0.01)
+        until(0.69)
         assert [slot.module.state for slot in made.slots] == [ModuleState.ARMED] * JOINTS
-
-
-def test_without_set_points_everybody_is_passive_after_the_watchdog_s_time():
-    made = chain(stepped=False)
-    with served(made) as (near, _, until):
-        until(0.11)
-        near.send(command(Action.ARM))
-        until(0.2)
-        assert made.slots[0].module.state == ModuleState.ARMED
-        until(0.215)
+        until(0.705)
         assert [slot.module.state for slot in made.slots] == [ModuleState.FAULT] * JOINTS
 
 

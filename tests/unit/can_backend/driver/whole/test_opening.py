@@ -39,7 +39,6 @@ from tests.unit.can_backend.driver.whole.recorded import (
     go,
     is_action,
     is_set_point,
-    module_of,
     words,
 )
 from tests.unit.can_backend.frames import read
@@ -171,23 +170,6 @@ def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> 
     moved = (np.abs(speeds[1] - speeds[0]) > 1e-9).any(axis=1)
     assert not moved[: change_at + 2].any(), "it waits for the next Sync"
     assert moved[change_at + 2 :].all(), "and acts from then on"
-
-
-def test_every_joint_may_be_in_its_own_mode() -> None:
-    modes = [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE, Mode.PASSIVE]
-    targets = [0.2, -0.5, 0.3, 0.0]
-    with loop() as run:
-        run.arm()
-        run.run(3, lambda _tick: SetPoints(modes, targets, [4.0, 3.0, 2.0, 0.0]))
-        demands = [module_of(run, node).demand for node in (1, 2, 3, 4)]
-        assert [demand.mode for demand in demands] == modes
-        assert [demand.target for demand in demands] == pytest.approx(targets)
-        assert [demand.torque_limit_nm for demand in demands] == pytest.approx([4.0, 3.0, 2.0, 0.0])
-        run.run(60, lambda _tick: SetPoints(modes, targets, [4.0, 3.0, 2.0, 0.0]))
-        joints = run.samples[-1].joints
-        assert joints.angle_rad[0] == pytest.approx(0.2, abs=0.02)
-        assert joints.velocity_rad_s[1] == pytest.approx(-0.5, abs=0.15)
-        assert run.faults == []
 
 
 def test_a_period_has_one_sync_and_one_set_point_for_each_module() -> None:

@@ -70,12 +70,15 @@ def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) ->
         assert run.faults == [] and max(run.true_speed_rad_s[-10:]) > 0.1
 
 
-def test_an_arming_that_is_lost_is_said_again_to_those_who_need_it() -> None:
+def test_an_arming_and_a_stop_that_are_lost_are_said_again_to_those_who_need_it() -> None:
     with loop() as run:
-        WIRES[0].loses = lambda frame: is_action(frame, Action.ARM) and node_of(frame.id) == BROADCAST
+        WIRES[0].loses = lambda frame: is_action(frame, Action.ARM, Action.STOP) and node_of(frame.id) == BROADCAST
         sent = go(run, "armed", 6)
         assert words(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
         assert run.states() == [ARMED] * JOINTS and run.faults == []
+        assert words(go(run, "fault", 3)) == ["stop", "stop 1", "stop 2", "stop 3", "stop 4"]
+        go(run, "fault", 20)
+        assert run.states() == [DISARMED] * JOINTS
 
 
 def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
@@ -102,15 +105,6 @@ def test_an_emergency_that_is_lost_is_said_until_everybody_has_heard() -> None:
         go(run, "estop", 10)
         assert run.states() == [EMERGENCY] * JOINTS
         assert words(go(run, "estop", 10)) == []
-
-
-def test_a_stop_that_is_lost_is_said_again() -> None:
-    with loop() as run:
-        run.arm()
-        WIRES[0].loses = lambda frame: is_action(frame, Action.STOP) and node_of(frame.id) == BROADCAST
-        assert words(go(run, "fault", 3)) == ["stop", "stop 1", "stop 2", "stop 3", "stop 4"]
-        go(run, "fault", 20)
-        assert run.states() == [DISARMED] * JOINTS
 
 
 # --- frames that the bus does not take ---------------------------------------------------------------------
