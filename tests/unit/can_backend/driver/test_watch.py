@@ -18,7 +18,7 @@ from tests.unit.can_backend.driver.watch_rig import (
     reporting,
     said,
 )
-from tests.unit.can_backend.frames import answer, begin, corrupted, heartbeat, joint_state
+from tests.unit.can_backend.frames import begin, corrupted, heartbeat, joint_state
 
 # --- what one module can do wrong --------------------------------------------------------------------------
 
@@ -108,7 +108,7 @@ def test_a_silent_module_whose_heart_beats_is_told_from_a_dead_one() -> None:
 def restarting(bench: Bench) -> list[Finding]:
     found: list[Finding] = []
     for uptime_s in (50.0, 0.1, 0.2):
-        found += bench.tick(lambda r, up=uptime_s: (answer(r, [2]), r.take(heartbeat(2, up)))[0])
+        found += bench.tick(answering(ModuleState.DISARMED, heartbeat(2, uptime_s)))
     return found
 
 

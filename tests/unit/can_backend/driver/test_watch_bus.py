@@ -7,8 +7,8 @@ from snakesim_can_backend.driver.module_monitor import Finding
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.commands import command
-from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, frame_id
-from tests.unit.can_backend.driver.watch_rig import Bench, quiet, said
+from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, frame_id
+from tests.unit.can_backend.driver.watch_rig import Bench, answering, quiet, said
 from tests.unit.can_backend.frames import answer, joint_state
 
 # --- the bus -----------------------------------------------------------------------------------------------
@@ -27,7 +27,7 @@ from tests.unit.can_backend.frames import answer, joint_state
 def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
     bench = Bench()
     error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
-    (found,) = bench.tick(errors=[error, error][:1])
+    (found,) = bench.tick(errors=[error])
     assert (found.what, found.joint) == (kind, None)
     assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
     assert bench.tick(errors=[error]) == []
@@ -82,11 +82,7 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
     ],
 )
 def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
-    def speak(reading: Reading) -> None:
-        answer(reading, [2])
-        reading.take(frame)
-
-    bench = Bench()
+    bench, speak = Bench(), answering(ModuleState.DISARMED, frame)
     (found,) = bench.tick(speak)
     assert (found.what, found.joint) == (what, None) and words in found.cause
     assert bench.tick(speak) == []

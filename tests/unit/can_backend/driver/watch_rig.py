@@ -5,7 +5,7 @@ from collections.abc import Callable
 from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.driver.module_monitor import Finding, Watch
 from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
+from snakesim_can_backend.protocol.definitions import Frame, LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.frames import answer, begin, heartbeat
 
@@ -47,19 +47,20 @@ class Bench:
         self.watch.forget(self.reading.sync)
 
 
-def answering(state: ModuleState) -> Speak:
-    """Node 2 answers, in this state."""
-    return lambda reading: answer(reading, [2], state=state)
+def answering(state: ModuleState = ModuleState.DISARMED, *frames: Frame) -> Speak:
+    """Node 2 answers in this state, and these frames come, too."""
+
+    def speak(reading: Reading) -> None:
+        answer(reading, [2], state=state)
+        for frame in frames:
+            reading.take(frame)
+
+    return speak
 
 
 def reporting(state: ModuleState = ModuleState.DISARMED, **told: float) -> Speak:
     """Node 2 answers in this state, and a heartbeat says more of it."""
-
-    def speak(reading: Reading) -> None:
-        answer(reading, [2], state=state)
-        reading.take(heartbeat(2, 1.0, state, **told))
-
-    return speak
+    return answering(state, heartbeat(2, 1.0, state, **told))
 
 
 HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1)

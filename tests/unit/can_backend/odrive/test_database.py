@@ -56,9 +56,6 @@ def test_states_modes_and_senders_are_theirs() -> None:
     assert (states[State.IDLE].name, states[State.CLOSED_LOOP].name) == ("IDLE", "CLOSED_LOOP_CONTROL")
     modes = DATABASE.get_message_by_name("Axis0_Set_Controller_Mode").get_signal_by_name("Control_Mode").choices
     assert [modes[one].name for one in Control] == ["TORQUE_CONTROL", "VELOCITY_CONTROL", "POSITION_CONTROL"]
-    of_hosts = {message for message, (name, _) in SAME.items() if "Master" in senders(name)}
+    theirs = {message: DATABASE.get_message_by_name(f"Axis0_{name}") for message, (name, _) in SAME.items()}
+    of_hosts = {message for message, described in theirs.items() if "Master" in described.senders}
     assert of_hosts == FROM_HOST - {Message.ESTOP, Message.CLEAR_ERRORS}
-
-
-def senders(name: str) -> list[str]:
-    return DATABASE.get_message_by_name(f"Axis0_{name}").senders

@@ -219,14 +219,10 @@ EVENTS: dict[str, Callable[[Module], None]] = {
 }
 
 
-def table_of_states() -> dict[str, list[str]]:
-    return {row[0]: row[1:] for row in rows("States and events")}
-
-
 @pytest.mark.parametrize("event", list(EVENTS))
 @pytest.mark.parametrize("state", list(ModuleState))
 def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: ModuleState) -> None:
-    table = table_of_states()
+    table = {row[0]: row[1:] for row in rows("States and events")}
     assert table["motor"][:2] == ["off", "off"] and set(EVENTS) | {"motor"} == set(table)
     said = table[event][state]
     module = module_in(state)
