@@ -22,9 +22,9 @@ from tests.unit.hal.rig import run_config
 JOINTS = 4
 
 
-def config(**dotted: Any) -> RunConfig:
-    """Four joints at 100 Hz, without an obstacle."""
-    return run_config(**{"backend": "can", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
+def config(joints: int = JOINTS, **dotted: Any) -> RunConfig:
+    """So many joints at 100 Hz, without an obstacle."""
+    return run_config(**{"backend": "can", "robot__chain__modules": joints, "rate_hz": 100, **dotted})
 
 
 @dataclass

@@ -26,7 +26,7 @@ from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.frames import read
-from tests.unit.hal.rig import run_config
+from tests.unit.can_backend.loop import config
 
 NODE = 3
 SERIAL = 0xC0FFEE
@@ -70,10 +70,6 @@ def armed(**flash: float) -> Module:
     module.frames.clear()
     assert module.state == ModuleState.ARMED
     return module
-
-
-def config(joints: int = 4, **dotted: Any) -> RunConfig:
-    return run_config(**{"backend": "can", "robot__chain__modules": joints, "rate_hz": 100, **dotted})
 
 
 def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -> ModuleChain:

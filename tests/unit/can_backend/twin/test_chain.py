@@ -13,7 +13,8 @@ from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
 from snakesim_hal.drivers.mocap_sample import MocapSample
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
-from tests.unit.can_backend.twin.rig import Host, chain, config, only, set_point
+from tests.unit.can_backend.loop import config
+from tests.unit.can_backend.twin.rig import Host, chain, only, set_point
 from tests.unit.hal.rig import pose
 
 G = 9.81
