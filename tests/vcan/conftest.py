@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.vcan.link import ip, listener, must
+from tests.vcan.link import ip, must
 
 CHANNEL = "vcan0"
 HERE = Path(__file__).parent
@@ -53,7 +53,9 @@ def channel() -> str:
 @pytest.fixture
 def raw_socket(channel: str) -> Iterator[socket.socket]:
     """A raw CAN socket on the bus, which gives up waiting after two seconds."""
-    with listener(channel) as opened:
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as opened:
+        opened.settimeout(2.0)
+        opened.bind((channel,))
         yield opened
 
 

@@ -1,7 +1,6 @@
-"""CAN interfaces, as a person would treat them with `ip` and `tc`; and a raw socket beside our own."""
+"""CAN interfaces, as a person would treat them with `ip` and `tc`; and frames as the kernel has them."""
 
 import shutil
-import socket
 import struct
 import subprocess
 
@@ -22,14 +21,6 @@ def must(done: subprocess.CompletedProcess[str]) -> None:
 
 def frame(can_id: int, data: bytes = b"") -> bytes:
     return FRAME.pack(can_id, len(data), data)
-
-
-def listener(channel: str) -> socket.socket:
-    """A raw CAN socket on a bus, which gives up waiting after two seconds."""
-    opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-    opened.settimeout(2.0)
-    opened.bind((channel,))
-    return opened
 
 
 def _run(tool: str, arguments: tuple[str, ...]) -> subprocess.CompletedProcess[str]:

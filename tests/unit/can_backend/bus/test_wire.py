@@ -6,6 +6,7 @@ import socket
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -94,18 +95,6 @@ class CanLike(socket.socket):
         return super().recv_into(buffer)
 
 
-class FakeBus:
-    """Instead of python-can's."""
-
-    def __init__(self, opened: CanLike) -> None:
-        self.socket = opened
-        self.closed = False
-
-    def shutdown(self) -> None:
-        self.socket.close()
-        self.closed = True
-
-
 class Rig:
     """A SocketCanWire whose kernel is the other end of a pair of sockets."""
 
@@ -113,13 +102,13 @@ class Rig:
         near, self.kernel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.kernel.settimeout(2.0)
         self.socket = CanLike(fileno=near.detach())
-        self.bus = FakeBus(self.socket)
         self.up = True
         self.opened_with: dict[str, object] = {}
 
-        def opened(**how: object) -> FakeBus:
+        def opened(**how: object) -> SimpleNamespace:
+            """Instead of python-can's bus."""
             self.opened_with = how
-            return self.bus
+            return SimpleNamespace(socket=self.socket, shutdown=self.socket.close)
 
         monkeypatch.setattr(wire_module, "SocketcanBus", opened)
         monkeypatch.setattr(wire_module, "check_interface", lambda _channel: None)
@@ -256,7 +245,7 @@ def test_the_kernel_filters(monkeypatch: pytest.MonkeyPatch, only: frozenset[Opc
     for identifier in range(0x800):
         assert passes(identifier) is (only is None or identifier >> 6 in only)
         assert not passes(0x80000000 | identifier) and not passes(0x40000000 | identifier), "extended, remote"
-    assert rig.bus.closed
+    assert rig.socket.fileno() == -1, "closed"
 
 
 def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,11 +17,12 @@ from snakesim_hal.backend import SetPoints
 from snakesim_hal.drivers.drive_backend import Clock
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
+from tests.unit.can_backend.loop import config
 from tests.unit.hal.drive_rig import drives_of
-from tests.unit.hal.rig import run_config
 
 TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
 JOINTS = 4
+CONFIG = config(JOINTS, backend="moteus")
 
 
 def theirs(number: int = 1, **options: Any) -> moteus.Controller:
@@ -95,9 +96,8 @@ def test_a_stop_of_ours_is_theirs_and_ids_are_extended_where_theirs_are() -> Non
 @pytest.fixture
 def bus() -> Any:
     """Emulated controllers of a robot, and their bus."""
-    config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
-    wire, clock = VirtualWire("moteus-theirs", fd=True), Clock(config)
-    twin = MoteusBackend.twin_on(config, MoteusSettings(plant="inertia"), [wire], clock, None)
+    wire, clock = VirtualWire("moteus-theirs", fd=True), Clock(CONFIG)
+    twin = MoteusBackend.twin_on(CONFIG, MoteusSettings(plant="inertia"), [wire], clock, None)
     with can.Bus(interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD) as ours:
         yield ours, twin, clock
     twin.close()
@@ -137,22 +137,21 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
 
 
 def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_file_says() -> None:
-    config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
-    backend = MoteusBackend(config, MoteusSettings(plant="inertia"))
+    backend = MoteusBackend(CONFIG, MoteusSettings(plant="inertia"))
     drives = drives_of(backend)
     sent: list[Frame] = []
     send = drives.wire.send
     drives.wire.send = lambda frame: sent.append(frame) or send(frame)
     joints = backend.sample(0, 0).joints
     for tick in range(1, 20):
-        joints = backend.sample(tick, tick * config.period_ns).joints
+        joints = backend.sample(tick, tick * CONFIG.period_ns).joints
         backend.enact(SetPoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
         backend.advance()
     backend.close()
     read = [parse_registers(frame.data) for frame in sent]
     assert all(one.command or one.query for one in read) and not any(one.errors for one in read)
     command = next(one.command for one in read if len(one.command) > 2)
-    motor = config.robot.joint_table[0].motor
+    motor = CONFIG.robot.joint_table[0].motor
     kp = command[moteus.Register.COMMAND_KP_SCALE] * drives._kp_nm_per_turn
     assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
     assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
@@ -160,9 +159,8 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
 
 
 def test_real_controllers_need_to_be_configured_for_the_robot_and_a_reference() -> None:
-    config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
     with pytest.raises(ConfigError, match=r"needs `servo.pid_position.kp` from .* N·m/turn on, .*say what they have"):
-        MoteusBackend.check(config, MoteusSettings(kp_nm_per_turn=0.01))
-    config = run_config(backend="moteus", robot__joints={"joint_1": {"id": 0}}, rate_hz=100)
+        MoteusBackend.check(CONFIG, MoteusSettings(kp_nm_per_turn=0.01))
+    one_is_the_host = config(backend="moteus", robot__joints={"joint_1": {"id": 0}})
     with pytest.raises(ConfigError, match="`id` = 0 is the host's"):
-        MoteusBackend.check(config, MoteusSettings())
+        MoteusBackend.check(one_is_the_host, MoteusSettings())
