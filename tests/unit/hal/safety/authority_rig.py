@@ -50,10 +50,16 @@ class Rig:
         return self.authority.decide()
 
 
-def armed(**robot: Any) -> Rig:
+def commanded(target: Any = 0.1, mode: Any = Mode.POSITION, **robot: Any) -> Rig:
+    """Not armed yet: its joints are at 0.1 rad, and a holder of the lease commands it."""
     rig = Rig(**robot)
     rig.observe(0.1)
-    assert rig.acquire().ok and rig.send(0.1) is None
+    assert rig.acquire().ok and rig.send(target, mode) is None
+    return rig
+
+
+def armed(**robot: Any) -> Rig:
+    rig = commanded(**robot)
     assert rig.arm().ok
     return rig
 

@@ -12,7 +12,7 @@ from snakesim_hal.safety.cables import Cables
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
 from tests.unit.hal.rig import LEASE_NS
-from tests.unit.hal.safety.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, ROBOT, Rig, armed, modes
+from tests.unit.hal.safety.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, ROBOT, Rig, armed, commanded, modes
 
 # --- arming ----------------------------------------------------------------------------------------------------
 
@@ -33,10 +33,6 @@ def test_the_way_to_armed() -> None:
         assert rig.authority.state == "disarmed"
     answer = rig.arm()
     assert answer.ok and answer.lifecycle == "armed" and rig.authority.arming == 1
-
-
-def test_a_command_before_any_lease_is_rejected() -> None:
-    assert Rig().send() == "no_lease"
 
 
 def test_a_stopped_robot_is_armed_only_after_a_clear_and_says_so() -> None:
@@ -61,10 +57,7 @@ def test_a_stopped_robot_is_armed_only_after_a_clear_and_says_so() -> None:
     ],
 )
 def test_arming_names_robot_backend_and_configuration(request_: LifecycleRequest, words: list[str]) -> None:
-    rig = Rig()
-    rig.observe()
-    rig.acquire()
-    rig.send()
+    rig = commanded()
     answer = rig.authority.on_lifecycle(request_, 0)
     assert not answer.ok and all(word in answer.reason for word in words) and rig.authority.state == "disarmed"
 
@@ -81,14 +74,11 @@ BAD_STATES: list[tuple[dict[str, Any], str]] = [
 def test_a_robot_that_does_not_know_its_joints_is_not_armed_and_does_not_stay_armed(
     bad: dict[str, Any], joint: str
 ) -> None:
-    rig = Rig()
-    rig.observe()
-    rig.acquire()
-    rig.send()
+    rig = commanded()
     rig.observe(**bad)
     answer = rig.arm()
     assert not answer.ok and answer.reason == f"no valid and fresh state of {joint}"
-    rig.observe()
+    rig.observe(0.1)
     assert rig.arm().ok
     rig.observe(**bad)
     rig.send(0.2)
@@ -135,10 +125,7 @@ def test_a_state_at_the_end_of_its_time_is_still_good() -> None:
 
 
 def test_arming_is_refused_while_a_target_is_far_and_names_the_joint() -> None:
-    rig = Rig()
-    rig.observe(0.1)
-    rig.acquire()
-    rig.send([0.1, 0.6, 0.1])
+    rig = commanded([0.1, 0.6, 0.1])
     answer = rig.arm()
     assert not answer.ok and "joint_2 has a target +0.50 rad" in answer.reason and "0.3" in answer.reason
     rig.send(0.3)
@@ -171,10 +158,7 @@ def test_right_after_arming_the_pose_is_held_until_a_new_command_comes() -> None
 
 def test_arming_needs_commands_that_still_come() -> None:
     """Asking keeps the lease while disarmed, but whoever only asks does not command."""
-    rig = Rig()
-    rig.observe(0.1)
-    rig.acquire()
-    rig.send(0.1)
+    rig = commanded()
     for _ in range(2):
         rig.pass_tick(5)
         assert rig.authority.on_lease(LeaseRequest(action="renew", holder="control", epoch=1), rig.now_ns).ok
@@ -187,20 +171,13 @@ def test_arming_needs_commands_that_still_come() -> None:
 
 @pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
 def test_arming_is_refused_to_a_stream_that_moves(mode: Mode) -> None:
-    rig = Rig()
-    rig.observe(0.1)
-    rig.acquire()
-    rig.send([0.1, 0.0, 0.1], [Mode.POSITION, mode, Mode.PASSIVE])
+    rig = commanded([0.1, 0.0, 0.1], [Mode.POSITION, mode, Mode.PASSIVE])
     reason = f"joint_2 is commanded in mode {mode.name.lower()}; it must hold its position at arming"
     assert rig.arm().reason == reason and rig.authority.state == "disarmed"
 
 
 def test_a_passive_stream_may_be_armed_whatever_its_targets() -> None:
-    rig = Rig()
-    rig.observe(0.1)
-    rig.acquire()
-    rig.send(99.0, Mode.PASSIVE)
-    assert rig.arm().ok
+    assert commanded(99.0, Mode.PASSIVE).arm().ok
 
 
 def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_lease() -> None:
@@ -229,10 +206,7 @@ def test_after_a_disarm_arming_needs_a_new_command() -> None:
 
 
 def test_a_new_holder_of_the_lease_must_command_itself_from_sequence_0_on() -> None:
-    rig = Rig()
-    rig.observe(0.1)
-    rig.acquire()
-    rig.send(0.1)
+    rig = commanded()
     assert rig.acquire("teleop", 200).ok
     assert rig.arm().reason == "no commands from teleop yet"
     assert rig.send(0.1, sequence=0) is None and rig.arm().ok
@@ -246,10 +220,7 @@ def test_while_disarmed_it_does_not_matter_which_arming_a_command_names() -> Non
 
 
 def test_arming_begins_a_new_term_of_the_lease() -> None:
-    rig = Rig()
-    rig.observe(0.1)
-    rig.acquire()
-    rig.send(0.1)
+    rig = commanded()
     rig.now_ns += LEASE_NS - 1
     assert rig.arm().ok and rig.authority.lease.expires_ns == 2 * LEASE_NS - 1
 
