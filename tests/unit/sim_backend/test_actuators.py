@@ -56,19 +56,12 @@ def test_a_motor_without_response_time_answers_at_once():
     assert torque(run) == pytest.approx(0.0, abs=NOTHING)
 
 
-def test_passive_means_no_torque_even_when_spun_beyond_the_limit_of_speed():
+def test_before_the_first_command_there_is_no_torque_even_when_spun_beyond_the_limit_of_speed():
     run = fast_run()
     run.sim.data.qvel[6] = 20.0
     for _ in range(50):
         run.go()
         assert torque(run) == pytest.approx(0.0, abs=NOTHING)
-
-
-def test_joints_are_passive_before_the_first_command():
-    run = Run(make_config())
-    run.sim.data.qvel[6:] = 1.0
-    run.go(0.1)
-    assert run.sim.true_state().torques_nm == pytest.approx([0.0] * 13, abs=NOTHING)
 
 
 @pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
@@ -143,25 +136,6 @@ def test_a_change_of_mode_moves_the_torque_only_as_the_motor_responds(before, af
         run.go()
         wanted = had + (demand - had) * (1 - np.exp(-1e-3 / RESPONSE_S))
         assert torque(run) == pytest.approx(wanted, abs=1e-6)
-
-
-def test_joints_may_be_in_different_modes():
-    run = Run(make_config({"chain": {"modules": 4}}, ICE))
-    run.command([Mode.POSITION, Mode.PASSIVE, Mode.TORQUE, Mode.VELOCITY], [0.2, 9.0, 0.05, 0.0])
-    run.go(0.1)
-    torques = run.sim.true_state().torques_nm
-    assert torques[1] == pytest.approx(0.0, abs=NOTHING)
-    assert torques[2] == pytest.approx(0.05, rel=1e-3)
-    run.command(Mode.POSITION, 0.1)
-    run.go(1.0)
-    assert run.sim.true_state().angles_rad == pytest.approx([0.1] * 4, abs=2e-3)
-
-
-def test_a_joint_stops_at_its_limit():
-    run = fast_run({**TWO_LINKS, "limits": {"angle_rad": 0.5}})
-    run.command(Mode.TORQUE, 1.0)
-    run.go(0.5)
-    assert run.sim.true_state().angles_rad[0] == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize("response_s", [0.0, 0.005])
