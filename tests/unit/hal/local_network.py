@@ -187,16 +187,14 @@ class Running:
     @property
     def status(self) -> Status:
         """The newest that was published."""
-        found = self._statuses.drain()
-        self._status = found[-1] if found else self._status
-        wait_until(lambda: self._status is not None or self._refresh(), "a status")
+        wait_until(lambda: self._refresh() is not None, "a status")
         assert self._status is not None
         return self._status
 
-    def _refresh(self) -> bool:
+    def _refresh(self) -> Status | None:
         found = self._statuses.drain()
         self._status = found[-1] if found else self._status
-        return self._status is not None
+        return self._status
 
     def ask(self, key: str, request: Message) -> Answer:
         """Ask the host; a no is an answer too."""

@@ -9,7 +9,7 @@ import msgspec
 
 from snakesim_hal.model.robot import RobotFile, describe
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Clock, Description, JointCommand, JointState, Mode, Pose, Power, Status
+from snakesim_hal.wire.messages import Clock, Contact, Description, JointCommand, JointState, Mode, Pose, Power, Status
 
 PERIOD_NS = 10_000_000
 LEASE_NS = 50_000_000
@@ -157,6 +157,14 @@ def pose(tick: int = 0, stamp_ns: int = 0, **other: Any) -> Pose:
     values = {"position_w": still, "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
     values |= {"velocity_w": still, "angular_velocity_w": still, **other}
     return Pose(tick=tick, stamp_ns=stamp_ns, **values)
+
+
+def contact(link: int = 0, **other: Any) -> Contact:
+    """A touch from the left that presses nothing, unless configured otherwise."""
+    still = (0.0, 0.0, 0.0)
+    values = {"position_l": still, "normal_l": (0.0, -1.0, 0.0), "force_l": still, "torque_l": still}
+    values |= {"tangent_1_l": (1.0, 0.0, 0.0), "tangent_2_l": (0.0, 0.0, 1.0)}
+    return Contact(link=link, **{"obstacle": None, **values, **other})
 
 
 def clock(tick: int, *, arming: int = 0, **other: Any) -> Clock:

@@ -173,9 +173,7 @@ def poisons(info: inspect.Type) -> list[Any]:
             return [{}, 1] + ([] if not info.min_length else [[]])
         case inspect.TupleType():
             return [[], [0.0] * (len(info.item_types) + 1)]
-        case inspect.DictType():
-            return [[], 1]
-        case inspect.StructType():
+        case inspect.DictType() | inspect.StructType():
             return [[], 1]
         case _:
             return []

@@ -9,6 +9,7 @@ from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Contact, Obstacle
 from tests.unit.gnc.stage import BODY_RADIUS_M, make_robot
+from tests.unit.hal.rig import contact
 
 ROBOT = make_robot()
 LENGTHS = [link.length_m for link in ROBOT.links]
@@ -37,15 +38,12 @@ def pegs(apart_m: float = 0.0) -> list[Obstacle]:
 def felt(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     """side: -1 for pushes from where no peg is."""
     return [
-        Contact(
-            link=link,
-            obstacle=None,
+        contact(
+            link,
             position_l=(0.07, s * side * BODY_RADIUS_M, 0.0),  # 15 mm off along the link, as estimates are
             normal_l=(0.0, -float(s * side), 0.0),
-            tangent_1_l=(1.0, 0.0, 0.0),
             tangent_2_l=(0.0, 0.0, float(s * side)),
             force_l=(0.0, -s * side * force_n, 0.0),
-            torque_l=(0.0, 0.0, 0.0),
         )
         for link, s in TOUCHED
     ]

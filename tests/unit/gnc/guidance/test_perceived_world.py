@@ -6,10 +6,11 @@ import pytest
 
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
-from snakesim_hal.wire.messages import Contact, Contacts, World
+from snakesim_hal.wire.messages import Contacts, World
 from snakesim_operator.results.map_score import MapScore, moved, score
 from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, Place, random_field
 from tests.unit.gnc.guidance.rendered import cylinder, hills, lidar
+from tests.unit.hal.rig import contact
 
 
 def reported(drive: Drive) -> World:
@@ -93,17 +94,8 @@ def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
 
 def touching(here: Place, turn: int) -> Contacts:
     """A peg, unseen, at the left side of the middle link; the sensor tells no name that is true."""
-    contact = Contact(
-        link=7,
-        obstacle="a name from the simulator",
-        position_l=(0.05, 0.04, 0.0),
-        normal_l=(0.0, -1.0, 0.0),
-        tangent_1_l=(1.0, 0.0, 0.0),
-        tangent_2_l=(0.0, 0.0, 1.0),
-        force_l=(0.0, -3.0, 0.0),
-        torque_l=(0.0, 0.0, 0.0),
-    )
-    return Contacts(tick=turn, stamp_ns=turn * STEP_NS, contacts=[contact])
+    touch = contact(7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0))
+    return Contacts(tick=turn, stamp_ns=turn * STEP_NS, contacts=[touch])
 
 
 def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():

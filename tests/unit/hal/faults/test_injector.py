@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, LagBackend, Running, following, meeting, running
-from tests.unit.hal.rig import description, run_config, state
+from tests.unit.hal.rig import clock, description, run_config, state
 
 ALLOWED: dict[str, Any] = {"pace": "realtime", "rate_hz": 100, "faults_allowed": True}
 
@@ -155,12 +155,9 @@ def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_ne
         faults, delay = MessageFaults(here, 1), parse("delay:hal/clock@0=0.1")
         faults.begin(delay)
         sent_at = []
-        clock = Clock(
-            tick=1, stamp_ns=1, period_ns=1, pace="free", lifecycle="armed", arming=1, lease_epoch=0, newest={}
-        )
         for _ in range(5):
             sent_at.append(time.monotonic())
-            publisher.put(clock)
+            publisher.put(clock(1))
             time.sleep(0.02)
         assert any(thread.name == "late messages" for thread in threading.enumerate())
         faults.end(delay)

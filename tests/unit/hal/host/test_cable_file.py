@@ -13,8 +13,9 @@ from snakesim_hal.host.cable_file import CABLES, FRESH_S, CableFile, kept_at
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile, describe
-from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.wire.messages import Description
 from tests.harness.wait import wait_until
+from tests.unit.hal.rig import state
 
 DECLARED = "2026-11-25T02:40:12+00:00"
 NOW_S = datetime(2026, 11, 25, 2, 50, tzinfo=UTC).timestamp()
@@ -50,7 +51,7 @@ class Bench:
         others = writers()
         kept = CableFile(self.folder, self.joints, msgspec.structs.replace(self.robot, joints=serials), now_s)
         for angle_rad in angles_rad:
-            kept.take(state(angle_rad))
+            kept.take(state(self.robot, [0.0, angle_rad, 0.0]))
         against = kept.cables.against_arming()
         if ends:
             kept.close()  # on a computer that stutters a disk may take longer than a host waits for it
@@ -60,14 +61,6 @@ class Bench:
 
 def writers() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "cables"}
-
-
-def state(angle_rad: float) -> JointState:
-    still = [0.0] * 3
-    return JointState(
-        tick=0, stamp_ns=0, angle_rad=[0.0, angle_rad, 0.0], velocity_rad_s=still, torque_nm=still,
-        valid=[True] * 3, age_ns=[0] * 3,
-    )  # fmt: skip
 
 
 def test_a_joint_that_was_turned_through_is_known_after_its_drive_has_forgotten_the_turn(tmp_path: Path) -> None:

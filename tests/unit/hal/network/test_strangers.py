@@ -19,7 +19,6 @@ from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
-    Contact,
     Contacts,
     DepthImage,
     Description,
@@ -36,7 +35,7 @@ from snakesim_hal.wire.quantities import Quaternion
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import LagBackend, meeting
-from tests.unit.hal.rig import clock, description, pose, power, run_config, state
+from tests.unit.hal.rig import clock, contact, description, pose, power, run_config, state
 
 ROBOT = description()  # three joints, four links
 X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
@@ -44,10 +43,7 @@ CLOCK = clock(3, pace="realtime")
 
 
 def contacts(link: int) -> Contacts:
-    touch = Contact(
-        link=link, obstacle=None, position_l=X, normal_l=X, tangent_1_l=X, tangent_2_l=X, force_l=X, torque_l=X
-    )
-    return Contacts(tick=0, stamp_ns=0, contacts=[touch])
+    return Contacts(tick=0, stamp_ns=0, contacts=[contact(link)])
 
 
 def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:

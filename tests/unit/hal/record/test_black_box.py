@@ -13,11 +13,10 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.record.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contact, Contacts, Mode
-from tests.unit.hal.rig import description, pose, state
+from snakesim_hal.wire.messages import Contacts, Mode
+from tests.unit.hal.rig import contact, description, pose, state
 
 ROBOT = description()
-STILL = (0.0, 0.0, 0.0)
 
 
 def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Decision:
@@ -41,13 +40,6 @@ def all_rows(box: BlackBox) -> dict[str, Any]:
     return box.layout.arrays(bytes(rows))
 
 
-def contact(obstacle: str | None, force: tuple[float, float, float]) -> Contact:
-    return Contact(
-        link=1, obstacle=obstacle, position_l=STILL, normal_l=STILL, tangent_1_l=STILL, tangent_2_l=STILL,
-        force_l=force, torque_l=STILL,
-    )  # fmt: skip
-
-
 def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
     box = BlackBox(ROBOT)
     count = 9000  # several times what is taken at once
@@ -56,8 +48,8 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
         if tick == 2:
             others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
         if tick in (3, 6):
-            touches = [contact("a", (3.0, 4.0, 0.0)), contact("a", STILL), contact("b", STILL)] if tick == 3 else []
-            others[keys.CONTACTS] = Contacts(tick=tick, stamp_ns=0, contacts=touches)
+            touches = [contact(obstacle="a", force_l=(3.0, 4.0, 0.0)), contact(obstacle="a"), contact(obstacle="b")]
+            others[keys.CONTACTS] = Contacts(tick=tick, stamp_ns=0, contacts=touches if tick == 3 else [])
         joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
         box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
     columns = all_rows(box)
@@ -194,6 +186,6 @@ def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
 
 def test_the_force_over_50_ms_is_kept_where_the_sensor_tells_it() -> None:
     box = BlackBox(ROBOT)
-    touches = Contacts(tick=0, stamp_ns=0, contacts=[contact("a", (3.0, 4.0, 0.0))], felt_n=1.5)
+    touches = Contacts(tick=0, stamp_ns=0, contacts=[contact(force_l=(3.0, 4.0, 0.0))], felt_n=1.5)
     box.record(0, 0, Samples(state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
     assert all_rows(box)["contact_peak_n"].tolist() == [1.5]

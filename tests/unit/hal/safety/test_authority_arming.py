@@ -52,7 +52,7 @@ def test_a_stopped_robot_is_armed_only_after_a_clear_and_says_so() -> None:
         (LifecycleRequest(action="arm", robot="worm"), ["this backend is 'lag', the request names None"]),
         (LifecycleRequest(action="arm", robot="other", backend="lag"), ["this robot is 'worm'", "'other'"]),
         (LifecycleRequest(action="arm", robot="worm", backend="can"), ["this backend is 'lag'", "'can'"]),
-        (msgspec.structs.replace(ARM, config_hash=None), ["the request names none", "arm with its config_hash"]),
+        (msgspec.structs.replace(ARM, config_hash=None), ["the request names none: read", "arm with its config_hash"]),
         (msgspec.structs.replace(ARM, config_hash="1" * 16), [f"{'0' * 16!r}, the request names {'1' * 16!r}"]),
     ],
 )
