@@ -1,7 +1,6 @@
 """The control service on a real host: what it gives its controller when streams stop; what it does without joints."""
 
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
 from tests.harness.wait import wait_until
 from tests.unit.gnc.services import Stage, stage
+from tests.unit.hal.local_network import threads_switching
 
 PERIOD_NS = 20_000_000
 SEEN = 3  # views in a row
@@ -20,11 +20,8 @@ SEEN = 3  # views in a row
 
 @pytest.fixture(autouse=True)
 def quick_threads() -> Iterator[None]:
-    """Host and services share one interpreter here; in real life they are processes."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    yield
-    sys.setswitchinterval(before)
+    with threads_switching():
+        yield
 
 
 def sighted(made: Stage, since: int = 0) -> bool:

@@ -1,6 +1,7 @@
 """A real backend of first-order joints, a host that runs it in a thread, and a client in another, over real Zenoh."""
 
 import math
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
@@ -38,6 +40,24 @@ from tests.harness.wait import wait_until
 from tests.unit.hal.rig import pose
 
 LIMIT_S = 20.0
+
+
+@contextmanager
+def threads_switching(every_s: float = 0.0005) -> Iterator[None]:
+    """Threads take turns so often: host and client share one interpreter here; in real life they are processes."""
+    before_s = sys.getswitchinterval()
+    sys.setswitchinterval(every_s)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before_s)
+
+
+def received(reader: Reader[MessageT], what: str, count: int = 1) -> list[MessageT]:
+    """What a reader has got, as soon as it is so many."""
+    found: list[MessageT] = []
+    wait_until(lambda: found.extend(reader.drain()) or len(found) >= count, what)
+    return found
 
 
 @contextmanager
@@ -236,6 +256,15 @@ def running(config: RunConfig, **host: Any) -> Iterator[Running]:
             made.stop()
             thread.join(LIMIT_S)
             assert not thread.is_alive(), "the host did not stop"
+
+
+@contextmanager
+def commanded(config: RunConfig, ticks: int = 5, **host: Any) -> Iterator[tuple[Running, Follower]]:
+    """A host that is armed, and a follower that has commanded it for more ticks than that."""
+    with running(config, **host) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > ticks, "commands")
+        yield run, control
 
 
 @contextmanager

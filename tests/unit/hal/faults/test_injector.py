@@ -15,7 +15,7 @@ from snakesim_hal.injection import parse
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import Follower, LagBackend, Running, following, meeting, running
+from tests.unit.hal.local_network import LagBackend, Running, commanded, meeting, running
 from tests.unit.hal.rig import clock, description, run_config, state
 
 ALLOWED: dict[str, Any] = {"pace": "realtime", "rate_hz": 100, "faults_allowed": True}
@@ -26,8 +26,7 @@ def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
 
 
 def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_it() -> None:
-    with running(run_config(**ALLOWED)) as run, following(run.link, Follower()):
-        run.arm()
+    with commanded(run_config(**ALLOWED)) as (run, _):
         answer = ask(run, "mute", "joint_2")
         assert answer.ok and answer.reason.startswith("mute of joint_2 has begun, at ") and answer.lifecycle == "armed"
         run.reaches("fault")
@@ -74,8 +73,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 
 
 def test_what_was_planned_and_cannot_be_done_is_told_as_a_fault_of_the_run() -> None:
-    with running(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as run, following(run.link, Follower()):
-        run.arm()
+    with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.since_start
         wait_until(lambda: any(fault.what == "injection_refused" for fault in told.kept), "a word about it")
         assert "is refused: backend 'lag' cannot do leak" in run.host.faults.noted[0]

@@ -13,7 +13,7 @@ from snakesim_hal.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Pace
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import Follower, LagBackend, following, running
+from tests.unit.hal.local_network import LagBackend, commanded
 from tests.unit.hal.rig import pose, power, run_config
 
 
@@ -28,9 +28,7 @@ from tests.unit.hal.rig import pose, power, run_config
 def test_an_error_anywhere_is_a_latched_fault_and_the_joints_are_told_to_be_safe(
     where: str, error: Exception, cause: str
 ) -> None:
-    with running(run_config()) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 3, "three ticks")
+    with commanded(run_config()) as (run, _):
         run.backend.fails_in, run.backend.fails_with = where, error
         wait_until(run.ended, "the end of the host")
         assert run.host.ended == "failed" and run.host.authority.state == "fault"
@@ -72,8 +70,7 @@ def test_a_sample_that_no_reader_would_accept_is_a_latched_fault_that_names_it(
     pace: Pace, key: str, sample: Any, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tests.unit.hal.local_network.LagBackend", Wrong)
-    with running(run_config(pace=pace)) as run, following(run.link, Follower()):
-        run.arm()
+    with commanded(run_config(pace=pace)) as (run, _):
         backend: Any = run.backend
         backend.wrong = {key: sample}
         wait_until(run.ended, "the end of the host")

@@ -9,7 +9,7 @@ from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, Pace, SimulatorRequest
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import Follower, Running, following, running
+from tests.unit.hal.local_network import Running, commanded
 from tests.unit.hal.rig import description, run_config
 
 PATIENT: dict[str, Any] = {"rate_hz": 50.0}  # with the longest lease, 100 ms
@@ -32,9 +32,7 @@ def stands_at(run: Running) -> int:
 
 @pytest.mark.parametrize("pace", ["realtime", "lockstep"])
 def test_nothing_expires_in_a_pause_and_steps_are_exact(pace: Pace) -> None:
-    with running(run_config(pace=pace, **PATIENT)) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 5, "commands")
+    with commanded(run_config(pace=pace, **PATIENT)) as (run, control):
         assert "paused by ada" in ask(run, "pause")
         tick = stands_at(run)
         time.sleep(MANY_LEASES_S)
@@ -53,9 +51,7 @@ def test_nothing_expires_in_a_pause_and_steps_are_exact(pace: Pace) -> None:
 
 def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
     """The lease counts robot time: it is as long after a pause as it was before."""
-    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 5, "commands")
+    with commanded(run_config(pace="realtime", **PATIENT)) as (run, control):
         ask(run, "pause")
         stands_at(run)
         control.silent.set()
@@ -65,8 +61,7 @@ def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
 
 
 def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None:
-    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()):
-        run.arm()
+    with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
         ask(run, "pause")
         tick = stands_at(run)
         assert run.ask(keys.ESTOP, EstopRequest(who="bob")).lifecycle == "estop"
@@ -78,8 +73,7 @@ def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None
 
 
 def test_speed_scales_real_time_and_tells_when_it_is_not_reached() -> None:
-    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()):
-        run.arm()
+    with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")
         assert run.status.speed == 0.2 and run.status.real_time_factor == pytest.approx(0.2, rel=0.3)
@@ -87,8 +81,7 @@ def test_speed_scales_real_time_and_tells_when_it_is_not_reached() -> None:
 
 
 def test_a_reset_ends_the_host_disarmed() -> None:
-    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()):
-        run.arm()
+    with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
         ask(run, "reset")
         wait_until(run.ended, "the host's end")
         assert run.host.ended == "reset" and run.host.authority.state == "disarmed"

@@ -9,6 +9,7 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Done, Pose
 from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import received
 from tests.unit.hal.rig import clock, pose
 
 
@@ -74,6 +75,4 @@ def test_a_tick_that_was_commanded_before_is_reported_done_when_it_is_shown_agai
         if arming == 0:
             client.commanded_tick = 0
         client.done(0)
-    reported: list[Done] = []
-    wait_until(lambda: reported.extend(reports.drain()) is None and bool(reported), "the tick reported done", 5.0)
-    assert reported == [Done(tick=0)]
+    assert received(reports, "the tick reported done") == [Done(tick=0)]

@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import (
     Pose,
 )
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import Follower, LagBackend, following, meeting, running
+from tests.unit.hal.local_network import Follower, LagBackend, commanded, following, meeting, received, running
 from tests.unit.hal.rig import command, description, run_config, state
 
 pytestmark = pytest.mark.usefixtures("quick_threads")
@@ -102,9 +102,7 @@ def test_a_slow_participant_is_waited_for() -> None:
 
 def test_a_client_that_falls_silent_is_a_stall_then_an_expired_lease_and_the_joints_are_damped() -> None:
     config = run_config(stall_limit_s=0.2)
-    with running(config, end_after_fault_s=0.1) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 20, "twenty ticks")
+    with commanded(config, 20, end_after_fault_s=0.1) as (run, control):
         control.silent.set()
         wait_until(run.ended, "the end of the run")
         stalled, expired = run.host.authority.faults
@@ -136,9 +134,7 @@ def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_cl
 
 
 def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
+    with commanded(run_config(pace="realtime")) as (run, _):
         answer = run.ask(keys.ESTOP, EstopRequest(who="passer-by"))
         assert answer.ok and answer.lifecycle == "estop"
         at = len(run.backend.enacted)
@@ -186,9 +182,7 @@ def test_arming_waits_for_everybody_and_says_for_whom() -> None:
 
 
 def test_a_fault_of_the_backend_stops_the_robot() -> None:
-    with running(run_config(), end_after_fault_s=0.05) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 3, "three ticks")
+    with commanded(run_config(), end_after_fault_s=0.05) as (run, _):
         run.backend.next_faults = [Fault(tick=1, what="hot", cause="joint_2 is at 90 degrees", joint="joint_2")]
         wait_until(run.ended, "the end of the run")
         assert run.host.authority.faults[0].joint == "joint_2"
@@ -309,18 +303,10 @@ def test_free_waits_for_nobody() -> None:
 
 
 def test_somebody_who_comes_late_gets_description_status_and_what_is_applied() -> None:
-    with running(run_config()) as run, following(run.link, Follower()) as control:
-        run.arm()
-        wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
-        with open_session(run.link) as late:
-            descriptions = late.latched_reader(keys.DESCRIPTION, Description)
-            found: list[Description] = []
-            wait_until(lambda: found or found.extend(descriptions.drain()), "the description")
-            assert found == [run.host.description]
-            applied, poses = late.reader(keys.APPLIED, AppliedCommand), late.reader(keys.POSE, Pose)
-            commands: list[AppliedCommand] = []
-            wait_until(lambda: commands.extend(applied.drain()) or len(commands) > 3, "applied commands")
-            assert all(c.sequence is not None and c.mode == [Mode.POSITION] * 3 for c in commands)
-            seen: list[Pose] = []
-            wait_until(lambda: seen.extend(poses.drain()) or seen, "a pose")
-            assert all(pose.tick % 5 == 0 for pose in seen)
+    with commanded(run_config()) as (run, _), open_session(run.link) as late:
+        descriptions = late.latched_reader(keys.DESCRIPTION, Description)
+        assert received(descriptions, "the description") == [run.host.description]
+        applied, poses = late.reader(keys.APPLIED, AppliedCommand), late.reader(keys.POSE, Pose)
+        commands = received(applied, "applied commands", 4)
+        assert all(c.sequence is not None and c.mode == [Mode.POSITION] * 3 for c in commands)
+        assert all(pose.tick % 5 == 0 for pose in received(poses, "a pose"))

@@ -2,11 +2,8 @@
 
 import os
 import socket
-import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,7 +17,7 @@ from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import meeting
+from tests.unit.hal.local_network import meeting, received, threads_switching
 from tests.unit.hal.rig import description, state
 
 ROBOT = description()
@@ -35,13 +32,11 @@ def test_a_latched_value_reaches_readers_that_come_later_and_only_the_newest() -
         with open_session(Link(endpoint, "worm")) as late:
             reader, arrived = late.latched_reader(keys.JOINTS, JointState), list[Arrival]()
             late.on_latched_arrival(keys.JOINTS, arrived.append)
-            found: list[JointState] = []
-            wait_until(lambda: found.extend(reader.drain()) or found, "the latched value")
+            found = received(reader, "the latched value")
             wait_until(lambda: arrived, "the latched arrival")
             assert [joints.tick for joints in found] == [2] and arrived[0].key == keys.JOINTS
             publisher.put(state(ROBOT, tick=3))
-            wait_until(lambda: found.extend(reader.drain()) or len(found) > 1, "the next value")
-            assert [joints.tick for joints in found] == [2, 3]
+            assert [joints.tick for joints in received(reader, "the next value")] == [3]
 
 
 def test_a_reader_that_comes_first_gets_the_value_when_the_publisher_comes() -> None:
@@ -50,9 +45,7 @@ def test_a_reader_that_comes_first_gets_the_value_when_the_publisher_comes() -> 
         reader = early.latched_reader(keys.JOINTS, JointState)
         with open_session(Link(endpoint, "worm")) as hal:
             hal.latched_publisher(keys.JOINTS, JointState).put(state(ROBOT, tick=7))
-            found: list[JointState] = []
-            wait_until(lambda: found.extend(reader.drain()) or found, "the value")
-            assert found[0].tick == 7
+            assert received(reader, "the value")[0].tick == 7
 
 
 def test_a_stream_is_not_given_to_those_who_come_late() -> None:
@@ -64,9 +57,7 @@ def test_a_stream_is_not_given_to_those_who_come_late() -> None:
             reader = late.reader(keys.JOINTS, JointState)
             wait_until(publisher.heard, "the subscription")
             publisher.put(state(ROBOT, tick=2))
-            found: list[JointState] = []
-            wait_until(lambda: found.extend(reader.drain()) or found, "the sample")
-            assert [joints.tick for joints in found] == [2]
+            assert [joints.tick for joints in received(reader, "the sample")] == [2]
 
 
 def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
@@ -91,9 +82,7 @@ def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
         ]
         for payload, encoding in [*bad, (good, ENCODING_PREFIX + "JointState/1")]:
             hal._zenoh.put(keys.JOINTS, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
-        found: list[JointState] = []
-        wait_until(lambda: found.extend(reader.drain()) or found, "the good one")
-        assert [joints.tick for joints in found] == [20]
+        assert [joints.tick for joints in received(reader, "the good one")] == [20]
         assert session.rejected == {"unknown_version": 1, "unknown_message": 1, "malformed": 1}
 
 
@@ -230,17 +219,6 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
         wait_until(lambda: arrived, "the sample through the router")
 
 
-@contextmanager
-def often_switching() -> Iterator[None]:
-    """Threads take turns at almost every step."""
-    before_s = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before_s)
-
-
 def test_threads_may_open_sessions_at_once_and_the_environment_of_children_stays_as_it_was() -> None:
     endpoint, before, failed = free_endpoint(), dict(os.environ), list[BaseException]()
 
@@ -254,7 +232,7 @@ def test_threads_may_open_sessions_at_once_and_the_environment_of_children_stays
             failed.append(error)
             start.abort()
 
-    with often_switching(), open_session(Link(endpoint, "worm", listen=True)):
+    with threads_switching(1e-6), open_session(Link(endpoint, "worm", listen=True)):
         together = threading.Barrier(8)
         threads = [threading.Thread(target=open_often, args=(together,)) for _ in range(8)]
         for thread in threads:
