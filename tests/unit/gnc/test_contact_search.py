@@ -23,6 +23,13 @@ SEARCHES = "in search of contacts"
 JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
 
 
+def searching(*, among_pegs: bool = False, **settings: float) -> tuple[Stage, ObstacleAided]:
+    """A body on its path that searches for contacts after a second, unless configured otherwise."""
+    stage = make_stage()
+    stage.pegs = stage.pegs if among_pegs else []
+    return stage, ObstacleAided(stage.robot, ObstacleAided.Settings(**{"search_after_s": 1.0, **settings}))
+
+
 def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[Action]:
     """What is commanded while the body stays where it is."""
     return [controller.update(stage.view(tick, TAIL_S_M)) for tick in ticks]
@@ -39,16 +46,12 @@ def period_s(actions: list[Action]) -> float:
 
 
 def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again() -> None:
-    stage = make_stage()
-    pegs, stage.pegs = stage.pegs, []
-    controller = ObstacleAided(
-        stage.robot, ObstacleAided.Settings(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
-    )
+    stage, controller = searching(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
     alone = stands(controller, stage, range(300))
     searches = [SEARCHES in action.report.why for action in alone]
     assert not any(searches[:115]) and all(searches[125:])
     assert np.ptp(targets(alone[125:])[:, -1]) > 0.5  # of the head
-    stage.pegs = pegs
+    stage.pegs = make_stage().pegs
     beside = stands(controller, stage, range(300, 400))
     assert not any(SEARCHES in action.report.why for action in beside[25:])
     assert max(action.report.propulsion_n or 0.0 for action in beside) > 5.0
@@ -59,9 +62,7 @@ def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again(
 
 @pytest.mark.parametrize("among_pegs", [True, False])
 def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) -> None:
-    stage = make_stage()
-    stage.pegs = stage.pegs if among_pegs else []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, shape_nm_per_rad=0.0))
+    stage, controller = searching(among_pegs=among_pegs, shape_nm_per_rad=0.0)
     seen = stands(controller, stage, range(1010))
     periods = [period_s(seen[first : first + 240]) for first in (150, 450, 750)]
     felt, to_head = pytest.approx(math.tau / 5.39, rel=0.15), pytest.approx(0.8, rel=0.05)
@@ -70,8 +71,7 @@ def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) 
 
 
 def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_with_the_fast_one() -> None:
-    stage = make_stage()
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, shape_nm_per_rad=0.0))
+    stage, controller = searching(among_pegs=True, shape_nm_per_rad=0.0)
     for tick in range(100):
         controller.update(stage.view(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
     seen = stands(controller, stage, range(100, 1150))
@@ -81,9 +81,7 @@ def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_
 
 
 def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
-    stage = make_stage()
-    stage.pegs = []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0))
+    stage, controller = searching()
     stands(controller, stage, range(110))
     led = [controller.update(stage.view(tick, TAIL_S_M + 0.0003 * (tick - 110))) for tick in range(110, 900)]
     assert all(SEARCHES in action.report.why for action in led)
@@ -91,17 +89,13 @@ def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
 
 
 def test_noise_of_the_pose_does_not_hide_that_a_body_stands() -> None:
-    stage, noise = make_stage(), np.random.default_rng(1)
-    stage.pegs = []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.2))
+    (stage, controller), noise = searching(search_after_s=1.2), np.random.default_rng(1)
     views = (stage.view(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
     assert any(SEARCHES in controller.update(view).report.why for view in views)
 
 
 def test_nobody_searches_when_told_not_to() -> None:
-    stage = make_stage()
-    stage.pegs = []
-    never = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=0.0))
+    stage, never = searching(search_after_s=0.0)
     assert not any(SEARCHES in action.report.why for action in stands(never, stage, range(500)))
 
 
@@ -149,9 +143,8 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
 
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
 def test_a_body_that_moves_as_it_is_to_does_not_search_whatever_carries_it(speed_m_s: float) -> None:
-    stage = make_stage()
-    stage.pegs, stage.speed_m_s = [], speed_m_s
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0))
+    stage, controller = searching()
+    stage.speed_m_s = speed_m_s
     moving = [controller.update(stage.view(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
     assert not any(SEARCHES in action.report.why for action in moving)
 

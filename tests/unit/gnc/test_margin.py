@@ -8,20 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.planar import wrenches
-from snakesim_gnc.control.push import find_touches, push_forward
+from snakesim_gnc.control.push import Touches, find_touches, push_forward
 from snakesim_gnc.navigation.margin import LARGEST_N, margins_n
 from snakesim_hal.model.outlines import Outlines
-from tests.unit.gnc.stage import BODY_RADIUS_M, make_pegs, make_route, make_stage, nodes_of
+from snakesim_hal.wire.messages import Obstacle
+from tests.unit.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
 
 SEEDS = st.integers(0, 2**31)
 
 
-def turns(nodes: np.ndarray) -> np.ndarray:
-    """Change of the joint angles per metre of the way, of a body on the usual route."""
+def touching(tail_s_m: float, pegs: list[Obstacle] | None = None) -> tuple[np.ndarray, Touches, np.ndarray]:
+    """Nodes of a body on the usual route, what touches it, and its joints' change of angle per metre of the way."""
     stage = make_stage()
-    tail_s_m = stage.route.project(nodes[:, 0])
-    now, then = (angles_of(nodes_of(stage, s)) for s in (tail_s_m, tail_s_m + 0.01))
-    return (then - now) / 0.01
+    nodes = nodes_of(stage, tail_s_m)
+    outlines = Outlines.of(stage.pegs if pegs is None else pegs)
+    slope = (angles_of(nodes_of(stage, tail_s_m + 0.01)) - angles_of(nodes)) / 0.01
+    return nodes, find_touches(nodes, BODY_RADIUS_M, outlines, reach_m=0.03, friction=0.0), slope
 
 
 def angles_of(nodes: np.ndarray) -> np.ndarray:
@@ -57,11 +59,8 @@ def test_contacts_on_one_side_cannot_push() -> None:
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
 def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
-    stage = make_stage()
-    nodes = nodes_of(stage, tail_s_m)
-    outlines = Outlines.of(make_pegs(make_route()))
-    touches = find_touches(nodes, BODY_RADIUS_M, outlines, reach_m=0.03, friction=0.0)
-    push = push_forward(nodes, touches, turns(nodes), loose_m=0.005)
+    nodes, touches, slope = touching(tail_s_m)
+    push = push_forward(nodes, touches, slope, loose_m=0.005)
     assert len(touches) >= 3 and push.balanced
     assert push.lambdas.min() >= 0.0
     forces = push.lambdas[:, None] * touches.directions_w
@@ -84,10 +83,9 @@ def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
 @settings(max_examples=30)
 def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
     random = np.random.default_rng(seed)
-    nodes = nodes_of(make_stage(), float(random.uniform(0.0, 2.0)))
-    pegs = [p for p in make_pegs(make_route()) if random.uniform() < 0.6]
-    touches = find_touches(nodes, BODY_RADIUS_M, Outlines.of(pegs), reach_m=0.03, friction=0.0)
-    push = push_forward(nodes, touches, turns(nodes), loose_m=0.005)
+    pegs = [peg for peg in make_stage().pegs if random.uniform() < 0.6]
+    nodes, touches, slope = touching(float(random.uniform(0.0, 2.0)), pegs)
+    push = push_forward(nodes, touches, slope, loose_m=0.005)
     assert (push.lambdas >= 0.0).all() and np.isfinite(push.torques_nm).all()
     if len(touches) < 3:
         assert not push.balanced
@@ -95,9 +93,7 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
 def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m: float) -> None:
-    nodes = nodes_of(make_stage(), tail_s_m)
-    touches = find_touches(nodes, BODY_RADIUS_M, Outlines.of(make_pegs(make_route())), reach_m=0.03, friction=0.0)
-    slope = turns(nodes)
+    nodes, touches, slope = touching(tail_s_m)
     thrifty, smallest = (push_forward(nodes, touches, one, loose_m=0.005) for one in (slope, np.zeros_like(slope)))
     assert thrifty.balanced and smallest.balanced
     done, circled = (np.abs(one.torques_nm * slope).sum() for one in (thrifty, smallest))
@@ -107,9 +103,8 @@ def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m:
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55])
 def test_dearer_contacts_leave_the_push_to_three_that_can_do_it_alone(tail_s_m: float) -> None:
-    nodes = nodes_of(make_stage(), tail_s_m)
-    touches = find_touches(nodes, BODY_RADIUS_M, Outlines.of(make_pegs(make_route())), reach_m=0.03, friction=0.0)
-    slope, three = turns(nodes), np.argsort(touches.body_s_m)[:3]
+    nodes, touches, slope = touching(tail_s_m)
+    three = np.argsort(touches.body_s_m)[:3]
     dearer = np.full(len(touches), 1000.0)
     dearer[three] = 0.0
     push = push_forward(nodes, touches, slope, loose_m=0.005, dearer=dearer)

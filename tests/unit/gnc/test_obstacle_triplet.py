@@ -27,7 +27,7 @@ def stay(controller, stage, ticks, **more):
     return action
 
 
-def test_one_joint_pushes_and_all_others_hold_the_shape():
+def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved_triplet():
     stage = make_stage()
     action = stay(make_controller(stage), stage, 100)
     report = action.report
@@ -39,6 +39,18 @@ def test_one_joint_pushes_and_all_others_hold_the_shape():
     others = [i for i in range(13) if i != report.propulsion_joint]
     targets, angles = np.array(action.set_points.target), np.array(report.reference_rad)
     assert targets[others] == pytest.approx(angles[others], abs=1e-3)
+    forces = np.array([point.force_w for point in report.push_points])[:, :2]
+    tangent = np.array(report.push_points[0].tangent_w)[:2]
+    assert forces.sum(axis=0) == pytest.approx(report.propulsion_n * tangent, abs=1e-6)
+    assert np.hypot(*forces.T) == pytest.approx(report.solved_force_n)
+    assert min(report.solved_force_n) > 0
+    places = [point.body_s_m for point in report.push_points]
+    assert places == sorted(places)
+    torque = report.bending_torque_nm[known(report.propulsion_joint)]
+    assert report.propulsion_torque_nm == pytest.approx(torque, rel=1e-6)
+    assert report.torque_headroom_nm == pytest.approx(7.0 - abs(torque), abs=0.05)
+    assert len(report.bending_torque_nm) == len(report.reference_rad) == 13
+    assert 1 < known(report.condition) < 20
 
 
 def test_on_request_servos_lead_by_the_load_that_they_are_to_hold():
@@ -56,23 +68,6 @@ def test_on_request_servos_lead_by_the_load_that_they_are_to_hold():
     assert targets[others] == pytest.approx(np.array(action.set_points.target)[others], abs=5e-3)  # and fades
 
 
-def test_the_report_is_the_solved_triplet():
-    stage = make_stage()
-    report = stay(make_controller(stage), stage, 100).report
-    forces = np.array([point.force_w for point in report.push_points])[:, :2]
-    tangent = np.array(report.push_points[0].tangent_w)[:2]
-    assert forces.sum(axis=0) == pytest.approx(report.propulsion_n * tangent, abs=1e-6)
-    assert np.hypot(*forces.T) == pytest.approx(report.solved_force_n)
-    assert min(report.solved_force_n) > 0
-    places = [point.body_s_m for point in report.push_points]
-    assert places == sorted(places)
-    torque = report.bending_torque_nm[known(report.propulsion_joint)]
-    assert report.propulsion_torque_nm == pytest.approx(torque, rel=1e-6)
-    assert report.torque_headroom_nm == pytest.approx(7.0 - abs(torque), abs=0.05)
-    assert len(report.bending_torque_nm) == len(report.reference_rad) == 13
-    assert 1 < known(report.condition) < 20
-
-
 def test_the_faster_it_moves_the_less_it_pushes():
     stage = make_stage()
     controller = make_controller(stage)
@@ -85,16 +80,13 @@ def test_a_joint_that_has_swung_out_pushes_less():
     controller = make_controller(stage)
     settled = stay(controller, stage, 50).report
     joint, way = known(settled.propulsion_joint), np.sign(known(settled.propulsion_torque_nm))
-    swung = [
-        controller.update(stage.view(50 + t, TAIL_S_M, world_age_ticks=1 + t, turned={joint: 0.3 * way})).report
-        for t in range(10)
-    ]
-    assert swung[-1].propulsion_n == pytest.approx(0.5 * 35.0, rel=0.05)
-    back = [
-        controller.update(stage.view(60 + t, TAIL_S_M, world_age_ticks=11 + t, turned={joint: -0.3 * way})).report
-        for t in range(10)
-    ]
-    assert back[-1].propulsion_n == pytest.approx(35.0, rel=0.05)
+    for first, turned_rad, share in ((50, 0.3 * way, 0.5), (60, -0.3 * way, 1.0)):
+        views = [
+            stage.view(tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad})
+            for tick in range(first, first + 10)
+        ]
+        pushed = [controller.update(view).report.propulsion_n for view in views]
+        assert pushed[-1] == pytest.approx(share * 35.0, rel=0.05)
 
 
 def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():

@@ -198,18 +198,14 @@ def test_conditioning_is_a_choice():
     assert not case.solve(condition_max=10).feasible
 
 
-def test_a_joint_on_the_third_normal_has_no_authority():
+@pytest.mark.parametrize("from_contact_m", [0.1, 0.0])
+def test_a_joint_on_the_third_normal_or_at_its_contact_has_no_authority(from_contact_m):
     case = at_inflections(0.3)
-    on_the_normal = case.points[2] - 0.1 * case.normals[2]
+    on_the_normal = case.points[2] - from_contact_m * case.normals[2]
     solved = solve_triplet(case.points, case.normals, case.tangent, 35.0, on_the_normal)
     assert not solved.feasible
     assert "no authority" in solved.reason
     assert np.isfinite(solved.forces_n).all()
-
-
-def test_a_joint_at_the_third_contact_has_no_authority():
-    case = at_inflections(0.3)
-    assert "no authority" in solve_triplet(case.points, case.normals, case.tangent, 35.0, case.points[2]).reason
 
 
 def test_coinciding_contacts_are_refused():
