@@ -1,23 +1,23 @@
 """Services in threads of their own, on a real host and real Zenoh, with a controller that shows what it was given."""
 
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from snakesim_gnc.control.controller import View
+from snakesim_gnc.control.controller import Action, View
+from snakesim_gnc.control.hold import Hold
 from snakesim_gnc.control.service import Control
 from snakesim_gnc.guidance.service import Guidance
 from snakesim_gnc.navigation.service import Navigation
 from snakesim_hal.errors import SnakesimError
+from snakesim_hal.model.plugins import CONTROLLERS, offered
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.network.session import Link, Reader, open_session
 from snakesim_hal.service import Service, ServiceLoop
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Trajectory
+from snakesim_hal.wire.messages import ControlState
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Running, running
 from tests.unit.hal.rig import run_config
@@ -25,33 +25,50 @@ from tests.unit.hal.rig import run_config
 SERVICES: dict[str, type[Service]] = {"guidance": Guidance, "navigation": Navigation, "control": Control}
 SCHEDULE: dict[str, Any] = {"guidance": {"every_ticks": 2}, "navigation": {"every_ticks": 5}, "control": {}}
 POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of the tests gives it
-MODULE = "snakesim_plugin_showing"  # as a controller file of this name is loaded
-SHOWING = """
-from snakesim_gnc.control.controller import Action, positions
-from snakesim_gnc.control.hold import Hold
-
-VIEWS = []
-ANSWERS = []
 
 
 class Showing(Hold):
-    def update(self, view):
-        VIEWS.append(view)
-        return ANSWERS[0](self, view) if ANSWERS else super().update(view)
-"""
+    """Holds, unless it is to answer otherwise."""
+
+    views: list[View]
+    answers: list[Callable[["Showing", View], Any]]  # its only entry is how it answers
+
+    def update(self, view: View) -> Action:
+        """Keeps what it was given."""
+        self.views.append(view)
+        return self.answers[0](self, view) if self.answers else super().update(view)
 
 
 class StopError(BaseException):
     """The test is over."""
 
 
-@dataclass
 class Serving:
-    """A service at work."""
+    """A service at work in a thread."""
 
-    thread: threading.Thread
-    stopped: threading.Event
-    error: SnakesimError | None = None
+    def __init__(self, name: str, config: RunConfig, link: Link) -> None:
+        self.stopped, self.error = threading.Event(), None
+        self.thread = threading.Thread(target=self._work, args=(name, config, link), name=name)
+        self.thread.start()
+
+    def _work(self, name: str, config: RunConfig, link: Link) -> None:
+        with open_session(link) as session:
+            try:
+                loop = ServiceLoop(SERVICES[name], config, session)
+                outputs = loop.service.outputs
+
+                def stoppable(clock: Any) -> Any:
+                    if self.stopped.is_set():
+                        raise StopError
+                    return outputs(clock)
+
+                loop.service.outputs = stoppable
+                loop.join()
+                loop.run()
+            except StopError:
+                pass
+            except SnakesimError as error:
+                self.error = error
 
     def stop(self) -> None:
         """End it as a process ends: without a word."""
@@ -67,17 +84,8 @@ class Stage:
     run: Running
     services: dict[str, Serving]
     states: Reader[ControlState]
-    trajectories: Reader[Trajectory]
+    views: list[View]  # what the controller was given so far
     reported: list[ControlState] = field(default_factory=list[ControlState])
-
-    @property
-    def views(self) -> list[View]:
-        """What the controller was given so far."""
-        return sys.modules[MODULE].VIEWS
-
-    def answer(self, how: Callable[[Any, View], Any]) -> None:
-        """From now on the controller answers like this."""
-        sys.modules[MODULE].ANSWERS[:] = [how]
 
     def state(self) -> ControlState | None:
         """The newest of what control told."""
@@ -96,56 +104,21 @@ class Stage:
 
 
 @contextmanager
-def stage(folder: Path, **config: Any) -> Iterator[Stage]:
+def stage(**config: Any) -> Iterator[Stage]:
     """The worm in real time, with guidance, navigation, and control with the controller that shows its views."""
-    (folder / "showing.py").write_text(SHOWING)
-    controller = f"{folder / 'showing.py'}:Showing"
-    made = run_config(
-        controller=controller,
-        pace="realtime",
-        services=SCHEDULE,
-        rate_hz=50.0,
-        faults_allowed=True,
-        **{**POSE, **config},
-    )
-    with running(made) as run, open_session(run.link) as session, ExitStack() as stack:
-        states, trajectories = (
-            session.reader(keys.CONTROL_STATE, ControlState),
-            session.reader(keys.TRAJECTORY, Trajectory),
-        )
+    common = {"controller": "showing", "pace": "realtime", "services": SCHEDULE, "rate_hz": 50.0}
+    made = run_config(**{**common, "faults_allowed": True, **POSE, **config})
+    Showing.views, Showing.answers = [], []
+    with (
+        offered(CONTROLLERS, "showing", Showing),
+        running(made) as run,
+        open_session(run.link) as session,
+        ExitStack() as stack,
+    ):
+        states = session.reader(keys.CONTROL_STATE, ControlState)
         services: dict[str, Serving] = {}
         for name in SERVICES:
-            services[name] = _serve(name, made, run.link)
+            services[name] = Serving(name, made, run.link)
             stack.callback(services[name].stop)
         wait_until(lambda: set(SERVICES) <= set(run.status.alive), "all services")
-        yield Stage(run, services, states, trajectories)
-
-
-def _serve(name: str, config: RunConfig, link: Link) -> Serving:
-    serving = Serving(threading.Thread(name=name), threading.Event())
-
-    def work() -> None:
-        with open_session(link) as session:
-            try:
-                _loop(session)
-            except StopError:
-                pass
-            except SnakesimError as error:
-                serving.error = error
-
-    def _loop(session: Session) -> None:
-        loop = ServiceLoop(SERVICES[name], config, session)
-        outputs = loop.service.outputs
-
-        def stoppable(clock: Any) -> Any:
-            if serving.stopped.is_set():
-                raise StopError
-            return outputs(clock)
-
-        loop.service.outputs = stoppable
-        loop.join()
-        loop.run()
-
-    serving.thread = threading.Thread(target=work, name=name)
-    serving.thread.start()
-    return serving
+        yield Stage(run, services, states, Showing.views)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,7 @@ from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
 from tests.harness.wait import wait_until
-from tests.unit.gnc.services import Stage, stage
+from tests.unit.gnc.services import Showing, Stage, stage
 from tests.unit.hal.local_network import threads_switching
 
 PERIOD_NS = 20_000_000
@@ -39,8 +38,8 @@ def speed(made: Stage) -> float | None:
     return None if trajectory is None else trajectory.speed_m_s
 
 
-def test_without_joints_it_sends_nothing_and_the_lease_ends(tmp_path: Path) -> None:
-    with stage(tmp_path, faults=["drop:sensor/joints@1"]) as made:
+def test_without_joints_it_sends_nothing_and_the_lease_ends() -> None:
+    with stage(faults=["drop:sensor/joints@1"]) as made:
         commands = made.run.session.reader(keys.JOINT_COMMAND, JointCommand)
         joints = made.run.session.reader(keys.JOINTS, JointState)
         made.run.arm()
@@ -54,9 +53,9 @@ def test_without_joints_it_sends_nothing_and_the_lease_ends(tmp_path: Path) -> N
         assert len(made.views) < 80
 
 
-def test_a_command_names_the_joint_state_that_it_answers(tmp_path: Path) -> None:
+def test_a_command_names_the_joint_state_that_it_answers() -> None:
     """Not the clock, which comes also when its joint state was lost on the way."""
-    with stage(tmp_path, max_age={"joints_s": 0.5}) as made:
+    with stage(max_age={"joints_s": 0.5}) as made:
         session = made.run.session
         clocks, joints = session.reader(keys.CLOCK, Clock), session.reader(keys.JOINTS, JointState)
         commands = session.reader(keys.JOINT_COMMAND, JointCommand)
@@ -79,11 +78,9 @@ def test_a_command_names_the_joint_state_that_it_answers(tmp_path: Path) -> None
         ("navigation", keys.TRAJECTORY, "trajectory", "navigation/trajectory is "),
     ],
 )
-def test_a_stream_that_stops_is_withheld_named_and_given_again(
-    tmp_path: Path, sender: str, key: str, what: str, words: str
-) -> None:
+def test_a_stream_that_stops_is_withheld_named_and_given_again(sender: str, key: str, what: str, words: str) -> None:
     limits = {"pose_s": 0.3, "trajectory_s": 0.5}
-    with stage(tmp_path, max_age=limits) as made:
+    with stage(max_age=limits) as made:
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
         assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key)).ok
@@ -103,8 +100,8 @@ def test_a_stream_that_stops_is_withheld_named_and_given_again(
                 assert view.tick * PERIOD_NS - (view.world.pose_stamp_ns or 0) <= 300_000_000
 
 
-def test_guidance_that_ends_leaves_a_world_and_a_trajectory_that_grow_old(tmp_path: Path) -> None:
-    with stage(tmp_path, max_age={"trajectory_s": 0.5}) as made:
+def test_guidance_that_ends_leaves_a_world_and_a_trajectory_that_grow_old() -> None:
+    with stage(max_age={"trajectory_s": 0.5}) as made:
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
         made.services["guidance"].stop()
@@ -114,8 +111,8 @@ def test_guidance_that_ends_leaves_a_world_and_a_trajectory_that_grow_old(tmp_pa
         assert made.run.status.lifecycle == "armed"
 
 
-def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why(tmp_path: Path) -> None:
-    with stage(tmp_path) as made:
+def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why() -> None:
+    with stage() as made:
         clocks, operator = made.run.session.reader(keys.CLOCK, Clock), made.run.session
         intents = operator.publisher(keys.INTENT, Intent)
         made.run.arm()
@@ -144,13 +141,13 @@ def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why(tmp_p
     ],
     ids=["raises", "report"],
 )
-def test_a_controller_that_answers_wrongly_ends_control_with_its_name(tmp_path: Path, answer, words: str) -> None:
-    with stage(tmp_path) as made:
-        made.answer(answer)
+def test_a_controller_that_answers_wrongly_ends_control_with_its_name(answer, words: str) -> None:
+    with stage() as made:
+        Showing.answers.append(answer)
         made.run.arm()
         control = made.services["control"]
         wait_until(lambda: not control.thread.is_alive(), "the end of control")
         assert isinstance(control.error, ControllerError)
         for text in (str(control.error), made.tells(words).reason):
-            assert "showing.py:Showing (class Showing): " in text and words in text
+            assert "controller showing (class Showing): " in text and words in text
         made.run.reaches("fault")
