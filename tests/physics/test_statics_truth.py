@@ -6,6 +6,7 @@ slowly, and the end of all motion awaited.
 """
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 
 import msgspec
@@ -116,17 +117,6 @@ def make_config(points: np.ndarray, pegs: list[Cylinder], tail_s_m: float) -> Ru
     )
 
 
-def feasible_benches() -> list[tuple[int, Bench]]:
-    found: list[tuple[int, Bench]] = []
-    seed = 0
-    while len(found) < WANTED:
-        seed += 1
-        bench = make_bench(seed)
-        if bench is not None:
-            found.append((seed, bench))
-    return found
-
-
 def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) -> tuple[float, Floats]:
     """Tension and contact forces, for this share of the propulsion, at rest. ahead_rad: how far targets are ahead."""
     backend = SimBackend(bench.config, SimSettings(timestep_s=0.001, tether=bench.tether))
@@ -159,7 +149,8 @@ def with_shipped(bench: Bench, **more: object) -> Bench:
     return dataclasses.replace(bench, config=msgspec.structs.replace(bench.config, robot=robot))
 
 
-BENCHES = feasible_benches()
+FEASIBLE = ((seed, bench) for seed in itertools.count(1) if (bench := make_bench(seed)) is not None)
+BENCHES = list(itertools.islice(FEASIBLE, WANTED))
 each_bench = pytest.mark.parametrize("bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in BENCHES])
 a_few_benches = pytest.mark.parametrize(
     "bench",

@@ -5,6 +5,7 @@ import lzma
 import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -37,13 +38,9 @@ def test_every_entry_of_an_archive_is_aligned() -> None:
         assert int(entry[54:62], 16) == length  # the size, seventh of the eight-digit fields after the magic
 
 
-def test_a_module_comes_after_what_it_depends_on() -> None:
-    order = kernel.load_order(["can_raw", "kvaser_pci", "vcan"], KERNEL)
+def test_a_module_comes_after_what_it_depends_on_and_what_is_built_in_is_not_loaded() -> None:
+    order = kernel.load_order(["can_raw", "virtio_net", "kvaser_pci", "vcan"], KERNEL)
     assert order == ["can", "can_raw", "sja1000", "can_dev", "kvaser_pci", "vcan"]
-
-
-def test_what_is_built_in_is_not_loaded() -> None:
-    assert kernel.load_order(["virtio_net"], KERNEL) == []
 
 
 def test_a_kernel_without_the_module_is_named() -> None:
@@ -130,16 +127,18 @@ def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "kvaser_pci" not in qemu(REQUEST, monkeypatch)
 
 
-@pytest.mark.parametrize("text", ["", "17447", "0:7447", "17447:70000", "a:b"])
-def test_a_forward_that_is_not_two_ports_is_refused(text: str) -> None:
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        *((with_vcan.ports, text) for text in ("", "17447", "0:7447", "17447:70000", "a:b")),
+        *((with_vcan.names, text) for text in ("", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen")),
+    ],
+)
+def test_a_forward_that_is_not_two_ports_and_a_channel_that_is_no_name_are_refused(
+    parse: Callable[[str], object], text: str
+) -> None:
     with pytest.raises(argparse.ArgumentTypeError):
-        with_vcan.ports(text)
-
-
-@pytest.mark.parametrize("text", ["", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen"])
-def test_a_channel_that_is_no_name_is_refused(text: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError):
-        with_vcan.names(text)
+        parse(text)
 
 
 def test_a_command_is_needed() -> None:

@@ -41,22 +41,18 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_
         assert all(text.startswith("tick ") for text in run.host.faults.noted)
 
 
-@pytest.mark.parametrize(
-    ("request_", "refusal", "words"),
-    [
-        (("mote", "joint_1", {}), "cannot", "knows no 'mote'"),
-        (("mute", "joint_9", {}), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
-        (("leak", "joint_1", {}), "cannot", "backend 'lag' cannot do leak to joint_1"),
-        (("kill", "control", {}), "wrong_part", "is carried out by run"),
-        (("drop", "actuator/joints", {}), "wrong_part", "is carried out by control"),
-        (("mute", "joint_1", {"end": True}), "wrong_state", "is not active; active: nothing"),
-    ],
-)
-def test_what_cannot_be_is_refused_with_the_reason(request_: Any, refusal: str, words: str) -> None:
-    kind, target, more = request_
+def test_what_cannot_be_is_refused_with_the_reason() -> None:
     with running(run_config(**ALLOWED)) as run:
-        answer = ask(run, kind, target, **more)
-        assert not answer.ok and answer.refusal == refusal and words in answer.reason
+        for asked, refusal, words in (
+            (FaultRequest(kind="mote", target="joint_1"), "cannot", "knows no 'mote'"),
+            (FaultRequest(kind="mute", target="joint_9"), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
+            (FaultRequest(kind="leak", target="joint_1"), "cannot", "backend 'lag' cannot do leak to joint_1"),
+            (FaultRequest(kind="kill", target="control"), "wrong_part", "is carried out by run"),
+            (FaultRequest(kind="drop", target="actuator/joints"), "wrong_part", "is carried out by control"),
+            (FaultRequest(kind="mute", target="joint_1", end=True), "wrong_state", "is not active; active: nothing"),
+        ):
+            answer = run.ask(keys.fault("hal"), asked)
+            assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
         assert run.host.faults.noted == []
 
 

@@ -13,8 +13,6 @@ from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import meeting, running
 from tests.unit.hal.rig import clock, description, run_config, state
 
-# --- the client alone ------------------------------------------------------------------------------------------
-
 
 class Listing:
     """A reader that has what the test puts in."""

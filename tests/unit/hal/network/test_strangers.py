@@ -29,13 +29,13 @@ from snakesim_hal.wire.messages import (
     Message,
     Trajectory,
     World,
-    WorldContact,
 )
 from snakesim_hal.wire.quantities import Quaternion
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import LagBackend, meeting
 from tests.unit.hal.rig import clock, contact, description, pose, power, run_config, state
+from tests.unit.hal.strategies import plain_example
 
 ROBOT = description()  # three joints, four links
 X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
@@ -47,16 +47,9 @@ def contacts(link: int) -> Contacts:
 
 
 def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:
-    touch = WorldContact(link=link, obstacle=None, body_s_m=0.0, position_w=X, normal_w=X, tangent_w=X, force_w=X)
-    return World(
-        tick=0,
-        stamp_ns=0,
-        base_position_w=X,
-        base_orientation_wxyz=orientation,
-        base_confidence=1.0,
-        contacts=[touch],
-        obstacles=[],
-    )
+    example = plain_example(World)
+    example["contacts"][0]["link"] = link
+    return msgspec.convert({**example, "base_orientation_wxyz": orientation}, World)
 
 
 def imu(link: list[int], rates: int) -> Imu:
@@ -68,23 +61,8 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
 
 
 def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthImage:
-    return DepthImage(
-        tick=0,
-        stamp_ns=0,
-        link=link,
-        position_l=X,
-        orientation_l_wxyz=turned,
-        width=3,
-        height=2,
-        fx_px=2.0,
-        fy_px=2.0,
-        cx_px=1.0,
-        cy_px=0.5,
-        range_min_m=0.1,
-        range_max_m=3.0,
-        scale_m=0.001,
-        depth=depth,
-    )
+    values = {"link": link, "orientation_l_wxyz": turned, "width": 3, "height": 2, "depth": depth}
+    return msgspec.convert({**plain_example(DepthImage), **values}, DepthImage)
 
 
 @pytest.mark.parametrize(

@@ -240,13 +240,10 @@ LEASE_PERIODS = LEASE_NS // PERIOD_NS
 FAR_PERIODS = 4  # until a target that moves by 0.02 rad a period is further than 0.075 rad
 
 
-def stuck(bench: Bench, periods: int, step: float = 0.02, **other: Any) -> Fault | None:
-    fault = None
-    for k in range(periods):
-        fault = bench.see(
-            0.0, 0.0, other.get("torque", 0.5), applied=targets(step * k, other.get("mode", Mode.POSITION))
-        )
-    return fault
+def stuck(
+    bench: Bench, periods: int, step: float = 0.02, torque: float = 0.5, mode: Mode = Mode.POSITION
+) -> Fault | None:
+    return [bench.see(0.0, 0.0, torque, applied=targets(step * k, mode)) for k in range(periods)][-1]
 
 
 def test_a_joint_that_repeats_itself_while_its_target_moves_is_frozen() -> None:
