@@ -7,12 +7,10 @@ import numpy as np
 
 from snakesim_gnc.control.body_on_path import chain_nodes
 from snakesim_gnc.control.controller import View
-from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.robot import Chain, Module, RobotFile, describe
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
 from snakesim_hal.wire.messages import Axis, Description, Obstacle, Trajectory, World, WorldContact
-from tests.unit.hal.rig import state
+from tests.unit.hal.rig import description, state
 
 T = TypeVar("T")
 
@@ -34,22 +32,14 @@ def known(value: T | None) -> T:
 
 def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> Description:
     """A chain of modules of 0.11 m."""
-    file = RobotFile(
-        name="test",
-        chain=Chain(modules=modules, axes=list(axes)),
-        module=Module(length_m=0.11, radius_m=BODY_RADIUS_M, mass_kg=0.3),
-        limits=Limits(
-            angle_rad=1.5, speed_rad_s=7.5, acceleration_rad_s2=400, torque_nm=torque_nm, torque_rate_nm_s=200
-        ),
-        motor=Motor(
-            stiffness_nm_per_rad=60,
-            damping_nm_s_per_rad=1.5,
-            velocity_gain_nm_s_per_rad=1.5,
-            response_time_s=0.01,
-            armature_kg_m2=0.005,
-        ),
+    limits = {"speed_rad_s": 7.5, "acceleration_rad_s2": 400, "torque_nm": torque_nm, "torque_rate_nm_s": 200}
+    gains = {"stiffness_nm_per_rad": 60, "damping_nm_s_per_rad": 1.5, "velocity_gain_nm_s_per_rad": 1.5}
+    return description(
+        chain={"modules": modules, "axes": list(axes)},
+        module={"length_m": 0.11, "radius_m": BODY_RADIUS_M, "mass_kg": 0.3},
+        limits={"angle_rad": 1.5, **limits},
+        motor={"response_time_s": 0.01, "armature_kg_m2": 0.005, **gains},
     )
-    return describe(file, backend="none", period_ns=round(PERIOD_S * 1e9), lease_ns=10**8, config_hash="0")
 
 
 def make_world(**changes: Any) -> World:

@@ -48,14 +48,10 @@ def estimated(torques, imu, shape=SHAPE, pose: Pose | None = None) -> list[FeltC
     return estimate(ROBOT, shape.tolist(), [0.0] * COUNT, torques, imu, pose)
 
 
-def test_nothing_is_felt_where_nothing_pushes():
-    torques, imu, *_ = readings([])
-    assert estimated(torques, imu) == []
-
-
-def test_friction_of_the_ground_is_no_contact():
-    torques, imu, *_ = readings([], friction=0.3, acceleration=(-0.3 * GRAVITY_M_S2, 0.0))
-    assert estimated(torques, imu, pose=pose(velocity_w=(0.3, 0.0, 0.0))) == []
+@pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, pose(velocity_w=(0.3, 0.0, 0.0)))])
+def test_nothing_is_felt_where_nothing_pushes_but_the_ground_by_friction(friction, moves):
+    torques, imu, *_ = readings([], friction=friction, acceleration=(-friction * GRAVITY_M_S2, 0.0))
+    assert estimated(torques, imu, pose=moves) == []
 
 
 @pytest.mark.parametrize("side", [1, -1])

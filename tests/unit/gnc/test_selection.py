@@ -172,25 +172,15 @@ def test_points_become_choices_with_a_joint_each():
     assert len(barred) + len(why) == len(found) + len(refused)
 
 
-def choices_on_wave(amplitude_m: float, pegs: int):
-    route = make_route(amplitude_m)
-    planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:pegs]]
-    points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
-    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    return triplets.choices(points, BodyOnPath(route, SEGMENTS).at(0.2).nodes_w, NODE_S, None, None)
-
-
 @pytest.mark.parametrize(
     ("slope_deg", "pushes"), [(29.5, ["012", "014", "123", "234"]), (30.5, ["014"]), (37.5, ["014"]), (38.0, [])]
 )
 def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list[str]):
     """On a row of pegs at distances a and b along a wave of slope alpha, lambda_1 > 0 where cos 2 alpha > a/(a + b)."""
-    found, _ = choices_on_wave(math.tan(math.radians(slope_deg)) * 0.6 / math.tau, pegs=5)
+    route = make_route(math.tan(math.radians(slope_deg)) * 0.6 / math.tau)
+    planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:5]]
+    points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
+    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
+    found, refused = triplets.choices(points, BodyOnPath(route, SEGMENTS).at(0.2).nodes_w, NODE_S, None, None)
     assert ["".join(name[-1] for name in c.triplet.names) for c in found] == pushes
-
-
-def test_a_steep_row_is_refused_with_the_contact_that_would_pull():
-    found, refused = choices_on_wave(0.08, pegs=3)
-    assert not found
-    assert "lambda_1" in refused[0]
-    assert "peg_0/peg_1/peg_2" in refused[0]
+    assert all("lambda_1" in why for why in refused)

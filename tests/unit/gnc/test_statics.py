@@ -166,13 +166,6 @@ def test_bending_torque_at_the_propulsion_joint_is_its_torque(case):
     assert torque == pytest.approx(solved.torque_nm, rel=1e-9, abs=1e-9)
 
 
-def test_beyond_the_triplet_nothing_bends_the_body():
-    case = at_inflections(0.3)
-    pushed = loads(case.solve().forces_n, case.normals, -PROPULSION_N * case.tangent)
-    torque = bending_torque_nm([[-0.1, 0.0], [0.9, 0.1]], [-0.1, 0.9], case.points, [0.0, 0.3, 0.6], pushed)
-    assert torque == pytest.approx([0.0, 0.0], abs=1e-9)
-
-
 def test_parallel_normals_are_refused_as_ill_conditioned():
     case = at_inflections(1e-9)
     solved = case.solve()

@@ -1,6 +1,5 @@
 """The tether of the static checks: holds one way, and hardly any other."""
 
-import numpy as np
 import pytest
 
 from snakesim_hal.errors import ConfigError
@@ -62,12 +61,3 @@ def test_without_a_tether_there_is_no_tension():
 def test_a_tether_that_cannot_be_is_refused(change, word):
     with pytest.raises(ConfigError, match=word):
         open_sim(make_config(), tether={**BACKWARD, **change})
-
-
-def test_towing_goes_at_the_winch_s_speed():
-    run = Run(make_config({"chain": {"modules": 4}}), tether={**BACKWARD, "reel_in_m_s": 0.2})
-    run.command(Mode.POSITION)
-    run.go(1.0)
-    drag = 0.3 * 1.2 * 9.81
-    assert run.sim.true_state().base_velocity_w[0] == pytest.approx(-0.2 + drag / 300.0, rel=0.02)
-    assert np.hypot(*run.sim.true_state().base_velocity_w[1:]) < 0.01

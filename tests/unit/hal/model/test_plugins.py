@@ -145,30 +145,6 @@ def test_a_plugin_without_settings_is_told_to_state_them() -> None:
 # --- who may import whom ---------------------------------------------------------------------------------------
 
 LINTER = Path(sys.executable).parent / "lint-imports"
-needs_linter = pytest.mark.skipif(not LINTER.is_file(), reason="import-linter is not installed in this environment")
-
-
-def lint(folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(LINTER), "--config", "pyproject.toml", "--no-cache"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-
-
-@pytest.fixture(scope="module")
-def copy_of_the_packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("packages")
-    shutil.copy(REPOSITORY / "pyproject.toml", folder)
-    for package in REPOSITORY.glob("snakesim*"):
-        if package.is_dir():
-            shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
-    return folder
-
-
 NEIGHBOURS = "Everything stands on the HAL"
 HAL, OPERATOR, CAN = "The rooms of the HAL", "The rooms of the operator's tools", "The rooms of the CAN backend"
 PURE = "What keeps a robot safe is pure"
@@ -198,14 +174,18 @@ WRONG = [  # (folder, import, contract that it breaks)
 ]
 
 
-@needs_linter
-def test_a_wrong_import_is_found_at_every_level(copy_of_the_packages: Path) -> None:
+@pytest.mark.skipif(not LINTER.is_file(), reason="import-linter is not installed in this environment")
+def test_a_wrong_import_is_found_at_every_level(tmp_path: Path) -> None:
+    shutil.copy(REPOSITORY / "pyproject.toml", tmp_path)
+    for package in REPOSITORY.glob("snakesim*/"):
+        shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
     for folder, _, _ in WRONG:
         wrong = sorted({module for place, module, _ in WRONG if place == folder})
         lines = "".join(f"import {module}\n" for module in wrong)
-        (copy_of_the_packages / folder / "planted.py").write_text(f'"""Breaks rules."""\n\n{lines}')
-    (copy_of_the_packages / "snakesim_hal" / "in_no_room.py").write_text('"""Where does this belong?"""\n')
-    said = lint(copy_of_the_packages).stdout
+        (tmp_path / folder / "planted.py").write_text(f'"""Breaks rules."""\n\n{lines}')
+    (tmp_path / "snakesim_hal" / "in_no_room.py").write_text('"""Where does this belong?"""\n')
+    command = [str(LINTER), "--config", "pyproject.toml", "--no-cache"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False).stdout
     for folder, module, contract in WRONG:
         broken = next(row for row in said.splitlines() if row.startswith(contract))
         assert broken.endswith("BROKEN"), broken
