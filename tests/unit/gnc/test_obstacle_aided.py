@@ -5,16 +5,15 @@ import pytest
 
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import Stage, make_pegs, make_robot, make_route
+from tests.unit.gnc.stage import make_stage
 
-ROUTE, ROBOT = make_route(), make_robot()
 HELD_NM = 0.6  # that every joint is measured with
 
 
 @pytest.mark.parametrize("lost", ["world", "trajectory"])
 def test_from_torque_mode_it_goes_on_holding_with_the_torque_that_is_there(lost: str):
-    stage = Stage(ROBOT, ROUTE, make_pegs(ROUTE))
-    controller = ObstacleAided(ROBOT, ObstacleAided.Settings())
+    stage = make_stage()
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
     views = [stage.view(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
     pushing = [controller.update(view) for view in views][-1].set_points
     assert set(pushing.mode) == {Mode.TORQUE}
@@ -22,14 +21,14 @@ def test_from_torque_mode_it_goes_on_holding_with_the_torque_that_is_there(lost:
 
     holding = controller.update(stage.view(40, 1.0, torque_nm=HELD_NM, without=lost)).set_points
     assert set(holding.mode) == {Mode.POSITION}
-    by_spring_nm = (np.array(holding.target) - views[-1].joints.angle_rad) * [
-        j.stiffness_nm_per_rad for j in ROBOT.joints
-    ]
+    stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
+    by_spring_nm = (np.array(holding.target) - views[-1].joints.angle_rad) * stiffness
     assert by_spring_nm == pytest.approx(HELD_NM, rel=0.1)
 
 
 def test_a_body_that_nothing_can_push_holds_its_shape_in_position_mode():
-    controller = ObstacleAided(ROBOT, ObstacleAided.Settings())
-    alone = Stage(ROBOT, ROUTE, [])
-    actions = [controller.update(alone.view(tick, 1.0)) for tick in range(40)]
+    stage = make_stage()
+    stage.pegs = []
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
+    actions = [controller.update(stage.view(tick, 1.0)) for tick in range(40)]
     assert set(actions[-1].set_points.mode) == {Mode.POSITION}

@@ -23,7 +23,6 @@ from snakesim_hal.wire.messages import (
     Description,
     Done,
     EstopRequest,
-    Fault,
     JointCommand,
     LeaseRequest,
     Mode,
@@ -179,14 +178,6 @@ def test_arming_waits_for_everybody_and_says_for_whom() -> None:
         with following(run.link, Follower()):
             run.arm()
         assert run.status.alive == ["control"] or run.host.authority.faults
-
-
-def test_a_fault_of_the_backend_stops_the_robot() -> None:
-    with commanded(run_config(), end_after_fault_s=0.05) as (run, _):
-        run.backend.next_faults = [Fault(tick=1, what="hot", cause="joint_2 is at 90 degrees", joint="joint_2")]
-        wait_until(run.ended, "the end of the run")
-        assert run.host.authority.faults[0].joint == "joint_2"
-        assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
 
 
 # --- strangers -------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import pytest
 
 from snakesim_hal.errors import StalledError
 from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
@@ -14,27 +15,18 @@ from tests.unit.hal.local_network import meeting, running
 from tests.unit.hal.rig import clock, description, run_config, state
 
 
-class Listing:
-    """A reader that has what the test puts in."""
-
-    def __init__(self) -> None:
-        self.arrived: list[JointState] = []
-
-    def drain(self) -> list[JointState]:
-        taken, self.arrived = self.arrived, []
-        return taken
-
-
 def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
-    robot, reader = description(), Listing()
-    feed: Feed[JointState] = Feed(reader, keys.JOINTS)  # pyright: ignore[reportArgumentType]
+    robot, network = description(), LocalNetwork()
+    feed = Feed(network.session().reader(keys.JOINTS, JointState), keys.JOINTS)
+    joints = network.session().publisher(keys.JOINTS, JointState)
     assert feed.newest() is None and feed.at(0) is None
-    reader.arrived = [state(robot, 0.1 * tick, tick=tick) for tick in range(100)]
-    feed.take_in()
+    for tick in range(100):
+        joints.put(state(robot, 0.1 * tick, tick=tick))
+        feed.take_in()
     newest, kept = feed.newest(), feed.at(99)
     assert newest is not None and newest.tick == 99 and kept is newest
     assert feed.at(50) is None and feed.at(90) is not None
-    reader.arrived = [state(robot, 0.0, tick=90)]  # shown again: it came last
+    joints.put(state(robot, 0.0, tick=90))  # shown again: it came last
     feed.take_in()
     newest = feed.newest()
     assert newest is not None and newest.tick == 90
