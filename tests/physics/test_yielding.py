@@ -18,6 +18,9 @@ from tests.whole_run import configure, run
 AT = [3.0, 1.0]
 PEG: dict[str, Any] = {"position_m": AT, "radius_m": 0.05, "name": "it"}
 BOX: dict[str, Any] = {"position_m": AT, "size_m": [0.3, 0.1, 0.2], "name": "it"}
+MASS_KG, FOOT = 2.0, 0.5
+BLOCK = BOX | {"mass_kg": MASS_KG, "base_friction": FOOT}
+HOLDS_N = FOOT * MASS_KG * G
 DIRECTIONS = np.linspace(0.0, math.pi, 5)
 
 
@@ -58,40 +61,35 @@ def test_a_post_on_a_spring_gives_way_by_force_over_stiffness_and_comes_back(dir
     ],
 )
 def test_a_block_stands_below_the_friction_of_its_foot_and_slides_above_it(direction: float, step_s: float) -> None:
-    mass, friction = 2.0, 0.5
-    towards, holds = np.array([math.cos(direction), math.sin(direction)]), friction * mass * G
-    block = Pushed("box", BOX | {"mass_kg": mass, "base_friction": friction}, step_s)
-    held = block.for_s(1.0, tuple(0.9 * holds * towards))
+    towards = np.array([math.cos(direction), math.sin(direction)])
+    block = Pushed("box", BLOCK, step_s)
+    held = block.for_s(1.0, tuple(0.9 * HOLDS_N * towards))
     assert np.linalg.norm(held) < 2e-4
-    assert block.for_s(5.0, tuple(0.9 * holds * towards)) == pytest.approx(held, abs=1e-9)  # it does not creep
+    assert block.for_s(5.0, tuple(0.9 * HOLDS_N * towards)) == pytest.approx(held, abs=1e-9)  # it does not creep
     block.for_s(1.0)
-    block.for_s(0.1, tuple(2.0 * holds * towards))
+    block.for_s(0.1, tuple(2.0 * HOLDS_N * towards))
     before = block.speed
-    block.for_s(0.5, tuple(2.0 * holds * towards))
+    block.for_s(0.5, tuple(2.0 * HOLDS_N * towards))
     gained = block.speed - before
-    assert gained == pytest.approx([*(0.5 * holds / mass * towards), 0.0], rel=1e-3, abs=1e-3)
+    assert gained == pytest.approx([*(0.5 * HOLDS_N / MASS_KG * towards), 0.0], rel=1e-3, abs=1e-3)
     block.for_s(2.0)
     assert np.linalg.norm(block.speed) < 1e-6
 
 
 def test_a_block_turns_above_the_moment_of_its_foot() -> None:
-    mass, friction = 2.0, 0.5
     lengths = np.stack(np.meshgrid(np.linspace(-0.15, 0.15, 601), np.linspace(-0.05, 0.05, 201)))
-    holds = friction * mass * G * float(np.hypot(*lengths).mean())
+    holds_nm = HOLDS_N * float(np.hypot(*lengths).mean())
     for share, turns in ((0.97, False), (1.03, True)):
-        block = Pushed("box", BOX | {"mass_kg": mass, "base_friction": friction})
-        x, y, turn = block.for_s(3.0, moment_nm=share * holds)
+        x, y, turn = Pushed("box", BLOCK).for_s(3.0, moment_nm=share * holds_nm)
         assert (abs(turn) > 0.05) == turns
         assert math.hypot(x, y) < 1e-9
 
 
 def test_a_block_that_turns_is_moved_sideways_by_any_force() -> None:
     """Dry friction opposes the whole motion: a foot that slips already holds nothing across its slip."""
-    mass = 2.0
-    block = Pushed("box", BOX | {"mass_kg": mass, "base_friction": 0.5})
-    alone = Pushed("box", BOX | {"mass_kg": mass, "base_friction": 0.5})
-    gentle = (0.3 * 0.5 * mass * G, 0.0)
-    assert block.for_s(1.0, gentle, moment_nm=2.0)[0] > 0.01 > 1e-4 > alone.for_s(1.0, gentle)[0]
+    gentle = (0.3 * HOLDS_N, 0.0)
+    turned, alone = Pushed("box", BLOCK).for_s(1.0, gentle, moment_nm=2.0), Pushed("box", BLOCK).for_s(1.0, gentle)
+    assert turned[0] > 0.01 > 1e-4 > alone[0]
 
 
 def test_a_spring_that_the_step_cannot_follow_is_refused_with_what_would_do() -> None:

@@ -12,8 +12,7 @@ LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 
 
 def windings(count: int = 1, **exceptions: Any) -> Thermal:
-    joints = {"joint_1": exceptions} if exceptions else {}
-    robot = robot_file(chain__modules=count, limits__torque_nm=4.0, joints=joints)
+    robot = robot_file(chain__modules=count, limits__torque_nm=4.0, joints={"joint_1": exceptions})
     return Thermal(robot.joint_table)
 
 
