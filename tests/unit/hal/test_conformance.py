@@ -44,18 +44,6 @@ def clauses() -> set[str]:
     }
 
 
-def mutant_outcomes(report: Path) -> dict[tuple[str, str], set[str]]:
-    """(mutant, clause) -> what came of it."""
-    ran = run_suite("-p", "tests.contract.mutants", f"--junitxml={report}", "--tb=no", "-q")
-    assert report.is_file(), ran.stdout + ran.stderr
-    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for case in ElementTree.parse(report).getroot().iter("testcase"):
-        clause, _, rest = case.attrib["name"].partition("[")
-        children = [child.tag for child in case if child.tag in ("failure", "error", "skipped")]
-        outcomes[rest.rstrip("]").partition("-")[0], clause].add(children[0] if children else "passed")
-    return outcomes
-
-
 def test_every_clause_has_a_backend_that_breaks_it() -> None:
     broken = {clause for mutant in MUTANTS for clause in mutant.breaks}
     assert broken == clauses()
@@ -64,7 +52,14 @@ def test_every_clause_has_a_backend_that_breaks_it() -> None:
 @pytest.mark.slow
 def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
     """One test, so that workers side by side do not run the suite several times."""
-    outcomes = mutant_outcomes(tmp_path / "report.xml")
+    report = tmp_path / "report.xml"
+    ran = run_suite("-p", "tests.contract.mutants", f"--junitxml={report}", "--tb=no", "-q")
+    assert report.is_file(), ran.stdout + ran.stderr
+    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)  # (mutant, clause) -> what came of it
+    for case in ElementTree.parse(report).getroot().iter("testcase"):
+        clause, _, rest = case.attrib["name"].partition("[")
+        children = [child.tag for child in case if child.tag in ("failure", "error", "skipped")]
+        outcomes[rest.rstrip("]").partition("-")[0], clause].add(children[0] if children else "passed")
     tried = [(mutant.name, clause, outcomes[mutant.name, clause]) for mutant in MUTANTS for clause in mutant.breaks]
     unnoticed = [(name, clause, found) for name, clause, found in tried if not found or found - NOTICED]
     assert not unnoticed

@@ -18,10 +18,6 @@ LIMIT_S = 10.0  # on a busy machine; alone each takes less than two
 DEEP = ".".join("a" * 50_000)
 
 
-def endless(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
 def sparse(path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(50 * 1024**3)
@@ -35,7 +31,7 @@ def listening(path: Path) -> None:
 
 ODD: dict[str, tuple[Callable[[Path], object], str]] = {
     "pipe": (os.mkfifo, "is a pipe, not a file"),
-    "device that never ends": (endless, "is a device, not a file"),
+    "device that never ends": (lambda path: path.symlink_to("/dev/zero"), "is a device, not a file"),
     "terminal": (lambda path: path.symlink_to("/dev/tty"), "is a device, not a file"),
     "socket": (listening, "is a socket, not a file"),
     "folder": (Path.mkdir, "is a folder, not a file"),

@@ -10,8 +10,8 @@ import pytest
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.wire.freshness import FRESH_NS
-from snakesim_hal.wire.messages import Fault, JointCommand, LeaseRequest, Mode
-from tests.unit.hal.rig import LEASE_NS
+from snakesim_hal.wire.messages import Fault, LeaseRequest, Mode
+from tests.unit.hal.rig import LEASE_NS, command
 from tests.unit.hal.safety.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, ROBOT, Rig, armed, commanded, modes
 
 # --- arming ----------------------------------------------------------------------------------------------------
@@ -238,15 +238,7 @@ def test_a_lease_that_ran_out_is_free_before_a_tick_has_noticed() -> None:
 def test_a_command_that_names_no_arming_never_moves_an_armed_robot() -> None:
     rig = armed()
     rig.pass_tick()
-    bare = JointCommand(
-        tick=rig.tick,
-        sequence=50,
-        lease_epoch=rig.authority.lease.epoch,
-        layout=ROBOT.layout,
-        valid_for_ns=LEASE_NS,
-        mode=[Mode.POSITION] * JOINTS,
-        target=[0.2] * JOINTS,
-    )
+    bare = command(ROBOT, 0.2, tick=rig.tick, sequence=50, lease_epoch=rig.authority.lease.epoch)
     assert rig.authority.offer(bare, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "before_arming"
     assert rig.authority.rejected == {"before_arming": 1}
     assert rig.pass_tick().set_points.target == pytest.approx([0.1] * JOINTS)

@@ -20,7 +20,7 @@ from snakesim_hal.safety.gate import (
     why_limited,
 )
 from snakesim_hal.wire.messages import JointCommand, Mode
-from tests.unit.hal.rig import command
+from tests.unit.hal.rig import command, description
 from tests.unit.hal.safety.gate_rig import (
     ANGLE_STEP,
     COOL,
@@ -197,9 +197,9 @@ def test_modes_may_differ_from_joint_to_joint() -> None:
 # --- bumpless --------------------------------------------------------------------------------------------------
 
 
-def motor_torque(mode: int, target: float, angle: float, velocity: float) -> float:
-    """What a joint's motor does with a target in position and torque mode, by the description's gains."""
-    return 40.0 * (target - angle) - 1.0 * velocity if mode == Mode.POSITION else target
+def motor_torque(target: float, angle: float, velocity: float) -> float:
+    """What a joint's motor does with a target in position mode, by the description's gains."""
+    return 40.0 * (target - angle) - 1.0 * velocity
 
 
 @given(
@@ -213,7 +213,7 @@ def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
     angle: float, velocity: float, torque: float, wanted: float, before: Mode
 ) -> None:
     applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, before)
-    implied = motor_torque(Mode.POSITION, applied.target[0], angle, velocity)
+    implied = motor_torque(applied.target[0], angle, velocity)
     assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
 
 
@@ -249,7 +249,7 @@ def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
 def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
     measured = Measured(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
     hold = bumpless([Mode.POSITION] * JOINTS, measured)
-    implied = [motor_torque(1, *row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
+    implied = [motor_torque(*row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
     assert implied == pytest.approx(measured.torque_nm.tolist())
     assert bumpless([Mode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
 
@@ -369,8 +369,7 @@ BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: be
 def test_the_tightest_limit_is_the_one_that_is_named(
     side: int, angle: float, wanted: float, speed_limit: float, word: str
 ) -> None:
-    joints = [msgspec.structs.replace(joint, speed_limit_rad_s=speed_limit) for joint in ROBOT.joints]
-    robot = msgspec.structs.replace(ROBOT, joints=joints)
+    robot = description(limits__speed_rad_s=speed_limit)
     measured = Measured(np.full(JOINTS, side * angle), np.zeros(JOINTS), np.zeros(JOINTS))
     applied = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
     asked, limits = command(robot, side * wanted, Mode.VELOCITY), JointLimits.of(robot)
