@@ -62,17 +62,13 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     assert off < 3 * reported.position_sd_m + 0.005
 
 
-def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name():
+def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_elsewhere_is_something_new():
     map_ = mapped(cylinder("a", 0.8, 0.0))
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
     reported = only(map_)
     assert reported.felt and reported.name == name
     assert map_.at(np.array([0.75, 0.0])) is map_.tracks[0] and map_.at(np.array([0.5, 0.5])) is None
-
-
-def test_an_unexplained_touch_is_something_new():
-    map_ = mapped(cylinder("a", 0.8, 0.0))
     touch(map_, (0.8, 0.4), 0.05, 3.0)
     assert len(map_.obstacles(0, 0.0)) == 2
 

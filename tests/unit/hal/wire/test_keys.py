@@ -34,15 +34,10 @@ def test_every_key_constant_is_in_the_space() -> None:
     assert constants == {row.key for row in keys.SPACE}
 
 
-@given(service=CHUNK)
-def test_services_are_found_in_their_keys(service: str) -> None:
-    assert keys.service_of(keys.done(service)) == service
-    assert keys.service_of(keys.alive(service)) == service
-    assert keys.message_at(keys.done(service)) is Done
-
-
 @given(name=CHUNK)
-def test_cameras_and_lidars_have_keys_of_their_own(name: str) -> None:
+def test_services_are_found_in_their_keys_and_cameras_and_lidars_have_keys_of_their_own(name: str) -> None:
+    assert keys.service_of(keys.done(name)) == keys.service_of(keys.alive(name)) == name
+    assert keys.message_at(keys.done(name)) is Done
     assert keys.message_at(keys.depth(name)) is DepthImage
     assert keys.message_at(keys.colour(name)) is ColourImage
     assert keys.message_at(keys.ranges(name)) is Ranges
