@@ -46,7 +46,7 @@ def test_the_path_ends() -> None:
     assert there.finished and there.speed_m_s == 0.0 and there.reason == "the path is finished"
 
 
-def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops() -> None:
+def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops_as_it_does_when_asked_to() -> None:
     intents = Intents(MISSION_M_S)
     assert desired(intents, None, 0.0) == (MISSION_M_S, "")
     asked = intent(1.0)
@@ -57,6 +57,7 @@ def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops() -> N
     speed, why = desired(intents, None, 60.0)  # it does not go back to its mission
     assert speed == 0.0 and "send a new one to go on" in why
     assert desired(intents, intent(60.0, who="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
+    assert desired(intents, intent(60.2, go=False), 60.3) == (0.0, "ann wants it to stop")
 
 
 def test_an_intent_may_ask_for_less_time_and_gets_no_more_than_the_longest() -> None:
@@ -98,10 +99,6 @@ def test_a_direction_holds_while_the_robot_stands_and_until_somebody_wants_the_m
     assert (expired.speed_m_s, expired.heading_w_rad) == (0.0, 1.5)  # it stops on the path that it is on
     assert intents.desired(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
     assert intents.desired(intent(2.2), 2_200_000_000).heading_w_rad is None
-
-
-def test_stop_is_a_wish_too() -> None:
-    assert desired(Intents(MISSION_M_S), intent(1.0, go=False), 1.1) == (0.0, "ann wants it to stop")
 
 
 def test_after_another_start_of_the_robot_an_intent_of_before_does_not_count_at_the_same_time_again() -> None:

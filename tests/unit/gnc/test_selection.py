@@ -139,13 +139,9 @@ def choices_in_row(count=7):
     return [Choice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
 
 
-def test_the_present_triplet_stays():
+def test_the_present_triplet_stays_and_its_successor_shares_most_push_points():
     row = choices_in_row()
     assert choose(row, row[3].triplet, switch_share=0.5) is row[3]
-
-
-def test_its_successor_shares_most_push_points():
-    row = choices_in_row()
     rest = [row[0], row[1], row[4], row[6]]
     assert choose(rest, row[3].triplet, switch_share=0.5) is row[4]
 

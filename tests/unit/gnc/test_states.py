@@ -44,10 +44,6 @@ def advanced(speed_m_s, seconds, noise_m=0.0, every_s=0.02):
     return far
 
 
-def test_nothing_is_known_before_the_first_measurement():
-    assert Advance().metres is None
-
-
 def test_the_advance_is_that_of_the_last_second():
     far = advanced(0.1, 5.0)
     assert far[0] == 0.0
@@ -67,8 +63,9 @@ def test_a_body_that_stops_stands_still_a_second_later():
             assert advance.metres is not None and advance.metres < 0.005
 
 
-def test_after_a_time_without_any_measurement_it_begins_anew():
+def test_nothing_is_known_before_the_first_measurement_and_after_a_time_without_any_it_begins_anew():
     advance = Advance()
+    assert advance.metres is None
     advance.put(0.0, (0.0, 0.0, 0.0))
     advance.put(5.0, (1.0, 0.0, 0.0))
     assert advance.metres == 0.0
