@@ -63,16 +63,3 @@ def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) ->
             return [command.snakesim(*one, "--endpoint", run.endpoint, cwd=tmp_path).code for one in asked][-1] == 0
 
         wait_until(armed, "a robot that is armed again")
-
-
-@pytest.mark.parametrize(
-    ("given", "why"),
-    [
-        (("--set", "services.navigation.place=host"), "there is room for control alone"),
-        ((*BESIDE, "--fault", "kill:control@1"), "control is no process of its own"),
-        (("--set", "services.control.place=driver"), "services.control.place"),
-    ],
-)
-def test_what_cannot_be_is_refused(tmp_path: Path, given: tuple[str, ...], why: str) -> None:
-    ended = command.snakesim("run", "triplet", *given, cwd=tmp_path)
-    assert ended.code == 2 and why in ended.err, ended.err

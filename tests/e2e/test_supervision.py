@@ -187,10 +187,3 @@ def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
         nothing_left(tmp_path / "run")
-
-
-def test_a_router_that_the_run_does_not_have_cannot_fail(tmp_path: Path) -> None:
-    ended = snakesim("run", "triplet", "--set", 'faults=["kill:router@1"]', "--out", "run", cwd=tmp_path)
-    assert ended.code == 2 and "--with-router" in ended.err and not (tmp_path / "run").exists()
-    ended = snakesim("run", "triplet", "--with-router", "--router", "tcp/127.0.0.1:1", "--out", "run", cwd=tmp_path)
-    assert ended.code == 2 and "--with-router" in ended.err

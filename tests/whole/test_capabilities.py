@@ -1,37 +1,18 @@
-"""What joints can do and measure: a controller that needs more is refused before anything starts; others run."""
+"""What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
 
 import pytest
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.hold import Hold
-from snakesim_hal.errors import ConfigError, ControllerError
+from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.run.in_process import simulate
 from tests.unit.hal.rig import state
 
 SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
-
-
-@pytest.mark.parametrize(
-    ("sets", "words"),
-    [
-        (
-            ('robot.joints.joint_4.modes=["position", "velocity"]',),
-            "controller 'obstacle_triplet' needs torque mode of every joint, and joint_4 has position, velocity",
-        ),
-        (
-            ('robot.joints.joint_7.measures=["voltage"]',),
-            "needs the measured torque of every joint, and joint_7 does not measure it. Choose another controller",
-        ),
-    ],
-)
-def test_what_a_controller_needs_and_a_joint_lacks_is_named_before_the_start(sets: tuple[str, ...], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        check_plugins(load("triplet", [parse_set(text) for text in sets]).config)
 
 
 def test_a_robot_of_position_servos_without_measurements_runs_what_needs_none() -> None:

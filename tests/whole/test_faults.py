@@ -1,4 +1,4 @@
-"""Faults on request in runs of one process: planned with a flag, and refused."""
+"""Faults on request in runs of one process, planned with a flag. Those that are refused are in refusals.toml."""
 
 from pathlib import Path
 
@@ -75,26 +75,6 @@ def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path,
     before, after = slice(50, 95), slice(106, 150)
     assert (modes[before, 4] == Mode.POSITION).all() and (modes[after, 4] == Mode.PASSIVE).all()
     assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["run", "triplet", "--fault", "mute:joint_14@1"], "--fault mute:joint_14@1: `faults[0]`: "),
-        (["run", "triplet", "--fault", "mute:joint_1@1", "--fault", "drop:a/b@1"], "`faults[1]`: 'a/b': no part"),
-        (
-            ["run", "triplet", "--fault", "leak:joint_1@1"],
-            "cannot do leak to joint_1: the simulator has neither modules",
-        ),
-        (["fault", "mute"], "give a target"),
-        (["fault", "mote", "joint_1"], "did you mean `mute`?"),
-        (["fault", "reboot", "joint_1", "--for", "2"], "happens once and has no end"),
-    ],
-)
-def test_what_cannot_be_is_refused_before_anything_starts(tmp_path: Path, arguments: list[str], words: str) -> None:
-    ended = snakesim(*arguments, cwd=tmp_path)
-    assert ended.code == 2 and words in ended.err
-    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_robot_there_is_nothing_to_ask_and_the_list_is_there_anyway(tmp_path: Path) -> None:

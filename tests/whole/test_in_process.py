@@ -1,10 +1,7 @@
-"""What `simulate` and `snakesim run --in-process` leave, and what they refuse."""
+"""What `simulate` and `snakesim run --in-process` leave. What they refuse is in refusals.toml."""
 
 from pathlib import Path
 
-import pytest
-
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY
 from snakesim_operator.run.in_process import WORDS, simulate
@@ -39,27 +36,6 @@ def test_a_controller_that_fails_ends_the_run_in_a_safe_stop(tmp_path: Path) -> 
     assert "control ended: controller" in result.summary.ended and "no idea" in result.summary.ended
     assert [fault.what for fault in result.summary.faults] == ["service_lost", "lease_expired"]
     assert result.record.host.lifecycle == "fault"
-
-
-@pytest.mark.parametrize(
-    ("sets", "words"),
-    [
-        (["pace=realtime"], "pace is 'realtime', must be 'lockstep'; add --pace lockstep"),
-        (["services.control.external=true"], "it needs a control service that is not external"),
-        (["services.guidance.external=true"], "services.guidance is external, and there is no network to meet it"),
-        (['faults=["kill:control@1"]'], "fault 'kill:control@1' needs processes of their own"),
-    ],
-)
-def test_what_needs_processes_or_a_network_is_refused(sets: list[str], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        simulate(load("triplet", [parse_set(text) for text in sets]).config)
-
-
-def test_the_command_refuses_what_needs_a_network(tmp_path: Path) -> None:
-    for flags in (["--stay"], ["--endpoint", "tcp/127.0.0.1:7500"], ["--namespace", "lab"], ["--with-router"]):
-        ended = snakesim("run", "triplet", "--in-process", *flags, cwd=tmp_path)
-        assert ended.code == 2 and f"--in-process and {flags[0]}: there is no network" in ended.err
-    assert not (tmp_path / "runs").exists()
 
 
 def test_a_run_that_ends_in_a_fault_is_the_same_each_time() -> None:

@@ -70,11 +70,6 @@ def test_without_a_pose_sensor_a_controller_of_joints_runs_alone_and_any_other_b
     assert wrong.code == 2 and "contact" in wrong.err and not (tmp_path / "wrong").exists()
 
 
-def test_a_mission_without_a_goal_has_no_end(tmp_path: Path) -> None:
-    ended = snakesim("run", "triplet", "--until-goal", "--in-process", cwd=tmp_path)
-    assert ended.code == 2 and "until_goal" in ended.err and "this mission has no goal to reach" in ended.err
-
-
 def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) -> None:
     near = ["--set", "mission.goal.distance_m=0.4", "--duration", "6"]
     ended, _ = run_to_summary(tmp_path / "run", "surveyed_clutter", *near)

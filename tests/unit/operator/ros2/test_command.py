@@ -1,26 +1,8 @@
-"""What `snakesim ros2` refuses, and what time it is in ROS."""
+"""What time it is in ROS. What `snakesim ros2` refuses is in tests/whole/refusals.toml."""
 
 import time
 
-import pytest
-
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.cli import parser
-from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.relay import RosTime
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["--ros-namespace", "/2nd robot"], "--ros-namespace '/2nd robot': give a name such as planar13"),
-        (["--ros-router", "localhost"], "--ros-router"),
-    ],
-)
-def test_bad_arguments_are_named(arguments: list[str], word: str) -> None:
-    with pytest.raises(ConfigError) as refused:
-        check(parser().parse_args(["ros2", *arguments]))
-    assert word in str(refused.value)
 
 
 def test_robot_time_is_taken_as_it_is() -> None:
