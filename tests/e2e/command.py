@@ -1,17 +1,17 @@
 """Drives the real `snakesim` command, and reads what it leaves."""
 
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.harness.command import LIMIT_S, SNAKESIM, Ended, Running, environment, running, snakesim
+from tests.harness.command import LIMIT_S, SNAKESIM, Ended, Running, call, environment, running, snakesim
 from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import nothing_left
 
 TOO_SLOW = "this computer is too slow: "
 __all__ = [
@@ -27,39 +27,17 @@ __all__ = [
     "run_to_summary",
     "running",
     "snakesim",
+    "summary_of",
 ]
 
 
-def call(
-    typed: Sequence[object],
-    cwd: Path,
-    env: Mapping[str, str] | None = None,
-    limit_s: float = LIMIT_S,
-    *,
-    urgent: bool = False,
-) -> Ended:
-    """Any program to its end. env: all of its environment.
-
-    urgent: as a run's own control, where that is allowed: a busy computer holds it up otherwise.
-    """
-    done = subprocess.run(
-        [str(word) for word in typed],
-        cwd=cwd,
-        env=environment(cwd) if env is None else env,
-        capture_output=True,
-        text=True,
-        timeout=limit_s,
-        check=False,
-        preexec_fn=(lambda: set_realtime_priority(SERVICE_PRIORITY)) if urgent else None,
-    )
-    return Ended(done.returncode, done.stdout, done.stderr)
-
-
 @contextmanager
-def background(home: Path, *arguments: str, stdin: int | None = None) -> Iterator[subprocess.Popen[str]]:
-    """A command in the background, killed at the end."""
+def background(
+    home: Path, *arguments: str, stdin: int | None = None, program: Sequence[str] = SNAKESIM
+) -> Iterator[subprocess.Popen[str]]:
+    """A command, of ours or of another program, in the background, killed at the end."""
     with subprocess.Popen(
-        [*SNAKESIM, *arguments], cwd=home, env=environment(home), stdin=stdin, stdout=subprocess.PIPE, text=True
+        [*program, *arguments], cwd=home, env=environment(home), stdin=stdin, stdout=subprocess.PIPE, text=True
     ) as process:
         try:
             yield process
@@ -69,15 +47,23 @@ def background(home: Path, *arguments: str, stdin: int | None = None) -> Iterato
 
 @contextmanager
 def armed_run(out: Path, *arguments: str) -> Iterator[Running]:
-    """A run in the background, once its first line of progress tells that it is armed."""
+    """A run in the background, once its first line of progress tells that it is armed; it leaves no process behind."""
     with running(out, *arguments) as run:
         run.wait_for(" s  ")
         yield run
+        if run.process.poll() is not None:
+            nothing_left(out)
 
 
 def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:
-    """`snakesim run ... --out out`, and the summary that it left."""
+    """`snakesim run ... --out out`, and the summary that it left, and no process."""
     network = [] if "--router" in arguments else ["--endpoint", free_endpoint()]
     ended = snakesim("run", *arguments, "--out", str(out), *network, cwd=out.parent, more=more)
     assert (out / SUMMARY).is_file(), ended.said
-    return ended, msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
+    nothing_left(out)
+    return ended, summary_of(out)
+
+
+def summary_of(out: Path) -> RunSummary:
+    """What a run left."""
+    return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)

@@ -4,19 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import Running, armed_run, run_to_summary, snakesim
+from tests.e2e.command import armed_run, run_to_summary, snakesim
 from tests.harness.endpoint import free_endpoint
-from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
-from tests.whole import command
+from tests.whole.command import tell
 
 pytestmark = pytest.mark.e2e
-
-
-def host_record(out: Path) -> HostRecord:
-    return RunRecord.load(out).host
 
 
 @pytest.mark.parametrize(
@@ -29,7 +23,7 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str
     ended, _ = run_to_summary(
         tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--pace", pace, *flags
     )
-    record = host_record(tmp_path / "run")
+    record = RunRecord.load(tmp_path / "run").host
     assert ended.code == 0 and record.armed_ticks == 200
     replayed = record.rejected_commands["replayed"]
     assert replayed == 100 if pace == "lockstep" else 90 <= replayed <= 110
@@ -41,29 +35,24 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str
     ]
 
 
-def ask(run: Running, *words: str):
-    return command.snakesim("fault", *words, "--endpoint", run.endpoint, cwd=run.out.parent)
-
-
 @pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
 def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--backend", backend]
     with armed_run(tmp_path / "run", *arguments) as run:
-        result = ask(run, "leak", "joint_3") if backend == "sim" else ask(run, "diverge", "simulator")
+        result = tell(run, "fault", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
         assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
-        result = ask(run, "mute", "joint_99")
+        result = tell(run, "fault", "mute", "joint_99")
         assert result.code == 1 and "no joint_99" in result.err
-        result = ask(run, "drop", "guidance/world", "--amount", "0.2", "--for", "0.5")
+        result = tell(run, "fault", "drop", "guidance/world", "--amount", "0.2", "--for", "0.5")
         assert result.code == 0 and result.out.startswith("drop of guidance/world has begun, at "), result.err
-        result = ask(run, "mute", "joint_3", "--for", "30")
+        result = tell(run, "fault", "mute", "joint_3", "--for", "30")
         assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), result.err
         assert run.end() == 1
-    record = host_record(tmp_path / "run")
+    record = RunRecord.load(tmp_path / "run").host
     assert record.faults[0].joint in (None, "joint_3") and "joint_3" in record.faults[0].cause
     assert "mute:joint_3@" in record.injected[0]
     said = (tmp_path / "run" / "guidance.log").read_text()
     assert "drop:guidance/world@" in said and "begins" in said
-    nothing_left(tmp_path / "run")
 
 
 def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
@@ -71,7 +60,6 @@ def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path)
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
-    nothing_left(tmp_path / "run")
 
 
 def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
@@ -99,7 +87,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     loaded = [tmp_path / part for part in ("host", "control")]
     with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
-            result = ask(run, *words)
+            result = tell(run, "fault", *words)
             assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()

@@ -3,20 +3,16 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack
-from pathlib import Path
 
-import msgspec
 import pytest
 
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.network.session_file import read_session
-from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState
-from tests.e2e.test_programs import Lab
+from snakesim_operator.results.record import RunRecord
+from tests.e2e.test_programs import Lab, lab
 from tests.harness.wait import wait_until
 from tests.whole import command
 
@@ -25,6 +21,7 @@ pytestmark = pytest.mark.e2e
 # One namespace is a prefix of the other, and the other robot has another number of joints.
 ROBOTS = {"lab": ("planar13", "lateral_undulation", 13), "lab/second": ("mamba", "hold", 18)}
 SECONDS = {"quick": 2, "a million messages": 1000}
+__all__ = ["lab"]
 SCENE = 'name = "plain"\n[ground]\nfriction = 0.5\n'
 SCENARIO = """
 robot = "{robot}"
@@ -62,18 +59,11 @@ class Listener:
             self.foreign[namespace] += joints(message) != ROBOTS[namespace][2]
 
 
-@pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
-    with ExitStack() as stack:
-        made = Lab(tmp_path, stack)
-        made.start("router", str(made.router_file))
-        yield made
-
-
 @pytest.mark.parametrize(
     "form", ["quick", pytest.param("a million messages", marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
 def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
+    lab.start("router", str(lab.router_file))
     (lab.folder / "plain.toml").write_text(SCENE)
     hosts = {}
     for namespace, (robot, controller, _) in ROBOTS.items():
@@ -96,7 +86,7 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
         took_s = time.monotonic() - began
     assert not any(listener.foreign.values()), listener.foreign
     for robot, _, _ in ROBOTS.values():
-        record = msgspec.json.decode((lab.folder / robot / "host.json").read_bytes(), type=HostRecord)
+        record = RunRecord.load(lab.folder / robot).host
         assert record.rejected_commands == {}
         _, alone = command.run_to_summary(lab.folder / f"{robot}-alone", str(lab.folder / f"{robot}.toml"))
         assert record.command_digest == alone.command_digest

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.host.latch import ESTOP
-from tests.e2e.command import Ended, Running, armed_run
-from tests.harness.processes import nothing_left
+from tests.e2e.command import Running, armed_run
 from tests.harness.wait import wait_until
-from tests.whole import command
+from tests.whole.command import snakesim, tell
 
 pytestmark = pytest.mark.e2e
 
@@ -20,15 +19,9 @@ LONG = ("triplet", "--controller", "hold", "--duration", "600", "--pace", "realt
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    out = tmp_path_factory.mktemp("operator") / "run"
-    with armed_run(out, *LONG) as started:
+    with armed_run(tmp_path_factory.mktemp("operator") / "run", *LONG) as started:
         yield started
         assert started.interrupt() == 130, started.said()
-    nothing_left(out)
-
-
-def tell(run: Running, *arguments: str) -> Ended:
-    return command.snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.out.parent)
 
 
 def until_armed(run: Running) -> None:
@@ -69,7 +62,7 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
 
 
 def test_nobody_there(tmp_path: Path) -> None:
-    for arguments in (["estop"], ["clear"], ["arm", "planar13", "sim"], ["status"]):
-        ended = command.snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
+    for arguments in (["estop"], ["clear"], ["arm", "planar13", "sim"], ["fault", "mute", "joint_1"], ["status"]):
+        ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
         words = "no robot answers" if arguments == ["status"] else "no robot on tcp/127.0.0.1:9"
         assert ended.code == 1 and words in ended.err + ended.out

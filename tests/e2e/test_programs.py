@@ -6,12 +6,11 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.session_file import read_session
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import SNAKESIM, Ended, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
@@ -94,8 +93,7 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     lab.until_armed()
     assert second.wait(60) == 0, (lab.folder / "host-triplet.log").read_text()
     _, alone = command.run_to_summary(lab.folder / "alone", *SCENARIO)
-    record = msgspec.json.decode((lab.folder / "second" / "host.json").read_bytes(), type=HostRecord)
-    assert record.command_digest == alone.command_digest
+    assert RunRecord.load(lab.folder / "second").host.command_digest == alone.command_digest
     router.send_signal(signal.SIGINT)
     assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 

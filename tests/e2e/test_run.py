@@ -1,6 +1,5 @@
 """The main job, with real processes: it runs, it moves, and it repeats itself, however busy the machine is."""
 
-import json
 import os
 import re
 import subprocess
@@ -9,13 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import msgspec
 import pytest
 
-from snakesim_operator.results.record import REPORT, SUMMARY
-from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import TOO_SLOW, armed_run, run_to_summary, snakesim
-from tests.harness.processes import nothing_left
+from snakesim_operator.results.record import REPORT
+from tests.e2e.command import TOO_SLOW, armed_run, run_to_summary, summary_of
 
 pytestmark = pytest.mark.e2e
 
@@ -31,7 +27,6 @@ def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
     assert summary.backend == "sim" and summary.config["scene"]["name"] == "triplet"
     assert (tmp_path / "run" / REPORT).stat().st_size > 20_000
     assert str(tmp_path / "run" / REPORT) in ended.out
-    nothing_left(tmp_path / "run")
 
 
 @contextmanager
@@ -59,7 +54,7 @@ def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_
     arguments = ["triplet", "--controller", "hold", "--duration", "60", "--pace", "realtime", "--set", "rate_hz=50"]
     with armed_run(tmp_path / "run", *arguments) as run, starved(run.part("control")):
         assert run.end() == 1, run.said()
-    ended = msgspec.json.decode((tmp_path / "run" / SUMMARY).read_bytes(), type=RunSummary).ended
+    ended = summary_of(tmp_path / "run").ended
     assert re.match(rf"{TOO_SLOW}(control|host) waited for a processor for \d+ of \d+ ms", ended), ended
     assert "; lease of control expired: " in ended and f"fault: {TOO_SLOW}" in run.said()
 
@@ -84,8 +79,7 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
 
 def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
     short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--pace", "lockstep"]
-    ended = snakesim("run", "surveyed_clutter", *short, "--out", "run", cwd=tmp_path, limit_s=120.0)
+    ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)
     assert ended.code == 0, ended.out + ended.err
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["ended"] == "complete" and 1.0 < summary["duration_s"] < 7.0
+    assert summary.ended == "complete" and 1.0 < summary.duration_s < 7.0
     assert "on request by snakesim run, at the goal" in (tmp_path / "run" / "host.json").read_text()

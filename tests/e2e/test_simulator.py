@@ -15,7 +15,7 @@ from snakesim_operator.run.in_process import simulate
 from tests.e2e.command import running
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
-from tests.whole.command import snakesim
+from tests.whole.command import snakesim, tell
 
 pytestmark = pytest.mark.e2e
 
@@ -28,7 +28,7 @@ def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_
     with running(out, *RUN) as run:
 
         def sim(*asked: str, code: int = 0) -> str:
-            ended = snakesim("sim", *asked, "--endpoint", run.endpoint, cwd=tmp_path)
+            ended = tell(run, "sim", *asked)
             assert ended.code == code, ended.out + ended.err
             return ended.out + ended.err
 
@@ -51,7 +51,7 @@ def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_
             assert len(hosts) == 2, hosts
             assert "as fast as it can" in sim("speed", "2", code=1)
             sim("pause")
-            assert snakesim("arm", "planar13", "sim", "--endpoint", run.endpoint, cwd=tmp_path).code == 0
+            assert tell(run, "arm", "planar13", "sim").code == 0
             sim("step", "7")
             wait_until(lambda: shows("armed", 7), "7 ticks")
             wait_until(lambda: "PAUSED" in run.said(), "the pause on the terminal")

@@ -6,15 +6,13 @@ import signal
 from pathlib import Path
 from typing import Literal
 
-import msgspec
 import pytest
 
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
-from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import Running, armed_run, running
+from tests.e2e.command import Running, armed_run, running, summary_of
 from tests.harness.processes import nothing_left, processes_of
 from tests.harness.wait import wait_until
 from tests.whole.command import snakesim
@@ -80,8 +78,7 @@ def pids(run: Running, *names: str) -> dict[str, int]:
 
 def interrupt(run: Running) -> RunSummary:
     assert run.interrupt() == 130 and "report:" in run.said(), run.said()
-    nothing_left(run.out)
-    return msgspec.json.decode((run.out / SUMMARY).read_bytes(), type=RunSummary)
+    return summary_of(run.out)
 
 
 @pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
@@ -147,7 +144,6 @@ def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> Non
     with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1 and "guidance was ended by SIGKILL" in run.said()
-    nothing_left(tmp_path / "run")
 
 
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:

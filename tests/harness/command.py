@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,16 +51,28 @@ def snakesim(
     inside: Sequence[str] = (),
 ) -> Ended:
     """Run a command to its end. more: of the environment. inside: a prefix that runs it somewhere else."""
+    return call([*inside, *SNAKESIM, *arguments], cwd, environment(cwd, **(more or {})), limit_s)
+
+
+def call(
+    typed: Sequence[object],
+    cwd: Path,
+    env: Mapping[str, str] | None = None,
+    limit_s: float = LIMIT_S,
+    begin: Callable[[], None] | None = None,
+) -> Ended:
+    """Any program to its end. env: all of its environment. begin: is called in its process, before it begins."""
     began = time.monotonic()
     try:
         done = subprocess.run(
-            [*inside, *SNAKESIM, *arguments],
+            [str(word) for word in typed],
             cwd=cwd,
-            env=environment(cwd, **(more or {})),
+            env=environment(cwd) if env is None else env,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=limit_s,
             check=False,
+            preexec_fn=begin,
         )
     except subprocess.TimeoutExpired as late:
         code, out, err = TOO_LONG, late.stdout, (late.stderr or b"") + b"\n[did not end within %g s]" % limit_s

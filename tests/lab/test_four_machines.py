@@ -11,9 +11,8 @@ import pytest
 
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.lab.lab_file import EXAMPLE
-from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM
+from tests.e2e.command import SNAKESIM, summary_of
 from tests.machines import NET, connected
 
 pytestmark = [
@@ -104,7 +103,7 @@ def run_alone(lab: Lab) -> RunSummary:
     """The same run, on the robot's machine alone."""
     more = ("--in-process",) if lab.backend == "sim" else ()
     lab.at("robot1", "run", *SCENARIO, "--backend", lab.backend, "--out", "alone", *more)
-    return msgspec.json.decode((lab.folder / "alone" / SUMMARY).read_bytes(), type=RunSummary)
+    return summary_of(lab.folder / "alone")
 
 
 def finished(lab: Lab) -> HostRecord:

@@ -4,12 +4,10 @@ import contextlib
 import io
 from pathlib import Path
 
-import msgspec
-
 from snakesim_operator.cli import main
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import Ended
+from tests.e2e.command import Ended, Running, summary_of
 
 
 def snakesim(*arguments: str, cwd: Path) -> Ended:
@@ -23,8 +21,13 @@ def snakesim(*arguments: str, cwd: Path) -> Ended:
     return Ended(code, out.getvalue(), err.getvalue())
 
 
+def tell(run: Running, *arguments: str) -> Ended:
+    """The same, told where a run is."""
+    return snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.home)
+
+
 def run_to_summary(out: Path, *arguments: str) -> tuple[Ended, RunSummary]:
     """`snakesim run ... --in-process --out out`, and the summary that it left."""
     ended = snakesim("run", *arguments, "--in-process", "--out", str(out), cwd=out.parent)
     assert (out / SUMMARY).is_file(), ended.out + ended.err
-    return ended, msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
+    return ended, summary_of(out)

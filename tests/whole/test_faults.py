@@ -5,16 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import RunRecord
 from tests.whole.command import run_to_summary, snakesim
 
 MAY_LOSE_ONE = "robot.safety.may_lose_joints=1"
-
-
-def host_record(out: Path) -> HostRecord:
-    return RunRecord.load(out).host
 
 
 @pytest.mark.parametrize(
@@ -48,7 +43,8 @@ def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
 ) -> None:
     robot = ("--set", "robot=planar13_mixed") if backend == "mixed" else ()
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault)
-    record, by = host_record(tmp_path / "run"), 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
+    record = RunRecord.load(tmp_path / "run").host
+    by = 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
     assert ended.code == 1 and summary.faults[0].what == what
     assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= by
     assert record.lifecycle == "fault"
@@ -77,8 +73,6 @@ def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path,
     assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
 
 
-def test_without_a_robot_there_is_nothing_to_ask_and_the_list_is_there_anyway(tmp_path: Path) -> None:
-    ended = snakesim("fault", "mute", "joint_1", "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
-    assert ended.code == 1 and ended.err.startswith("snakesim: ")
+def test_the_list_is_there_without_a_robot(tmp_path: Path) -> None:
     ended = snakesim("fault", "list", cwd=tmp_path)
     assert ended.code == 0 and "undervoltage" in ended.out
