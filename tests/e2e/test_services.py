@@ -16,7 +16,6 @@ from snakesim_operator.run.in_process import WORDS
 from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary
 from tests.e2e.documents import REPOSITORY, sections
 from tests.harness.endpoint import free_endpoint
-from tests.harness.processes import nothing_left
 from tests.whole import command as in_process
 
 pytestmark = pytest.mark.e2e
@@ -64,7 +63,6 @@ def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]
 
 def test_a_service_of_a_file_publishes_a_pose_in_processes_and_in_one(home: Path) -> None:
     assert digest_of(home, "many", run_to_summary) == digest_of(home, "one", in_process.run_to_summary)
-    nothing_left(home / "many")
 
 
 WRONG = {
@@ -98,34 +96,6 @@ def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path
             said = service.stderr.readline()
             service.terminate()
         assert said.startswith("sensor: waiting for the network")
-
-
-def test_a_service_that_a_recording_names_runs_only_when_its_user_says_so(home: Path) -> None:
-    (home / "mine.py").write_text(
-        "from pathlib import Path\n"
-        "from snakesim_gnc.navigation.service import Navigation\n"
-        "(Path(__file__).parent / 'ran').touch()\n"
-        "class Mine(Navigation):\n    pass\n"
-    )
-    code = "services.navigation.code="
-    begin = ["run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", "--set", f"{code}./mine.py:Mine"]
-    ended = in_process.snakesim(*begin, cwd=home)
-    assert ended.code == 0, ended
-    (home / "ran").unlink()
-    for other in (["info", "run"], ["report", "run"], ["export", "run", "--format", "csv"], ["compare", "run", "run"]):
-        assert in_process.snakesim(*other, cwd=home).code == 0 and not (home / "ran").exists()
-    refused = in_process.snakesim("replay", "run", "--control", "--controller", "hold", cwd=home)
-    assert refused.code == 2 and "the recording names './mine.py:Mine' as its service navigation" in refused.err
-    assert "--run-recorded-code" in refused.err and f"--set {code}./mine.py:Mine" in refused.err
-    for more, runs in (
-        (["--set", f"{code}navigation"], False),
-        (["--set", f"{code}./mine.py:Mine"], True),
-        (["--run-recorded-code"], True),
-    ):
-        replayed = in_process.snakesim("replay", "run", "--control", *more, cwd=home)
-        assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
-        assert (home / "ran").exists() == runs
-        (home / "ran").unlink(missing_ok=True)
 
 
 MALFORMED = {
@@ -163,7 +133,6 @@ def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(home: P
     else:
         ended, summary = run_to_summary(home / "run", *code, "--pace", pace)
         log = (home / "run" / "sensor.log").read_text()
-        nothing_left(home / "run")
     assert ended.code == 1 and summary.duration_s < 5.0  # it ends at once
     said = re.compile(
         r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*" + re.escape(words)
@@ -197,7 +166,6 @@ def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Pat
     for said in (summary.ended, ended.out):
         assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out
     assert ended.code == 1 and summary.duration_s == 0.0
-    nothing_left(home / "run")
     alone = in_process.snakesim("run", *flags, "--in-process", "--out", "one", cwd=home)
     assert alone.code != 0 and given_up in alone.err and why in alone.err, alone
 

@@ -6,27 +6,19 @@ A command may do its work, do it and say what is lost, or refuse in a line; with
 import random
 import shutil
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import pytest
-import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.recording import mcap_file, recording
 from snakesim_operator.recording.chunks import HEAD, unpack
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.run.in_process import simulate
 from tests.fuzz.forked import Forked, forked
 from tests.harness.endpoint import free_endpoint
-from tests.whole.damaged import Span, chunks, flipped, spans
+from tests.whole.damaged import Span, chunks, flipped, packed, recorded, spans
 
 SPOILT, WHOLE, OUT = "spoilt.mcap", "whole.mcap", "made"
 COMMANDS: dict[str, list[str]] = {
@@ -130,14 +122,6 @@ def forged(chance: random.Random, content: bytes) -> bytes:
     return content[: span.begin] + packed(bytes(data)) + content[span.end :]
 
 
-def packed(content: bytes, compression: str = "zstd", data: bytes | None = None) -> bytes:
-    """A chunk record."""
-    builder = RecordBuilder()
-    body = zstandard.compress(content) if data is None else data
-    Chunk(compression, body, 0, 0, zlib.crc32(content), len(content)).write(builder)
-    return builder.end()
-
-
 def noise(chance: random.Random, content: bytes) -> bytes:
     """Nothing behind the magic that is of ours."""
     return MCAP0_MAGIC + chance.randbytes(chance.choice((0, 1, 500, 100_000)))
@@ -163,7 +147,7 @@ class Verdict:
 
 def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> Verdict:
     """So many damaged copies, each into all commands, or so many of them in turn."""
-    record(folder / "run")
+    recorded(folder / "run", 0.6, 40_000)
     content, verdict = (folder / "run" / RECORDING).read_bytes(), Verdict()
     names = [name for name in COMMANDS if name != TRUTH]
     with forked(folder) as runner:
@@ -174,14 +158,6 @@ def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> V
             chosen = names if commands is None else [*names, *names][first : first + commands]
             _try(folder / f"{number}", runner, spoilt, content, chosen, f"{damage.__name__} {number}", verdict)
     return verdict
-
-
-def record(out: Path) -> None:
-    """A short run, in many small chunks."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(mcap_file, "CHUNK_BYTES", 40_000)
-        patched.setattr(recording, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
-        simulate(load("peg_row", [parse_set("duration_s=0.6")]).config, out)
 
 
 def _try(

@@ -3,40 +3,27 @@
 import csv
 import json
 import struct
-import zlib
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire import keys
-from snakesim_operator.recording import mcap_file, recording
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.run.in_process import simulate
 from tests.whole.command import snakesim
-from tests.whole.damaged import chunks, flipped, spans, written
+from tests.whole.damaged import chunks, flipped, packed, recorded, spans, written
 
 INCOMPLETE = 3
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of many small chunks, as a long recording has them."""
-    out = tmp_path_factory.mktemp("recorded") / "run"
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(mcap_file, "CHUNK_BYTES", 100_000)
-        patched.setattr(recording, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
-        simulate(load("peg_row", [parse_set("duration_s=1.5")]).config, out)
-    return out
+    return recorded(tmp_path_factory.mktemp("recorded") / "run", 1.5, 100_000)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +37,8 @@ def lost(whole_path: Path, path: Path) -> dict[str, int]:
     """By key, by comparison with the file as it was."""
     counts = [dict[str, int](), dict[str, int]()]
     for count, reader in zip(counts, (RecordingReader(whole_path), RecordingReader(path)), strict=True):
-        for recorded in reader.messages():
-            count[recorded.key] = count.get(recorded.key, 0) + 1
+        for one in reader.messages():
+            count[one.key] = count.get(one.key, 0) + 1
     missing = {key: number - counts[1].get(key, 0) for key, number in counts[0].items()}
     return {key: number for key, number in missing.items() if number}
 
@@ -199,14 +186,6 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
     assert list(reader.messages()) and reader.finished and not reader.lacks
 
 
-def packed(content: bytes, name: str = "zstd", size: int | None = None, data: bytes | None = None) -> bytes:
-    """A chunk record. size: what it claims to unpack to."""
-    builder = RecordBuilder()
-    body = zstandard.compress(content) if data is None else data
-    Chunk(name, body, 0, 0, zlib.crc32(content), len(content) if size is None else size).write(builder)
-    return builder.end()
-
-
 def test_a_bad_lz4_chunk_and_an_impossible_time_are_damage_as_any_other(whole: bytes, tmp_path: Path) -> None:
     first, second = chunks(whole)[:2]
     bad = packed(b"abc", "lz4", data=b"no lz4 at all")
@@ -238,41 +217,41 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
         assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
 
 
-@pytest.fixture(scope="module")
-def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a run of a controller whose file leaves a mark when it is loaded."""
-    folder = tmp_path_factory.mktemp("foreign")
-    (folder / "mine.py").write_text(
+NAVIGATION = "services.navigation.code="
+NAMED = {  # the class that is made another; how a run names that one, how the refusal calls it, and what stands for it
+    "controller": ("control.hold import Hold", ("--controller", "./mine.py:Mine"), ("--controller", "hold")),
+    "service navigation": (
+        "navigation.service import Navigation",
+        ("--set", f"{NAVIGATION}./mine.py:Mine"),
+        ("--set", f"{NAVIGATION}navigation"),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NAMED)
+def test_what_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, kind: str) -> None:
+    base, own, shipped = NAMED[kind]
+    (tmp_path / "mine.py").write_text(
         "from pathlib import Path\n"
-        "from snakesim_gnc.control.hold import Hold\n"
+        f"from snakesim_gnc.{base} as Base\n"
         "(Path(__file__).parent / 'ran').touch()\n"
-        "class Mine(Hold):\n    pass\n"
+        "class Mine(Base):\n    pass\n"
     )
-    begin = ["run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", "--controller", "./mine.py:Mine"]
-    ended = snakesim(*begin, cwd=folder)
-    assert ended.code == 0 and (folder / "ran").exists(), ended
-    return folder
-
-
-def test_who_reads_a_recording_runs_no_code_that_it_names(foreign: Path) -> None:
-    (foreign / "ran").unlink(missing_ok=True)
+    begun = snakesim("run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", *own, cwd=tmp_path)
+    assert begun.code == 0 and (tmp_path / "ran").exists(), begun
+    (tmp_path / "ran").unlink()
     for words in ("info run", "report run", "export run --format csv", "compare run run"):
-        assert snakesim(*words.split(), cwd=foreign).code == 0
-    replayed = snakesim("replay", "run", "--control", cwd=foreign)
-    assert replayed.code == 2 and "the recording names './mine.py:Mine' as its controller" in replayed.err
-    assert "--run-recorded-code" in replayed.err and "--controller ./mine.py:Mine" in replayed.err
-    assert not (foreign / "ran").exists()
-
-
-@pytest.mark.parametrize(
-    ("more", "runs"),
-    [("--controller ./mine.py:Mine", True), ("--run-recorded-code", True), ("--controller hold", False)],
-)
-def test_it_runs_when_its_user_says_so(foreign: Path, more: str, runs: bool) -> None:
-    (foreign / "ran").unlink(missing_ok=True)
-    replayed = snakesim("replay", "run", "--control", *more.split(), cwd=foreign)
-    assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
-    assert (foreign / "ran").exists() == runs
+        assert snakesim(*words.split(), cwd=tmp_path).code == 0
+    more = () if kind == "controller" else ("--controller", "hold")  # which says nothing of a service
+    refused = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
+    assert refused.code == 2 and f"the recording names './mine.py:Mine' as its {kind}" in refused.err
+    assert "--run-recorded-code" in refused.err and " ".join(own) in refused.err
+    assert not (tmp_path / "ran").exists()
+    for flags, runs in ((shipped, False), (own, True), (("--run-recorded-code",), True)):
+        replayed = snakesim("replay", "run", "--control", *flags, cwd=tmp_path)
+        assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+        assert (tmp_path / "ran").exists() == runs
+        (tmp_path / "ran").unlink(missing_ok=True)
 
 
 def test_a_folder_with_a_black_box_tells_of_its_recording_too(run: Path, whole: bytes, tmp_path: Path) -> None:
