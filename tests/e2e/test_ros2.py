@@ -7,8 +7,10 @@ import json
 import os
 import signal
 import struct
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +26,12 @@ from snakesim_hal.wire.messages import Clock, Intent, Trajectory
 from tests.e2e.command import background, running
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.whole.command import snakesim
+from tests.unit.operator.ros2.rig import SERVICE_HASHES
+from tests.whole.command import tell
 
 pytestmark = pytest.mark.e2e
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-SERVICES = {  # type hashes, as ROS has them
-    "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
-    "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
-    "rcl_interfaces/srv/DescribeParameters": "845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
-    "rcl_interfaces/srv/GetParameters": "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
-    "rcl_interfaces/srv/SetParameters": "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
-    "rcl_interfaces/srv/SetParametersAtomically": "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
-}
 DEFINED = {
     "std_srvs/srv/Trigger": ("uint8 structure_needs_at_least_one_member", "bool success\nstring message"),
     "rcl_interfaces/srv/ListParameters": (
@@ -63,6 +58,15 @@ for _name, _texts in DEFINED.items():
         STORE.register({f"{_name}{_part}": _fields})
 ROUTER = '{mode: "router", listen: {endpoints: ["%s"]}, scouting: {multicast: {enabled: false}}}'
 RUN = ("clutter", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "rate_hz=50")
+
+
+@contextmanager
+def ros_router(folder: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """The router of a ROS network, and where it listens."""
+    at = free_endpoint()
+    (folder / "ros.json5").write_text(ROUTER % at)
+    with background(folder, "router", "ros.json5") as router:
+        yield at, router
 
 
 def session_at(endpoint: str) -> zenoh.Session:
@@ -112,7 +116,7 @@ class RosSide:
 
     def asked(self, name: str, kind: str, request: Any) -> Any:
         """As a client of rmw_zenoh: target and attachment are its own; None: nobody answers."""
-        key = f"0/{name}/{kind.replace('/', '::').replace('::srv::', '::srv::dds_::')}_/RIHS01_{SERVICES[kind]}"
+        key = f"0/{name}/{kind.replace('/', '::').replace('::srv::', '::srv::dds_::')}_/RIHS01_{SERVICE_HASHES[kind]}"
         sent = struct.pack("<qqB16s", 7, time.time_ns(), 16, bytes(range(16)))
         payload = bytes(STORE.serialize_cdr(request, f"{kind}_Request"))
         complete = zenoh.QueryTarget.ALL_COMPLETE
@@ -160,13 +164,11 @@ class RosSide:
 
 
 def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
-    at = free_endpoint()
-    (tmp_path / "ros.json5").write_text(ROUTER % at)
-    with running(tmp_path / "run", *RUN) as run, background(tmp_path, "router", "ros.json5") as router:
+    with running(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
         run.wait_for(" s  ")
-        refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", run.endpoint, cwd=tmp_path)
+        refused = tell(run, "ros2", "--ros-router", run.endpoint)
         assert refused.code == 2 and "itself is on this endpoint" in refused.err
-        refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", cwd=tmp_path)
+        refused = tell(run, "ros2", "--ros-router", at, "--joint-commands")
         assert refused.code != 0 and "has a controller already, which holds the lease" in refused.err
         bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
         with session_at(at) as session, background(tmp_path, *bridge):
@@ -181,14 +183,12 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
 
 
 def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
-    at, endpoint = free_endpoint(), free_endpoint()
-    (tmp_path / "ros.json5").write_text(ROUTER % at)
+    endpoint = free_endpoint()
     late = ("run", "triplet", "--pace", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
-    bridge = ("ros2", "--endpoint", endpoint, "--ros-router", at)
     with (
-        background(tmp_path, "router", "ros.json5"),
+        ros_router(tmp_path) as (at, _),
         session_at(at) as session,
-        background(tmp_path, *bridge) as waiting,
+        background(tmp_path, "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
     ):
         assert waiting.stdout is not None and "Waiting for it up to 60 s" in waiting.stdout.readline()
         with background(tmp_path, *late):
@@ -200,10 +200,8 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
 
 def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
     """Arm, command single joints, fall silent, stop, clear, disarm: all of it as a node of rmw_zenoh would."""
-    at = free_endpoint()
-    (tmp_path / "ros.json5").write_text(ROUTER % at)
     alone = ("triplet", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "services.control.external=true")
-    with running(tmp_path / "run", *alone) as run, background(tmp_path, "router", "ros.json5"):
+    with running(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
         bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
         with session_at(at) as session, background(tmp_path, *bridge):
             ros = RosSide(session)

@@ -1,10 +1,10 @@
 """A run: decode sample after sample, let a HAL act on what decodes, and keep count."""
 
+import os
 import random
 import resource
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from snakesim_hal.errors import WireError
@@ -21,6 +21,7 @@ from snakesim_hal.wire.messages import (
     Message,
 )
 from tests.fuzz.payloads import ROBOT, Maker
+from tests.fuzz.vitals import vitals
 from tests.unit.hal.rig import PERIOD_NS, command, state
 
 LONGEST_REASON = 400  # characters of an error's text, whatever a sender wrote
@@ -115,11 +116,8 @@ def run(payloads: int, seed: int) -> Report:
         if number % PER_TICK == 0:
             robot.pass_tick()
         if (number + 1) % max(payloads // 10, 1) == 0:
-            report.resident_mb.append(_resident_mb())
+            now = vitals(os.getpid())
+            assert now is not None
+            report.resident_mb.append(now.resident_mb)
     report.peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return report
-
-
-def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20

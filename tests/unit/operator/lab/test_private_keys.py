@@ -1,9 +1,6 @@
 """Private keys of a lab: a folder that is there keeps its mode, and keys that everybody may read are named."""
 
-import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,8 +11,7 @@ from snakesim_operator.cli import main
 from snakesim_operator.lab.check import Findings, _check_certificate
 from snakesim_operator.lab.identities import identities
 from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
-
-SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
+from tests.harness.command import SNAKESIM, call, environment
 
 
 def mode(path: Path) -> int:
@@ -85,15 +81,9 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
 @pytest.mark.parametrize("most_mb", [20, 30, 40, 100])
 def test_too_little_memory_is_one_line(tmp_path: Path, most_mb: int) -> None:
     typed = [*SNAKESIM, "deploy", "certs", str(EXAMPLE), "--out", str(tmp_path / "lab")]
-    ended = subprocess.run(
-        ["sh", "-c", f'ulimit -v {most_mb * 1024}; exec "$@"', "sh", *typed],
-        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert ended.returncode in (0, 1) and "Traceback" not in ended.stderr, ended.stderr
-    if ended.returncode == 1:
-        assert len(ended.stderr.splitlines()) == 1
-        assert f"needs more memory than `ulimit -v` allows, {most_mb} MB" in ended.stderr
+    limited = ["sh", "-c", f'ulimit -v {most_mb * 1024}; exec "$@"', "sh", *typed]
+    ended = call(limited, tmp_path, environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0)
+    assert ended.code in (0, 1) and "Traceback" not in ended.err, ended.err
+    if ended.code == 1:
+        assert len(ended.err.splitlines()) == 1
+        assert f"needs more memory than `ulimit -v` allows, {most_mb} MB" in ended.err

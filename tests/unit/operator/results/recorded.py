@@ -60,6 +60,7 @@ class Reader(HTMLParser):
 
     def __init__(self, page: str) -> None:
         super().__init__()
+        self.html = page
         self.ids: list[str] = []
         self.words: list[str] = []
         self.attributes: list[tuple[str, str, str | None]] = []

@@ -27,6 +27,7 @@ from tests.unit.operator.results.recorded import LOST, SECONDS, Reader, changed,
 
 HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
 INTERVALS_S = {9 - k: interval for k, interval in enumerate(itertools.pairwise(HAND_OVERS_S))}  # 9 is joint_10
+DRAWING = r'<svg viewBox="[^"]*" class="figure" role.*?</svg>'
 
 
 @pytest.fixture(scope="module")
@@ -122,8 +123,8 @@ def test_forces_balance_and_add_up_to_the_commanded_one(record: RunRecord) -> No
 
 
 def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, record: RunRecord) -> None:
-    html = report_page(record, summarise(record, "complete"))
-    polygons = re.findall(r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>', html)
+    figure = r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>'
+    polygons = re.findall(figure, page.html)
     lengths = [math.dist(*edge) for svg in polygons for edge in drawn_edges(svg, "commanded")]
     drawn = drawn_instants(record, events(record, summarise(record, "complete")))
     forces_n = [one.state.propulsion_n for _, one in drawn if one.balance is not None and one.state is not None]
@@ -133,24 +134,21 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     assert math.dist(ring[0][0], ring[-1][1]) == pytest.approx(lengths[0], abs=0.5)
 
 
-def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(record: RunRecord) -> None:
+def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(page: Reader, record: RunRecord) -> None:
     clear = changed(record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds])
-    kinds = [{kind for frame in read(one).film["frames"] for kind in frame[8]} for one in (record, clear)]
+    pages = page, read(clear)
+    kinds = [{kind for frame in one.film["frames"] for kind in frame[8]} for one in pages]
     assert {"solved", "resultant", "solved asked", "resultant asked"} == kinds[0]
     assert {"solved asked", "resultant asked"} == kinds[1]
-    html = report_page(clear, summarise(clear, "complete"))
-    drawings = re.findall(r'<svg viewBox="[^"]*" class="figure" role.*?</svg>', html)
+    drawings = re.findall(DRAWING, pages[1].html)
     classes = {found for svg in drawings for found in re.findall(r'class="((?:solved|resultant)[^"]*)"', svg)}
     assert {"solved asked shaft", "solved asked head", "resultant asked shaft"} <= classes
     assert not {"solved shaft", "solved head", "resultant shaft", "resultant head"} & classes
-    assert "asked for, and no contact felt there" in read(clear).text
+    assert "asked for, and no contact felt there" in pages[1].text
 
 
-def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(record: RunRecord) -> None:
-    html = report_page(record, summarise(record, "complete"))
-    drawings = [
-        ET.fromstring(found) for found in re.findall(r'<svg viewBox="[^"]*" class="figure" role.*?</svg>', html)
-    ]
+def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(page: Reader) -> None:
+    drawings = [ET.fromstring(found) for found in re.findall(DRAWING, page.html)]
     assert len(drawings) > 8
     for drawing in drawings:
         for (a, first), (b, second) in itertools.combinations([(t.text, box_of(t)) for t in drawing.iter("text")], 2):
@@ -193,10 +191,9 @@ def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: R
     assert "stale" in page.words
 
 
-def test_the_page_says_how_to_repeat_the_run(record: RunRecord) -> None:
-    page = report_page(record, summarise(record, "complete"))
-    assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page
-    assert "&#34;amplitude_m&#34;: 0.045" in page
+def test_the_page_says_how_to_repeat_the_run(page: Reader, record: RunRecord) -> None:
+    assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page.html
+    assert "&#34;amplitude_m&#34;: 0.045" in page.html
 
 
 # --- parts -----------------------------------------------------------------------------------------------------
@@ -237,15 +234,13 @@ def test_the_plotting_library_is_the_one_that_its_note_names() -> None:
     assert (LIBRARY.parent / "LICENSE-plotly.txt").is_file()
 
 
-def test_an_obstacle_that_yields_is_drawn_dashed_and_says_what_it_does(record: RunRecord) -> None:
+def test_an_obstacle_that_yields_is_drawn_dashed_and_says_what_it_does(page: Reader, record: RunRecord) -> None:
     row = record.config.scene.pegs_along_route[0]
     made = msgspec.structs.replace(row, lean_rad=0.2, stiffness_n_per_m=800.0, mass_kg=2.0, base_friction=0.5)
     scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])
     loose = dataclasses.replace(record, config=msgspec.structs.replace(record.config, scene=scene))
     html = report_page(loose, summarise(loose, "complete"))
-    assert 'class="peg yields"' in html and 'class="peg yields"' not in report_page(
-        record, summarise(record, "complete")
-    )
+    assert 'class="peg yields"' in html and 'class="peg yields"' not in page.html
     said = (
         "leans by 0.2 rad, springs back with 800 N/m, slides from 9.81 N on, and is drawn where it stood at the start"
     )

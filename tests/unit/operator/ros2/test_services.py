@@ -15,7 +15,7 @@ from snakesim_operator.ros2.joint_commands import VALID_NS, JointTargets
 from snakesim_operator.ros2.parameters import NOT_SET, _descriptor, _value
 from snakesim_operator.tools.parameters import Parameter
 from tests.unit.hal import rig
-from tests.unit.operator.ros2.rig import of_robot
+from tests.unit.operator.ros2.rig import SERVICE_HASHES, of_robot
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 # From docs/design.md of ros2/rmw_zenoh.
@@ -34,17 +34,8 @@ def test_a_service_of_the_design_document() -> None:
 
 
 def test_hashes_are_those_that_others_have() -> None:
-    known = {  # of ListParameters as `ros2 service info -v` prints it, else as other programs for ROS 2 have them
-        types.TRIGGER: "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
-        types.LIST_PARAMETERS: "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
-        types.GET_PARAMETERS: "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
-        types.GET_PARAMETER_TYPES: "da199c878688b3e530bdfe3ca8f74cb9fa0c303101e980a9e8f260e25e1c80ca",
-        types.DESCRIBE_PARAMETERS: "845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
-        types.SET_PARAMETERS: "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
-        types.SET_PARAMETERS_ATOMICALLY: "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
-    }
-    for service, digits in known.items():
-        assert service.type.type_hash == f"RIHS01_{digits}", service.type.name
+    ours = {one.type.name: one.type.type_hash for one in vars(types).values() if isinstance(one, types.Service)}
+    assert ours == {name: f"RIHS01_{digits}" for name, digits in SERVICE_HASHES.items()}
 
 
 def test_an_answer_says_who_asked_what() -> None:

@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 
-import msgspec
-
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.run.patience import Patience
-from tests.unit.hal.strategies import plain_example
+from tests.unit.hal import rig
 
 ALL = ("guidance", "control")
 
@@ -14,8 +12,9 @@ ALL = ("guidance", "control")
 def status(
     tick: int = 0, *, alive: Sequence[str] = ALL, ready: bool = False, waiting_for: Sequence[str] = ("guidance",)
 ) -> Status:
-    plain = {**plain_example(Status), "tick": tick, "stamp_ns": tick * 10_000_000, "ready_to_arm": ready}
-    return msgspec.convert({**plain, "alive": alive, "waiting_for": waiting_for}, Status)
+    return rig.status(
+        tick=tick, stamp_ns=tick * rig.PERIOD_NS, ready_to_arm=ready, alive=alive, waiting_for=waiting_for
+    )
 
 
 def test_robot_time_is_counted_where_it_passes_however_slowly_the_computer_shows_it() -> None:

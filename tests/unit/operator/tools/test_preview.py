@@ -2,6 +2,7 @@
 
 import io
 
+import msgspec
 import numpy as np
 import PIL.Image
 import pytest
@@ -52,11 +53,8 @@ def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) 
 
 
 def test_only_what_is_looked_at() -> None:
-    listed = description()
-    robot = type(listed)(
-        **{name: getattr(listed, name) for name in listed.__struct_fields__ if name != "sensors"},
-        sensors=[SensorDescription(key=keys.depth("head"), rate_hz=20.0, delay_s=0.0)],
-    )
+    sensor = SensorDescription(key=keys.depth("head"), rate_hz=20.0, delay_s=0.0)
+    robot = msgspec.structs.replace(description(), sensors=[sensor])
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as beside:
         images = hal.publisher(keys.depth("head"), DepthImage)
