@@ -8,6 +8,7 @@
 """
 
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,11 @@ import sysconfig
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pytest
+
 REPOSITORY = Path(__file__).parents[2]
+UV = REPOSITORY / ".tools" / "bin" / "uv"
+needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
 LEFT_OUT = shutil.ignore_patterns(".venv", ".tools", ".git", "runs", "build", "*.egg-info", "__pycache__", ".*_cache")
 PROLOGUE = """\
 set -eum
@@ -86,22 +91,18 @@ def script(section: Section) -> str:
 
 def _expecting(command: str) -> str:
     code = re.search(r"#.*\(exit code (\d+)\)", command)
-    reported = f"echo '$' {_quoted(command)}"
+    reported = f"echo '$' {shlex.quote(command)}"
     if code is None:
         return f"{reported}\n{command}"
     return f"{reported}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "'\\''") + "'"
 
 
 def clone(folder: Path) -> None:
     """The repository's files, and an environment that `make` takes for its own: it lends what is installed here."""
     shutil.copytree(REPOSITORY, folder, ignore=LEFT_OUT, symlinks=True)
     (folder / ".tools").symlink_to(REPOSITORY / ".tools")
-    uv, venv = REPOSITORY / ".tools" / "bin" / "uv", folder / ".venv"
-    subprocess.run([uv, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True)
+    venv = folder / ".venv"
+    subprocess.run([UV, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True)
     library = next((venv / "lib").glob("python*/site-packages"))
     lent = sysconfig.get_path("purelib")
     (library / "lent.pth").write_text(f"import site; site.addsitedir({lent!r})\n")

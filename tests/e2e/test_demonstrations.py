@@ -8,14 +8,13 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.command import SNAKESIM, Running, armed_run, call, environment
-from tests.e2e.documents import REPOSITORY
+from tests.e2e.documents import REPOSITORY, UV, needs_uv
 from tests.e2e.test_teleop import UP, at_the_keyboard
 from tests.harness.wait import wait_until
 from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 RUN = ("clutter", "--pace", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
-UV = REPOSITORY / ".tools" / "bin" / "uv"
 THEIRS = REPOSITORY / "build" / "lerobot"  # an environment of its own: lerobot brings PyTorch, 6 GB
 LEROBOT = "lerobot==0.4.4"
 LOADED = """
@@ -130,7 +129,7 @@ def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
+@needs_uv
 def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
     """Installs it, once, into build/lerobot."""
     python = THEIRS / "bin" / "python"

@@ -14,7 +14,7 @@ import pytest
 
 from tests.e2e import documents
 from tests.e2e.command import environment
-from tests.e2e.documents import REPOSITORY, Section, sections
+from tests.e2e.documents import REPOSITORY, Section, needs_uv, sections
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
@@ -30,9 +30,7 @@ CONTROLLERS, ROBOTS, SCENES = (typed_in(f"docs/{page}.md") for page in ("control
 PAGES = ("first-controller", "train", "your-robot", "your-sensor", "lab-tutorial")
 LESSONS = [section for page in PAGES for section in typed_in(f"docs/{page}.md")]
 README = typed_in("README.md")
-UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
-needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
 
 
 def named(section: Section) -> str:

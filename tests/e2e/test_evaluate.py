@@ -2,21 +2,17 @@
 
 import contextlib
 import json
-import os
 import re
 import shlex
-import signal
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
 import pytest
 
 from snakesim_hal.record.host_record import HOST_RECORD
 from snakesim_operator.results.record import REPORT
-from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary, snakesim
+from tests.e2e.command import Ended, background, run_to_summary, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
@@ -36,6 +32,7 @@ mission.goal = { kind = "heading", distance_m = 0.06 }
 "scene.ground.friction" = [0.1, 0.2]
 """
 CASES = 8
+DASK = (sys.executable, "-m", "dask")
 TABLES = ("results.csv", "results.parquet", "evaluation.html")
 
 
@@ -67,44 +64,10 @@ def done(out: Path) -> int:
     return path.read_bytes().count(b"\n") if path.is_file() else 0
 
 
-def children(pid: int) -> list[int]:
-    reported = Path(f"/proc/{pid}/task").glob("*/children")
-    return [int(child) for path in reported for child in path.read_text().split()]
-
-
-def lives(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def listening(pids: list[int]) -> set[str]:
-    """Addresses on which processes take connections, as the kernel writes them."""
-    own: set[str] = set()
-    for fd in (fd for pid in pids for fd in Path(f"/proc/{pid}/fd").iterdir()):
-        with contextlib.suppress(FileNotFoundError):  # closed since it was listed
-            own.add(str(fd.readlink()))
-    found: set[str] = set()
-    for table in ("tcp", "tcp6"):
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
-            fields = line.split()
-            if fields[3] == "0A" and f"socket:[{fields[9]}]" in own:
-                found.add(fields[1].partition(":")[0])
-    return found
-
-
-@contextmanager
-def background(*command: str, home: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A command in a process of its own, killed at the end if it is still there."""
-    process = subprocess.Popen(
-        command, cwd=home, env=environment(home), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait(10)
+def lives(process: psutil.Process) -> bool:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return process.status() != psutil.STATUS_ZOMBIE
+    return False
 
 
 @pytest.mark.slow
@@ -143,13 +106,14 @@ def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None
 @pytest.mark.slow
 def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     out = home / "killed"
-    command = [*SNAKESIM, "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)]
-    with background(*command, home=home) as process:
+    with background(home, "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)) as process:
         wait_until(lambda: done(out) >= 2, "two cases done")
-        left = children(process.pid)
+        command_itself = psutil.Process(process.pid)
+        left = command_itself.children()
         assert len(left) >= 2
-        assert listening([process.pid, *left]) == {"0100007F"}  # 127.0.0.1
-        os.kill(left[-1], signal.SIGSTOP)  # it cannot see that its parent dies
+        sockets = [socket for one in (command_itself, *left) for socket in one.net_connections("tcp")]
+        assert {socket.laddr.ip for socket in sockets if socket.status == psutil.CONN_LISTEN} == {"127.0.0.1"}
+        left[-1].suspend()  # it cannot see that its parent dies
     wait_until(lambda: not any(map(lives, left)), "no process left", 10)
     before = done(out)
     assert 2 <= before < CASES
@@ -165,11 +129,11 @@ def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tup
 
 
 def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """Where a scheduler of our own will listen, and the commands of it and of a worker."""
+    """Where a scheduler of our own will listen, and what Dask is told to be it and a worker."""
     port = free_endpoint().rpartition(":")[2]
-    address, program = f"tcp://127.0.0.1:{port}", (sys.executable, "-m", "dask")
-    scheduler = (*program, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
-    worker = (*program, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+    address = f"tcp://127.0.0.1:{port}"
+    scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    worker = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
     return address, scheduler, worker
 
 
@@ -177,7 +141,7 @@ def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
 def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
     address, scheduler, worker = dask()
     small = ["--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5"]
-    with background(*scheduler, home=home), background(*worker, home=home):
+    with background(home, *scheduler, program=DASK), background(home, *worker, program=DASK):
         there = snakesim("train", "surveyed_clutter", *small, "--cluster", address, "--out", "there", cwd=home)
     here = snakesim("train", "surveyed_clutter", *small, "--workers", "1", "--out", "here", cwd=home)
     assert there.code == here.code == 0, there.out + there.err + here.err
@@ -189,12 +153,10 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undistur
     address, scheduler, worker = dask()
     out = home / "cluster"
     with (
-        background(*scheduler, home=home),
-        background(*worker, home=home) as lost,
-        background(*worker, home=home),
-        background(
-            *(*SNAKESIM, "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)), home=home
-        ) as process,
+        background(home, *scheduler, program=DASK),
+        background(home, *worker, program=DASK) as lost,
+        background(home, *worker, program=DASK),
+        background(home, "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)) as process,
     ):
         wait_until(lambda: done(out) >= 2, "two cases done")
         lost.kill()
@@ -248,15 +210,21 @@ def test_a_sweep_runs_every_value(home: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_search_goes_on_where_it_ended(home: Path) -> None:
-    given = ["optimise", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40"]
-    given += ["--goal", "path_distance_m", "--storage", "search.db", "--workers", "2"]
+def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Path) -> None:
+    given = ["optimise", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40", "--seed", "2"]
+    given += ["--goal", "path_distance_m", "--workers", "2"]
     first = snakesim(*given, "--trials", "2", cwd=home)
     assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
-    more = snakesim(*given, "--trials", "4", cwd=home)
+    (kept,) = (home / "runs").glob("optimise-*.db")
+    assert f"runs/{kept.name} keeps all trials" in first.out, first.out + first.err
+    more = snakesim(*given, "--storage", f"runs/{kept.name}", "--trials", "4", cwd=home)
     assert "holds 2 trials already" in more.out and "trial 3:" in more.out, more.out + more.err
-    command = shlex.split(more.out.split("best path_distance_m: ")[1].splitlines()[1])
+    _, said = more.out.split("best path_distance_m: ")
+    command = shlex.split(said.splitlines()[1])
+    assert command.pop(0) == "snakesim"
     assert "--until-goal" not in command, "`snakesim run` refuses it for a mission without a goal"
+    again, summary = run_to_summary(home / "again", *command[1:])
+    assert again.code == 0 and f"{summary.path_distance_m:.4g}" == said.split(",")[0], again.out + again.err
 
 
 @pytest.mark.slow
@@ -273,17 +241,3 @@ def test_a_search_on_a_row_of_a_suite_prints_an_evaluation(home: Path) -> None:
     cases = [json.loads(line)["outcome"]["numbers"] for line in lines]
     assert len(cases) == 2 and {case["ticks"] for case in cases} == {40}, "what is set is set in a row, too"
     assert f"{sum(case['advance_m'] for case in cases) / 2:.4g}" == said.split(",")[0]
-
-
-@pytest.mark.slow  # above it is read, and a sweep is run
-def test_what_a_search_prints_can_be_run(home: Path) -> None:
-    given = ["optimise", "clutter", "--set", "duration_s=0.5", "--set", "controller=path_following", "--seed", "2"]
-    given += ["--vary", "controllers.path_following.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1"]
-    found = snakesim(*given, cwd=home)
-    (kept,) = (home / "runs").glob("optimise-*.db")
-    assert f"runs/{kept.name} keeps all trials" in found.out, found.out + found.err
-    _, said = found.out.split("best advance_m: ")
-    command = shlex.split(said.splitlines()[1])
-    assert command.pop(0) == "snakesim"
-    again, summary = run_to_summary(home / "again", *command[1:])
-    assert again.code == 0 and f"{summary.advance_m:.4g}" == said.split(",")[0], again.out + again.err

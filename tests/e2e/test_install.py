@@ -23,17 +23,15 @@ from snakesim_operator.extras import BRINGS
 from tests.contract.workbench import text_of_the_example
 from tests.distributions import required
 from tests.e2e.command import Ended, call, environment
+from tests.e2e.documents import REPOSITORY, UV, needs_uv
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 
-REPOSITORY = Path(__file__).parents[2]
 SCHEMAS = REPOSITORY / "schemas"
-UV = REPOSITORY / ".tools" / "bin" / "uv"
 NOT_SOURCES = shutil.ignore_patterns(".*", "runs", "build", "dist", "*.egg-info", "__pycache__")
 PACKAGES = ("snakesim_can_backend", "snakesim_gnc", "snakesim_hal", "snakesim_operator", "snakesim_sim_backend")
-needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
 
 
 def run(*command: object, cwd: Path, **more: str) -> str:

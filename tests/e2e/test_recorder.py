@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import struct
-import subprocess
 import threading
 import time
 from pathlib import Path
@@ -22,9 +21,8 @@ from snakesim_operator.playback.play import play
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import SNAKESIM, armed_run, environment
+from tests.e2e.command import armed_run, background
 from tests.harness.endpoint import free_endpoint
-from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
 from tests.whole import command
 
@@ -56,11 +54,8 @@ def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_pa
     with armed_run(tmp_path / "run", *LONG) as run:
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)
-        typed = [*SNAKESIM, "record", "--endpoint", run.endpoint, "--out", "beside.mcap"]
-        served = [*typed, "--foxglove", "0", "--foxglove-origin", TRUSTED]
-        with subprocess.Popen(
-            served, cwd=tmp_path, env=environment(tmp_path), stdout=subprocess.PIPE, text=True
-        ) as beside:
+        typed = ("record", "--endpoint", run.endpoint, "--out", "beside.mcap")
+        with background(tmp_path, *typed, "--foxglove", "0", "--foxglove-origin", TRUSTED) as beside:
             assert beside.stdout is not None
             address = next(line for line in beside.stdout if "Foxglove" in line).rpartition(" ")[2].strip()
             file = tmp_path / "beside.mcap"
@@ -77,7 +72,6 @@ def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_pa
             assert said.count("refused a viewer") == 4 and "http://evil.example" in said, said
         assert links == [f"link_{i}" for i in range(14)]
         assert run.end() == 3, run.said()  # complete, but the record lacks something
-    nothing_left(tmp_path / "run")
     assert run.said().count("warning:") == 1 and "recorder was ended by SIGKILL" in run.said()
     kept = list(RecordingReader(tmp_path / "run" / RECORDING).messages([keys.JOINTS]))
     assert len(kept) > 10

@@ -9,19 +9,15 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.command import Ended, call, environment
+from tests.e2e.documents import REPOSITORY
 
 pytestmark = pytest.mark.e2e
 
-REPOSITORY = Path(__file__).parents[2]
-COMMANDS = {
-    "commissioning": ("joints",),
-    "console": ("console",),
-    "evaluate": ("evaluate", "sweep", "optimise"),
-    "figures": ("plot",),
-    "lab": ("deploy",),
-    "robots": ("robot",),
-    "ros2": ("ros2",),
-}
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+COMMANDS: dict[str, list[str]] = {}  # of the rooms that nothing imports
+for _name, _at in PROJECT["entry-points"]["snakesim.commands"].items():
+    if _at.startswith("snakesim_operator."):
+        COMMANDS.setdefault(_at.split(".")[1], []).append(_name)
 IMPORT_ALL = (
     "import importlib, pkgutil, snakesim_operator as top\n"
     "for found in pkgutil.walk_packages(top.__path__, 'snakesim_operator.'):\n"
@@ -37,12 +33,11 @@ def without(rooms: Sequence[str], folder: Path) -> Path:
     for room in rooms:
         shutil.rmtree(folder / "snakesim_operator" / room)
     gone = tuple(f"snakesim_operator.{room}." for room in rooms)
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    metadata = folder / f"snakesim-{project['version']}.dist-info"
+    metadata = folder / f"snakesim-{PROJECT['version']}.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.4\nName: snakesim\nVersion: {project['version']}\n")
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.4\nName: snakesim\nVersion: {PROJECT['version']}\n")
     lines: list[str] = []
-    for group, entries in project["entry-points"].items():
+    for group, entries in PROJECT["entry-points"].items():
         lines.append(f"[{group}]")
         lines += [f"{n} = {at}" for n, at in entries.items() if not at.startswith(gone)]
     (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")

@@ -1,12 +1,12 @@
 """How the processes of a run are: memory, threads and open files of each, and what they complained of."""
 
 import re
-import resource
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 COMPLAINTS = re.compile(r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Error\b", re.MULTILINE)
-_PAGE_MB = resource.getpagesize() / 2**20
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,10 @@ class Vitals:
 def vitals(pid: int) -> Vitals | None:
     """None when the process is gone."""
     try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-        threads = len(list(Path(f"/proc/{pid}/task").iterdir()))
-        files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-    except OSError:
+        process = psutil.Process(pid)
+        return Vitals(pid, process.memory_info().rss / 2**20, process.num_threads(), process.num_fds())
+    except psutil.Error:
         return None
-    return Vitals(pid, pages * _PAGE_MB, threads, files)
 
 
 def complaints(out: Path) -> list[str]:

@@ -10,6 +10,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import zenoh
 from cryptography import x509
@@ -172,13 +173,10 @@ def passed(lab: SmallLab, settings: dict[str, Any], command: str) -> list[str]:
     return heard
 
 
-def listening() -> set[str]:
-    """The TCP sockets of this process on which somebody could connect."""
-    own = {path.readlink().name for path in Path("/proc/self/fd").iterdir() if path.is_symlink()}
-    rows = [
-        line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/self/net/{name}").read_text().splitlines()
-    ]
-    return {row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
+def listening() -> set[tuple[str, int]]:
+    """Where somebody could connect to this process by TCP."""
+    sockets = psutil.Process().net_connections("tcp")
+    return {socket.laddr for socket in sockets if socket.status == psutil.CONN_LISTEN}
 
 
 def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
