@@ -1,13 +1,13 @@
 """Tab completion: the printed scripts, asked by a real bash and a real zsh."""
 
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.plugins import CONTROLLERS, installed
+from tests.harness.command import call
 from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -52,12 +52,7 @@ def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
     shell, path = script
     words, wanted = TYPED[typed]
     plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
-    done = subprocess.run(
-        [shell, *plain, "-c", ASK[shell], shell, str(path), "snakesim", *words],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
-    found = {word for word in done.stdout.split() if word.startswith(words[-1])}  # which zsh leaves to its matcher
-    assert done.stderr == "" and (found >= wanted if typed == "all commands" else found == wanted), done.stdout
+    done = call([shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent)
+    assert done.code == 0, done.said
+    found = {word for word in done.out.split() if word.startswith(words[-1])}  # which zsh leaves to its matcher
+    assert done.err == "" and (found >= wanted if typed == "all commands" else found == wanted), done.out

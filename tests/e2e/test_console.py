@@ -67,8 +67,9 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         assert not page.errors, page.errors
 
 
-def test_a_page_is_dark_if_its_browser_prefers_that_until_the_viewer_chooses() -> None:
-    with page_server(open_port(None)) as (server, address), chromium() as browser:
+def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
+    """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
+    with page_server(open_port(None), stop=lambda: "stopped") as (server, address), chromium() as browser:
         Page(server, None, None, Log(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
@@ -78,6 +79,11 @@ def test_a_page_is_dark_if_its_browser_prefers_that_until_the_viewer_chooses() -
             wait_until(lambda prefers=prefers: page.value(LOOK) == prefers, f"a {prefers} page")
         page.click("Dark page")
         wait_until(lambda: page.value(LOOK) == "light", "the viewer's choice")
+        page.value("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
+        for count, leave in enumerate(("window.dispatchEvent(new Event('blur'))", HIDE), start=1):
+            page.value("document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
+            page.value(leave)
+            assert page.value("ends") == count
 
 
 def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_the_panel() -> None:
@@ -111,19 +117,6 @@ def test_a_page_says_when_its_second_stop_does_not_answer_and_stops_by_it(tmp_pa
         page.wait_for("planar13: stopped")
         with open_session(Link(run.endpoint, "planar13")) as session:
             assert session.latest(keys.STATUS, Status, 10.0, lambda one: one.lifecycle == "estop") is not None
-
-
-@pytest.mark.slow
-def test_a_held_button_is_let_go_when_its_page_loses_the_keyboard_or_is_hidden() -> None:
-    with page_server(open_port(None), stop=lambda: "stopped") as (server, address), chromium() as browser:
-        Page(server, None, None, Log(), recorded="a run")
-        page = browser.open(address, *SMALL)
-        page.wait_for("Dark page")
-        page.value("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
-        for count, leave in enumerate(("window.dispatchEvent(new Event('blur'))", HIDE), start=1):
-            page.value("document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
-            page.value(leave)
-            assert page.value("ends") == count
 
 
 @pytest.mark.slow

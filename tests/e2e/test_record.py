@@ -7,16 +7,14 @@ import subprocess
 import time
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
-from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM, Ended, armed_run, call, run_to_summary, running
+from snakesim_operator.results.record import REPORT, RunRecord
+from tests.e2e.command import LIMIT_S, SNAKESIM, Ended, armed_run, call, run_to_summary, running, summary_of
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left
 from tests.harness.wait import wait_until
@@ -28,6 +26,9 @@ pytestmark = pytest.mark.e2e
 LONG = ["triplet", "--controller", "hold", "--duration", "30", "--pace", "realtime", "--set", "rate_hz=50"]
 SHORT = ["triplet", "--duration", "5", "--seed", "7"]
 RATE_HZ = 50
+IN_ONE, LOCKED = ["--in-process"], "mount -o remount,ro ."
+FULL = "No space left on device; the run goes on"
+READ_ONLY = "Read-only file system; the run goes on, but nothing of it is recorded"
 
 
 def handles(pid: int, number: signal.Signals) -> bool:
@@ -36,14 +37,10 @@ def handles(pid: int, number: signal.Signals) -> bool:
     return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
 
 
-def summary_of(out: Path) -> RunSummary:
-    return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
-
-
 def newest_status(session: Session) -> Status:
-    statuses, found = session.latched_reader(keys.STATUS, Status), list[Status]()
-    wait_until(lambda: bool(found.extend(statuses.drain()) or found), "a status")
-    return found[-1]
+    found = session.latest(keys.STATUS, Status, LIMIT_S)
+    assert found is not None
+    return found
 
 
 # --- kills -----------------------------------------------------------------------------------------------------
@@ -58,7 +55,6 @@ def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Pat
         assert run.end() == 1, run.said()
         said = run.said()
     assert "host was ended by SIGKILL" in said and "may lack the last second" in said and "Traceback" not in said
-    nothing_left(tmp_path / "run")
     record, summary = RunRecord.load(tmp_path / "run"), summary_of(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ
     assert summary.ticks == len(record.time_s) and summary.duration_s == pytest.approx(len(record.time_s) / RATE_HZ)
@@ -74,7 +70,6 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
             tick = newest_status(session).tick
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
-    nothing_left(tmp_path / "run")
     record = RunRecord.load(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ and record.host.ended == "running" and record.control
     result = command.snakesim("compare", "run", "run", cwd=tmp_path)
@@ -104,8 +99,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
 
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
-        result = command.snakesim("disarm", "--endpoint", run.endpoint, cwd=tmp_path)
-        assert result.code == 0, result.err
+        assert command.tell(run, "disarm").code == 0
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
     assert "of 2 s" in ended and "the time was over before the requested armed time was reached" in ended
@@ -150,19 +144,21 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.parametrize(
-    ("options", "prepare", "more"),
+    ("options", "prepare", "more", "warning"),
     [
-        pytest.param("size=1M", "cat /dev/zero > ballast 2> /dev/null", ["--in-process"], marks=pytest.mark.slow),
-        ("size=48k", "", ["--in-process"]),  # room for the configuration and little else
-        ("size=250k", "", []),  # less than the black box alone takes: rows are lost whoever fills it first
-        pytest.param("size=1M,nr_inodes=4", "", ["--in-process"], marks=pytest.mark.slow),
+        pytest.param("size=1M", "cat /dev/zero > ballast 2> /dev/null", IN_ONE, FULL, marks=pytest.mark.slow),
+        ("size=48k", "", IN_ONE, FULL),  # room for the configuration and little else
+        ("size=250k", "", [], FULL),  # less than the black box alone takes: rows are lost whoever fills it first
+        pytest.param("size=1M,nr_inodes=4", "", IN_ONE, FULL, marks=pytest.mark.slow),
+        ("size=1M", LOCKED, [], READ_ONLY),
+        ("size=1M", f"mkdir run; echo '{{}}' > run/config.json; {LOCKED}", IN_ONE, READ_ONLY),
     ],
 )
-def test_a_full_disk_neither_ends_nor_changes_a_run(
-    tmp_path: Path, digest: str, options: str, prepare: str, more: list[str]
+def test_a_full_or_read_only_disk_neither_ends_nor_changes_a_run(
+    tmp_path: Path, digest: str, options: str, prepare: str, more: list[str], warning: str
 ) -> None:
     ended, left = in_a_file_system(tmp_path, options, prepare, *SHORT, *more)
-    orderly(ended, left, code=3, warning="No space left on device; the run goes on")
+    orderly(ended, left, code=3, warning=warning)
     assert f"command digest        {digest[:16]}" in ended.out
     if (left / "blackbox.rows").is_file():
         assert "of 500 ticks are missing in the black box" in ended.out
@@ -180,14 +176,6 @@ def test_a_full_disk_disturbs_no_tick_in_real_time(tmp_path: Path) -> None:
     ended, left = in_a_file_system(tmp_path, "size=100k", "", *arguments)
     orderly(ended, left, code=3, warning="No space left on device")
     assert "time                  5.00 s in 5.0" in ended.out
-
-
-@pytest.mark.parametrize("prepare", ["true", "mkdir run; echo '{}' > run/config.json"])
-def test_a_read_only_folder_neither_ends_nor_changes_a_run(tmp_path: Path, digest: str, prepare: str) -> None:
-    more = [] if prepare == "true" else ["--in-process"]
-    ended, left = in_a_file_system(tmp_path, "size=1M", f"{prepare}; mount -o remount,ro .", *SHORT, *more)
-    orderly(ended, left, code=3, warning="Read-only file system; the run goes on, but nothing of it is recorded")
-    assert f"command digest        {digest[:16]}" in ended.out
 
 
 SLOW = '''
@@ -255,4 +243,3 @@ def test_a_disk_that_hangs_delays_neither_ticks_nor_a_stop_nor_the_end(tmp_path:
             assert session.ask(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
         assert run.end(30.0) == 1, run.said()
         assert "the disk has not answered" in run.said() and "Traceback" not in run.said()
-    nothing_left(tmp_path / "run")

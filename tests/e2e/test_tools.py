@@ -24,9 +24,9 @@ pytestmark = pytest.mark.e2e
 TUTORIAL = Path("docs/tutorial.md").resolve()
 
 
-def echoed(run: Running, folder: Path, key: str, count: int, *more: str) -> list[dict[str, Any]]:
+def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any]]:
     """What `snakesim echo` prints, each line read as JSON."""
-    ended = command.snakesim("echo", key, "--count", str(count), "--endpoint", run.endpoint, *more, cwd=folder)
+    ended = command.tell(run, "echo", key, "--count", str(count), *more)
     assert ended.code == 0 and ended.err == "", ended.err
     lines = [json.loads(line) for line in ended.out.splitlines()]
     assert len(lines) == count and all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
@@ -39,18 +39,15 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
             [*SNAKESIM, "scenarios"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     assert done.returncode == 1 and done.stderr.startswith("snakesim: ") and done.stderr.count("\n") == 1
-    seen = subprocess.run(
-        ["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], cwd=tmp_path, capture_output=True, check=False
-    )
-    assert seen.stderr == b"" and seen.stdout.count(b"\n") == 1
+    seen = call(["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], tmp_path)
+    assert seen.err == "" and seen.out.count("\n") == 1
 
 
 def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
     run = f"{' '.join(SNAKESIM)} run triplet --in-process --duration 1 --no-record --out"
     for number, unread in enumerate(("| head -0", ">&-", "> /dev/full 2>&1")):
-        command = f"set -o pipefail; {run} {number} {unread}"
-        ended = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert (ended.returncode, ended.stderr) == (0, ""), f"{unread}: {ended.stderr}"
+        ended = call(["bash", "-c", f"set -o pipefail; {run} {number} {unread}"], tmp_path)
+        assert (ended.code, ended.err) == (0, ""), f"{unread}: {ended.err}"
         assert (tmp_path / str(number) / "summary.json").exists(), unread
 
 
@@ -128,29 +125,25 @@ def first_line_ran(pid: int) -> bool:
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime"]
     with armed_run(tmp_path / "run", *arguments) as run:
-        rate = command.snakesim(
-            "echo", "sensor/joints", "--hz", "--count", "2", "--endpoint", run.endpoint, cwd=tmp_path
-        )
+        rate = command.tell(run, "echo", "sensor/joints", "--hz", "--count", "2")
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
-        one = command.snakesim("echo", "hal/description", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
-        reported = json.loads(one.out)
+        (reported,) = echoed(run, "hal/description", 1)
         assert reported["key"] == "planar13/hal/description" and reported["message"]["joints"][12]["name"] == "joint_13"
-        found = echoed(run, tmp_path, "sensor/**", 40)
+        found = echoed(run, "sensor/**", 40)
         assert {"planar13/sensor/joints", "planar13/sensor/imu"} <= {line["key"] for line in found}
         assert all("tick" in line["message"] for line in found)
-        everything = {line["key"] for line in echoed(run, tmp_path, "**", 200)}
+        everything = {line["key"] for line in echoed(run, "**", 200)}
         assert {"planar13/hal/description", "planar13/hal/clock", "planar13/hal/done/guidance"} <= everything
-        named = echoed(run, tmp_path, "*/joints", 3, "--namespace", "planar13")
+        named = echoed(run, "*/joints", 3, "--namespace", "planar13")
         assert {line["key"] for line in named} <= {"sensor/joints", "actuator/joints"}
-        unknown = command.snakesim("echo", "sensor/smell", "--endpoint", run.endpoint, cwd=tmp_path)
+        unknown = command.tell(run, "echo", "sensor/smell")
         assert unknown.code == 2 and "sensor/contacts" in unknown.err
-        wrong = command.snakesim("echo", "sensor/***", "--endpoint", run.endpoint, cwd=tmp_path)
+        wrong = command.tell(run, "echo", "sensor/***")
         assert wrong.code == 2 and "is not a key" in wrong.err and wrong.err.count("\n") == 1
-        status = command.snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
+        status = command.tell(run, "status")
         assert status.code == 0 and "planar13: armed" in status.out and "control, guidance, navigation" in status.out
         assert run.interrupt() == 130
-    nothing_left(tmp_path / "run")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace, which needs root")

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import zenoh
 
 from snakesim_operator.cli import main
 from snakesim_operator.lab.lab_file import EXAMPLE
+from tests.harness.command import call
 
 MAX_EXPOSED = 2.5  # of 10, as systemd-analyze rates it; below is "OK"
 MACHINE = re.compile(r"^\[machines\.\w+\]$", re.MULTILINE)
@@ -46,19 +46,12 @@ def test_zenoh_parses_every_file(rendered: Path) -> None:
 def test_systemd_accepts_every_unit_and_finds_it_closed(rendered: Path) -> None:
     units = sorted(rendered.rglob("*.service"))
     assert len(units) == 10
-    done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", *map(str, units)], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    done = call(["systemd-analyze", "verify", "--man=no", *units], rendered)
+    assert (done.code, done.err) == (0, "")
     for unit in units:
-        rated = subprocess.run(
-            ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        score = re.search(r"exposure level for \S+: ([\d.]+)", rated.stdout)
-        assert score is not None and float(score[1]) <= MAX_EXPOSED, f"{unit.name}: {rated.stdout[-200:]}"
+        rated = call(["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered)
+        score = re.search(r"exposure level for \S+: ([\d.]+)", rated.out)
+        assert score is not None and float(score[1]) <= MAX_EXPOSED, f"{unit.name}: {rated.said[-200:]}"
 
 
 def test_containers_run_what_the_units_run(rendered: Path) -> None:

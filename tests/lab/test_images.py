@@ -3,7 +3,7 @@
 import json
 import time
 
-from msgspec import structs
+import msgspec
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.session_file import read_session
@@ -12,26 +12,12 @@ from snakesim_hal.wire.messages import DepthImage
 from snakesim_hal.wire.roles import Role
 from tests.harness.wait import wait_until
 from tests.lab.small_lab import OWN, SmallLab
+from tests.unit.hal.strategies import plain_example
 
 KEY = keys.depth("head")
 # The largest that a robot may have: it is sent in many pieces, each of which waits for the one before it.
-IMAGE = DepthImage(
-    tick=1,
-    stamp_ns=1,
-    link=0,
-    position_l=(0.0, 0.0, 0.0),
-    orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
-    width=1280,
-    height=960,
-    fx_px=600.0,
-    fy_px=600.0,
-    cx_px=639.5,
-    cy_px=479.5,
-    range_min_m=0.1,
-    range_max_m=2.0,
-    scale_m=0.001,
-    depth=bytes(2 * 1280 * 960),
-)
+SIZE = {"width": 1280, "height": 960, "depth": bytes(2 * 1280 * 960)}
+IMAGE = msgspec.convert({**plain_example(DepthImage), **SIZE, "tick": 1}, DepthImage)
 
 
 def link(lab: SmallLab, role: Role) -> Link:
@@ -48,7 +34,7 @@ def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: SmallLab) -> 
         reader, found = viewer.reader(KEY, DepthImage), list[DepthImage]()
         robots, viewers = robot.publisher(KEY, DepthImage), viewer.publisher(KEY, DepthImage)
         wait_until(robots.heard, "the viewer subscribes")
-        viewers.put(structs.replace(IMAGE, tick=2))
+        viewers.put(msgspec.structs.replace(IMAGE, tick=2))
 
         def arrived() -> bool:
             robots.put(IMAGE)  # one that a busy router drops is not sent again

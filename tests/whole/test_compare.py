@@ -95,8 +95,6 @@ def test_pages_are_written_to_files_only(runs: Path, tmp_path: Path) -> None:
 
 
 def test_wrong_input_is_refused_with_a_way_out(runs: Path, tmp_path: Path) -> None:
-    ended = snakesim("compare", str(runs / "a"), "nowhere", cwd=tmp_path)
-    assert ended.code == 2 and "nowhere: no such folder" in ended.err and "`snakesim run` left" in ended.err
     other, _ = run_to_summary(tmp_path / "mamba", "mamba_hills", "--duration", "0.1")
     assert other.code == 0, other.out + other.err
     ended = snakesim("compare", str(runs / "a"), "mamba", cwd=tmp_path)

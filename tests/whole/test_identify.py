@@ -57,9 +57,3 @@ def test_a_robot_that_does_not_hang_is_not_identified(tmp_path: Path) -> None:
     assert ended.code == 1 and "does not move as a robot that hangs by its tail" in ended.out, ended.out + ended.err
     ended = snakesim("identify", "run", "--write", "planar13", cwd=tmp_path)
     assert ended.code == 2 and "give the path of your own robot file" in ended.err
-
-
-def test_another_run_is_refused(tmp_path: Path) -> None:
-    run_to_summary(tmp_path / "run", "triplet", "--duration", "0.1")
-    ended = snakesim("identify", "run", cwd=tmp_path)
-    assert ended.code == 2 and "snakesim run identify" in ended.err

@@ -40,7 +40,8 @@ def test_a_sound_robot_passes(tmp_path: Path) -> None:
     assert code == 0 and lines[-1] == f"{JOINTS} of {JOINTS} joints are as the robot file says", lines
 
 
-def test_another_run_is_refused(tmp_path: Path) -> None:
+def test_a_run_of_another_scenario_is_neither_checked_nor_identified(tmp_path: Path) -> None:
     run_to_summary(tmp_path / "run", "triplet", "--duration", "0.1")
-    ended = snakesim("joints", "check", "run", cwd=tmp_path)
-    assert ended.code == 2 and "snakesim run joint_check" in ended.err
+    for typed, wanted in ((("joints", "check", "run"), "joint_check"), (("identify", "run"), "identify")):
+        ended = snakesim(*typed, cwd=tmp_path)
+        assert ended.code == 2 and f"snakesim run {wanted}" in ended.err

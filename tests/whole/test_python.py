@@ -13,6 +13,7 @@ from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.playback.export import UNITS
 from snakesim_operator.run.in_process import simulate
 from tests.e2e.documents import REPOSITORY, sections
+from tests.harness.command import call
 
 needs_pandas = pytest.mark.skipif(importlib.util.find_spec("pandas") is None, reason="pandas is not installed")
 
@@ -164,14 +165,7 @@ def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     assert len(study.splitlines()) <= 25
     assert f"```python\n{study}```" in (REPOSITORY / "README.md").read_text()
     (tmp_path / "study.py").write_text(study)
-    done = subprocess.run(
-        [sys.executable, "study.py"],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(REPOSITORY), "PATH": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "first.html").is_file() and "incomplete" not in done.stdout
-    assert "0.5 rad: " in done.stdout and "sim -> can" in done.stdout and "A moved" in done.stdout
+    done = call([sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    assert done.code == 0, done.err
+    assert (tmp_path / "first.html").is_file() and "incomplete" not in done.out
+    assert "0.5 rad: " in done.out and "sim -> can" in done.out and "A moved" in done.out

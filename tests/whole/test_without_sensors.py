@@ -12,14 +12,13 @@ from snakesim_operator.results.record import REPORT, RunRecord
 from tests.whole.command import snakesim
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "without_sensors.py"
-BARE = ("robot.sensors.imu",)  # and these servos have no contact sensors, whatever the file says
 SHORT = ["triplet", "--backend", "dynamixel", "--duration", "2.5", "--in-process"]
+BARE = [*SHORT, "--unset", "robot.sensors.imu"]  # and these servos have no contact sensors, whatever the file says
 
 
 def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is_estimated(tmp_path: Path) -> None:
-    flags = [word for key in BARE for word in ("--unset", key)]
-    watched = [*SHORT, *flags, "--set", "mission.localisation=dead_reckoning", "--out", "watched"]
-    blind = [*SHORT, *flags, "--unset", "robot.sensors.pose", "--out", "blind"]
+    watched = [*BARE, "--set", "mission.localisation=dead_reckoning", "--out", "watched"]
+    blind = [*BARE, "--unset", "robot.sensors.pose", "--out", "blind"]
     ended = {name: snakesim("run", *words, cwd=tmp_path) for name, words in (("watched", watched), ("blind", blind))}
     said = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ended}
     assert all(one.code == 0 for one in ended.values()), ended["blind"].out + ended["blind"].err
