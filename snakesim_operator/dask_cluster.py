@@ -11,11 +11,16 @@ from snakesim_hal.errors import ConfigError, NotConnectedError, short
 MEET_S = 20.0
 
 
+def check_address(address: str | None) -> None:
+    """Before anything is begun for it. Raises ConfigError."""
+    if address is not None and not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
+        raise ConfigError(f"--cluster {short(address)}: give the scheduler as tcp://HOST:PORT")
+
+
 @contextmanager
 def connected(address: str) -> Iterator[Client]:
     """Its client. Raises NotConnectedError when there is no answer, ConfigError for an invalid address."""
-    if not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
-        raise ConfigError(f"--cluster {short(address)}: give the scheduler as tcp://HOST:PORT")
+    check_address(address)
     try:
         client = Client(address, timeout=MEET_S, set_as_default=False)
     except (OSError, TimeoutError):

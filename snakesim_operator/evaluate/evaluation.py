@@ -13,6 +13,7 @@ from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say
+from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate import store
 from snakesim_operator.evaluate.card import CARD, Card, card_of, compare, read_card, text
 from snakesim_operator.evaluate.case import Case
@@ -55,6 +56,7 @@ def go(request: Request) -> int:
         return _run_one(request, request.only)
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out")
+    check_address(request.cluster)
     others = [read_card(path) for path in request.against]
     seed = first_field(request)
     cases = cases_of(request.suite, request.source, request.controllers, request.fields, seed)

@@ -17,6 +17,7 @@ from optuna.trial import Trial, TrialState
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import compose, parse_set
 from snakesim_hal.terminal import say
+from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate.case import Case, Outcome
 from snakesim_operator.evaluate.cluster import size, solve, workers
 from snakesim_operator.evaluate.suite import Suite, also_set, cases_of, read_suite, rows_of, seeds_of
@@ -51,6 +52,7 @@ def optimise(request: Request) -> int:
         )
     for end in ("low", "high"):  # before anything is started
         _cases(request, {key: getattr(one, end) for key, one in space.items()})
+    check_address(request.cluster)
     study = _study(request)
     have = len(study.get_trials(states=(TrialState.COMPLETE,)))
     already = f"holds {have} trials already" if have else "keeps all trials"

@@ -103,13 +103,6 @@ def test_a_wrong_suite_is_told_what_and_where(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_cluster_without_an_address_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """After its folder is made, which is left: so it is no row of refusals.toml."""
-    given = ("--fields", "1", "--cluster", "nowhere", "--out", str(tmp_path / "out"))
-    assert main(["evaluate", "sensors", *given]) == 2
-    assert "--cluster nowhere" in capsys.readouterr().err
-
-
 def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
     suite, source = read(tmp_path, 'scenario = "jam"\n[vary]\nseed = "1:1000:1000"')
     with pytest.raises(ConfigError, match="300000 cases"):
