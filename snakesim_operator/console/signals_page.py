@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 from snakesim_hal.arrays import Floats
 from snakesim_operator.console.signals import Signals
 from snakesim_operator.results.page.charts import LIBRARY, rounded, thinned
-from snakesim_operator.results.page.palette import DARK, LIGHT, joint_colours
+from snakesim_operator.results.page.palette import DARK, LIGHT, joint_colours, variables
 
 HERE = Path(__file__).parent
 PATH = "/signals"
@@ -148,10 +148,8 @@ def _json(value: object) -> tuple[str, bytes]:
 
 def _themes() -> str:
     """Both, for a page that is told which one it has."""
-    light, dark = (
-        "".join(f"--{name}:{value};" for name, value in (colours | joint_colours(COLOURS, dark=is_dark)).items())
-        for colours, is_dark in ((LIGHT, False), (DARK, True))
-    )
+    light = variables(LIGHT | joint_colours(COLOURS, dark=False))
+    dark = variables(DARK | joint_colours(COLOURS, dark=True))
     return f":root{{{light}}}:root.dark{{{dark}color-scheme:dark}}"
 
 

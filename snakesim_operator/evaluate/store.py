@@ -82,20 +82,16 @@ def _read(path: Path, handle: int) -> Results:
 def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Path]:
     """Results in the order of the cases, as Parquet and CSV; nothing in them depends on the clock."""
     columns = _columns()
-    rows = [_row(case, done[case.id], list(columns)) for case in cases if case.id in done]
+    finished = [(case, done[case.id]) for case in cases if case.id in done]
+    rows = [{**one.numbers, **case.columns, "error": one.error} for case, one in finished]
     paths = [folder / PARQUET, folder / CSV]
     schema = pa.schema(list(columns.items()))
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), paths[0])
     with paths[1].open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(columns), lineterminator="\n")
+        writer = csv.DictWriter(file, list(columns), extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     return paths
-
-
-def _row(case: Case, outcome: Outcome, columns: list[str]) -> dict[str, Number]:
-    values = {**outcome.numbers, **case.columns, "error": outcome.error}
-    return {name: values.get(name) for name in columns}
 
 
 def _columns() -> dict[str, Any]:

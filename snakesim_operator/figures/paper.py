@@ -79,7 +79,7 @@ def _near(record: RunRecord, instant: Instant, width_in: float) -> Figure:
     contact = balance.contacts[-1]
     points = [np.array(contact.position_w[:2])]
     if (joint := instant.propulsion_joint) is not None:
-        at = nodes_xy_w(record, instant)[joint + 1]
+        at = nodes_xy_w(record, instant.row)[joint + 1]
         torque_nm = record.torque_nm[instant.row, joint]
         axes.plot(*at, "o", color=rcParams["text.color"], markersize=5)
         axes.annotate(f"$\\tau$ {torque_nm:.2f} N·m", at, (6, -12), textcoords="offset points")
@@ -152,7 +152,7 @@ def _torque(axes: Axes, record: RunRecord, joint: int) -> None:
 
 def _ground(axes: Axes, record: RunRecord, instant: Instant) -> None:
     """Obstacles and body, to scale; the window is that round the body."""
-    nodes = nodes_xy_w(record, instant)
+    nodes = nodes_xy_w(record, instant.row)
     for item in record.placed:
         one = item.obstacle
         if one.shape == "box":

@@ -97,18 +97,17 @@ def size_limits() -> list[dict[str, Any]]:
     others = [row.key for row in keys.SPACE if row.message and row.key not in (*images, *queries, *small)]
     latched = [f"{row.key}/@adv/{ANY}" for row in keys.SPACE if row.kind == "latched"]
     return [
-        _limit("images", ["put", "delete", "query", "reply"], images, MAX_IMAGE_BYTES),
-        _limit("requests", ["put", "delete", "query", "reply"], queries, REQUEST_BYTES),
-        _limit("commands", ["put", "delete", "query", "reply"], small, COMMAND_BYTES),
-        _limit("others", ["put", "delete", "query", "reply"], [*others, *latched], MAX_PAYLOAD_BYTES),
+        {
+            "id": name,
+            "flows": ["ingress"],
+            "messages": ["put", "delete", "query", "reply"],
+            "key_exprs": [f"{ANY}/{place}" for place in places],
+            "size_limit": max_bytes,
+        }
+        for name, places, max_bytes in (
+            ("images", images, MAX_IMAGE_BYTES),
+            ("requests", queries, REQUEST_BYTES),
+            ("commands", small, COMMAND_BYTES),
+            ("others", [*others, *latched], MAX_PAYLOAD_BYTES),
+        )
     ]
-
-
-def _limit(name: str, messages: list[str], places: list[str], max_bytes: int) -> dict[str, Any]:
-    return {
-        "id": name,
-        "flows": ["ingress"],
-        "messages": messages,
-        "key_exprs": [f"{ANY}/{place}" for place in places],
-        "size_limit": max_bytes,
-    }

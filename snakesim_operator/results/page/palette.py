@@ -78,10 +78,11 @@ def themes(joints: int) -> str:
     """The colours of both themes as CSS variables. Paper is always light."""
     light, dark = LIGHT | joint_colours(joints, dark=False), DARK | joint_colours(joints, dark=True)
     return (
-        f":root{{{_variables(light)}}}@media screen and (prefers-color-scheme:dark)"
-        f"{{:root:not(.paper){{{_variables(dark)}}}}}"
+        f":root{{{variables(light)}}}@media screen and (prefers-color-scheme:dark)"
+        f"{{:root:not(.paper){{{variables(dark)}}}}}"
     )
 
 
-def _variables(colours: dict[str, str]) -> str:
+def variables(colours: dict[str, str]) -> str:
+    """Colours as CSS has them."""
     return "".join(f"--{name}:{value};" for name, value in colours.items())

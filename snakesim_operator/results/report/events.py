@@ -38,11 +38,8 @@ def events(record: RunRecord, summary: RunSummary) -> list[Event]:
     forces = record.contact_peak_n
     if np.nanmax(forces, initial=0.0) > 0:
         row = int(np.nanargmax(forces))
-        found.append(
-            Event(
-                float(record.time_s[row] - record.time_s[0]), f"Largest contact force over 50 ms, {forces[row]:.0f} N"
-            )
-        )
+        at_s = float(record.time_s[row] - record.time_s[0])
+        found.append(Event(at_s, f"Largest contact force over 50 ms, {forces[row]:.0f} N"))
     found += [Event(band.start_s, "Jam") for band in jam_bands(record)[:1]]
     moved_m = distance_m(summary)
     stop = stop_of(record, abs(moved_m)) if moved_m else None
@@ -93,5 +90,5 @@ def _instant_of(record: RunRecord, event: Event) -> Instant | None:
 
 
 def _look_alike(record: RunRecord, a: Instant, b: Instant) -> bool:
-    moved_m = np.abs(nodes_xy_w(record, a) - nodes_xy_w(record, b)).max()
+    moved_m = np.abs(nodes_xy_w(record, a.row) - nodes_xy_w(record, b.row)).max()
     return bool(moved_m < SAME_M or abs(a.time_s - b.time_s) < SAME_S)

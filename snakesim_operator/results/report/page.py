@@ -101,7 +101,7 @@ def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
     cards: list[dict[str, Any]] = []
     windows = views(record, [instant for _, instant in chosen], VIEW_WIDTH)
     for (event, instant), view in zip(chosen, windows, strict=True):
-        nodes, polygon = nodes_xy_w(record, instant), None
+        nodes, polygon = nodes_xy_w(record, instant.row), None
         ahead = nodes[-1] - nodes[0]
         if instant.balance is not None:
             scale = units_per_n(balances, *POLYGON, upright=view.upright)

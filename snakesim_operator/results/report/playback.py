@@ -20,7 +20,7 @@ from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, element, figure
 from snakesim_operator.results.report.timeline import end_s, in_words, zero_s
 from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
-from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view
+from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view, nodes_xy_w
 
 MessageT = TypeVar("MessageT", ControlState, World)
 FRAMES = 300
@@ -47,7 +47,7 @@ def playback(record: RunRecord) -> Playback | None:
     if not len(posed):
         return None
     rows = posed[np.unique(np.linspace(0, len(posed) - 1, min(len(posed), FRAMES)).astype(int))]
-    nodes = [_nodes(record, int(row)) for row in rows]
+    nodes = [nodes_xy_w(record, int(row)) for row in rows]
     names = [joint.name for joint in record.description.joints]
     states = _latest(record, rows, record.control)
     worlds = _latest(record, rows, record.worlds)
@@ -117,12 +117,6 @@ def _flat(view: View, points_w: Floats) -> list[float]:
 def _last_before(record: RunRecord, rows: NDArray[np.intp], stamps_ns: Sequence[int]) -> list[int]:
     stamps_s = np.array(stamps_ns) * 1e-9
     return (np.searchsorted(stamps_s, record.time_s[rows] + SAME_TICK_S, side="right") - 1).tolist()
-
-
-def _nodes(record: RunRecord, row: int) -> Floats:
-    nodes = record.nodes_w(row)
-    assert nodes is not None, "rows without a pose are not drawn"
-    return nodes[:, :2]
 
 
 def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[MessageT]) -> list[MessageT | None]:

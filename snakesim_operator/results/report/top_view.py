@@ -31,7 +31,7 @@ ROUND = 12  # corners of a circle
 
 def top_view(record: RunRecord, instant: Instant, view: View) -> str:
     """The drawing of one instant."""
-    nodes, joint = nodes_xy_w(record, instant), instant.propulsion_joint
+    nodes, joint = nodes_xy_w(record, instant.row), instant.propulsion_joint
     labels = Labels(view.width, view.height - FOOT)
     parts = [ground(record, view, labels), body(record, view, nodes, labels)]
     parts += [_felt(contact, view, labels) for contact in instant.felt]
@@ -106,12 +106,11 @@ def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:
     for i, link in enumerate(record.description.links):
         wide = 2 * link.radius_m * view.scale
         kind = "head-link" if i == len(record.description.links) - 1 else "link"
+        a, b = points[i], points[i + 1]
         for class_, width in ((f"{kind}-edge", wide), (kind, wide - 2.4)):
-            a, b = points[i], points[i + 1]
-            parts.append(
-                element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=max(width, 1.0))
-            )
-        labels.keep_off_line(points[i], points[i + 1], wide / 2, 0.4)
+            thick = max(width, 1.0)
+            parts.append(element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=thick))
+        labels.keep_off_line(a, b, wide / 2, 0.4)
     parts += [element("circle", cx=x, cy=y, r=2.4, class_="joint") for x, y in points[1:-1]]
     return "".join(parts)
 

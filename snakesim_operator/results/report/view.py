@@ -62,7 +62,7 @@ def reach_m(obstacle: Obstacle) -> float:
 
 def views(record: RunRecord, instants: list[Instant], width: float) -> list[View]:
     """A window for each instant, all of one size and at one scale: round the body, with room for the arrows."""
-    bodies = [nodes_xy_w(record, one) for one in instants]
+    bodies = [nodes_xy_w(record, one.row) for one in instants]
     balances = [one.balance for one in instants if one.balance is not None]
     sizes = [size for one in balances for size in (*one.size_n, float(np.hypot(*one.resultant_n)))]
     sizes = sizes or [math.hypot(*contact.force_w[:2]) for one in instants for contact in one.felt]
@@ -102,8 +102,8 @@ def _with_obstacles(record: RunRecord, plain: View, low: Floats, high: Floats) -
     return low, high
 
 
-def nodes_xy_w(record: RunRecord, instant: Instant) -> Floats:
+def nodes_xy_w(record: RunRecord, row: int) -> Floats:
     """Tail end, joints and head end on the ground, (joints + 2, 2)."""
-    nodes = record.nodes_w(instant.row)
-    assert nodes is not None, "instants without a pose are not chosen"
+    nodes = record.nodes_w(row)
+    assert nodes is not None, "rows without a pose are not drawn"
     return nodes[:, :2]

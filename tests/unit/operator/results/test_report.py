@@ -104,7 +104,7 @@ def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page
     assert found[0].words == "Start" and found[-1].words == "Stop"
     assert sum(one.words.startswith("Largest contact force") for one in found) == 1
     drawn = drawn_instants(record, found)
-    bodies = [nodes_xy_w(record, instant) for _, instant in drawn]
+    bodies = [nodes_xy_w(record, instant.row) for _, instant in drawn]
     assert all(np.abs(a - b).max() > 0.004 for a, b in itertools.combinations(bodies, 2))
     said = "; ".join(event.words for event, _ in drawn)
     for words in ("Start", "joint_10 begins to propel", "Hand-over to joint_4", "Largest contact force", "Stop"):
