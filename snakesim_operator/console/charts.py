@@ -1,6 +1,7 @@
 """Live charts: every joint now, and the last seconds of all joints."""
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -61,18 +62,8 @@ class JointCharts:
             height=190,
             scales={"x": {"time": False}, "y": _range(self._limits)},
         )
-        colours = list(joint_colours(count, dark=True).values())
-        lines = tuple(line(name, colour) for name, colour in zip(self._names, colours, strict=True))
-        empty = (np.zeros(1), *[np.full(1, np.nan)] * count)
         self._angles_then, self._torques_then = (
-            gui.add_uplot(
-                empty,
-                ({"label": "s"}, *lines),
-                title=title,
-                height=190,
-                scales={"x": {"time": False}, "y": _range(most)},
-                legend={"show": False},
-            )
+            over_time(gui, self._names, title, {"y": _range(most)}, legend={"show": False})
             for title, most in (
                 ("Angle of all joints, last 10 s, rad", angles),
                 ("Torque of all joints, last 10 s, N·m", self._limits),
@@ -97,7 +88,8 @@ class JointCharts:
             return
         measured = np.where(joints.valid, joints.angle_rad, np.nan)
         self._angles.data = (self._number, measured, references_rad(snapshot))
-        limits = np.array([self._share(snapshot, name) for name in self._names]) * self._limits
+        derated = {} if snapshot.status is None else snapshot.status.derated
+        limits = np.array([derated.get(name, 1.0) for name in self._names]) * self._limits
         torque = np.where(joints.valid, joints.torque_nm, np.nan)
         pushing = pushing_joint(snapshot)
         marked = np.where(np.arange(len(torque)) == pushing, torque, np.nan)
@@ -108,9 +100,6 @@ class JointCharts:
             for chart, which in ((self._angles_then, 1), (self._torques_then, 2)):
                 values = np.array([sample[which] for sample in self._history])[kept]
                 chart.data = (times[kept], *np.ascontiguousarray(values.T))
-
-    def _share(self, snapshot: RobotSnapshot, joint: str) -> float:
-        return 1.0 if snapshot.status is None else snapshot.status.derated.get(joint, 1.0)
 
 
 def references_rad(snapshot: RobotSnapshot) -> Floats:
@@ -127,6 +116,19 @@ def references_rad(snapshot: RobotSnapshot) -> Floats:
 def _range(most: Floats) -> Any:
     """A fixed scale up to the limits: one sees how much is left, and values that are unknown do not matter."""
     return {"range": (-1.05 * float(most.max()), 1.05 * float(most.max()))}
+
+
+def over_time(gui: viser.GuiApi, names: Sequence[str], title: str, scale: Any = None, **more: Any) -> Any:
+    """A chart with a line for each name, still empty. scale: of the values; None: as they come."""
+    colours = joint_colours(len(names), dark=True).values()
+    return gui.add_uplot(
+        (np.zeros(1), *[np.full(1, np.nan)] * len(names)),
+        ({"label": "s"}, *(line(name, colour) for name, colour in zip(names, colours, strict=True))),
+        title=title,
+        height=190,
+        scales={"x": {"time": False}, **(scale or {})},
+        **more,
+    )
 
 
 def line(label: str, stroke: str, *, dash: bool = False, dots: bool = False, size: int = 5) -> Any:

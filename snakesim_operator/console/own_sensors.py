@@ -7,10 +7,9 @@ import numpy as np
 import viser
 
 from snakesim_hal.wire.own_sample import OwnKind, own_kinds
-from snakesim_operator.console.charts import HISTORY_S, SAMPLES_MOST, keep, line
+from snakesim_operator.console.charts import HISTORY_S, SAMPLES_MOST, keep, over_time
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.texts import plain, table
-from snakesim_operator.results.page.palette import joint_colours
 
 MOST_CHARTS, MOST_LINES = 8, 16
 
@@ -77,15 +76,8 @@ class OwnSensors:
     def _add(self, what: tuple[str, str], names: list[str]) -> None:
         if what in self._charts:
             self._charts.pop(what)[1].remove()
-        colours = joint_colours(len(names), dark=True).values()
-        chart = self._gui.add_uplot(
-            (np.zeros(1), *[np.full(1, np.nan)] * len(names)),
-            ({"label": "s"}, *(line(name, colour) for name, colour in zip(names, colours, strict=True))),
-            title=f"{what[0]}, last {HISTORY_S:g} s, {what[1]}",
-            height=190,
-            scales={"x": {"time": False}},
-        )
-        self._charts[what] = names, chart
+        title = f"{what[0]}, last {HISTORY_S:g} s, {what[1]}"
+        self._charts[what] = names, over_time(self._gui, names, title)
 
     def remove(self) -> None:
         """Take everything off the page: another robot."""

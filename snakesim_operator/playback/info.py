@@ -28,11 +28,8 @@ from snakesim_operator.results.record import GIVE
 from snakesim_operator.results.recorded import ALL, Contents
 from snakesim_operator.tools.parameters import PREFIX, differing
 
-IRREGULAR = (
-    keys.CONTROL_STATE,
-    keys.STATUS,
-    keys.INTENT,
-)  # published on a change too, so that nothing is missing there
+# Published on a change too, so that nothing is missing there.
+IRREGULAR = (keys.CONTROL_STATE, keys.STATUS, keys.INTENT)
 
 
 @dataclass
@@ -104,28 +101,6 @@ def inspect_recording(path: Path) -> RecordingInfo:
         if recorded.key == keys.SETTINGS_IN_FORCE:
             with contextlib.suppress(WireError):
                 in_force.append(decoder.decode(recorded.payload, recorded.encoding))
-    return _summed_up(path, reader, found, contents, _changes(in_force))
-
-
-def _changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
-    return [
-        SettingsChange(
-            time_s=now.stamp_ns * 1e-9,
-            who=now.who,
-            changed={PREFIX + one.name: (was.value, one.value) for was, one in differing(before, now)},
-        )
-        for before, now in pairwise(in_force)
-        if now.who is not None and now.changes != before.changes
-    ]
-
-
-def _summed_up(
-    path: Path,
-    reader: RecordingReader,
-    found: dict[str, KeyInfo],
-    contents: Contents,
-    settings: list[SettingsChange],
-) -> RecordingInfo:
     robot, status = contents.description, contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
     # Not since the oldest message: latched values, such as the description, are older than a recording that began late.
@@ -152,10 +127,22 @@ def _summed_up(
         command_digest=None if host is None or not host.ticks else host.command_digest,
         own_arithmetic=[] if robot is None else foreign(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
-        settings=settings,
+        settings=_changes(in_force),
         dropped=reader.losses.dropped,
         keys={key: _numbers(one, duration_s, regular=key not in irregular) for key, one in sorted(found.items())},
     )
+
+
+def _changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
+    return [
+        SettingsChange(
+            time_s=now.stamp_ns * 1e-9,
+            who=now.who,
+            changed={PREFIX + one.name: (was.value, one.value) for was, one in differing(before, now)},
+        )
+        for before, now in pairwise(in_force)
+        if now.who is not None and now.changes != before.changes
+    ]
 
 
 def _why(status: Status) -> str:

@@ -146,9 +146,8 @@ class McapFile:
             self._counts[channel] += len(index) // 2
             self._index[channel] = []
         after = records.count - length
-        ChunkIndex(length, at, "zstd", len(data), end_ns, after, offsets, begin_ns, len(self._chunk)).write(
-            self._chunk_indices
-        )
+        index = ChunkIndex(length, at, "zstd", len(data), end_ns, after, offsets, begin_ns, len(self._chunk))
+        index.write(self._chunk_indices)
         self._file.write(records.end())
         self._spans_ns = [min([begin_ns, *self._spans_ns]), max([end_ns, *self._spans_ns])]
         self._chunks += 1

@@ -66,7 +66,9 @@ class OriginRelay:
         head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
         why = why_head_refused(head, self._also)
         if why is not None:
-            self._tell(why)
+            if why not in self._told and len(self._told) < AT_ONCE:
+                self._told.add(why)
+                self._report(f"Foxglove: refused a viewer: {why}; if you trust it: --foxglove-origin ORIGIN")
             writer.write(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
             await writer.drain()
             return
@@ -80,11 +82,6 @@ class OriginRelay:
             await asyncio.gather(*ways, return_exceptions=True)
         finally:
             to_behind.close()
-
-    def _tell(self, why: str) -> None:
-        if why not in self._told and len(self._told) < AT_ONCE:
-            self._told.add(why)
-            self._report(f"Foxglove: refused a viewer: {why}; if you trust it: --foxglove-origin ORIGIN")
 
     def __enter__(self) -> Self:
         return self

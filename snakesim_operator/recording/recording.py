@@ -77,7 +77,8 @@ class Recording:
 
     def _write(self, arrival: Arrival) -> None:
         if arrival.key == keys.DESCRIPTION:
-            self._meet(arrival.payload)
+            with suppress(*UNDECODABLE):
+                self._own = own_kinds(msgspec.msgpack.decode(arrival.payload, type=Description))
         channel = self._channels.get(arrival.key)
         if channel is None and (channel := self._open(arrival)) is None:
             return
@@ -93,10 +94,6 @@ class Recording:
             self._mcap.add(channel, at_ns, wall_ns, self._shown[shown.topic], shown.payload)
             if self._show is not None:
                 self._show(shown, at_ns)
-
-    def _meet(self, payload: bytes) -> None:
-        with suppress(*UNDECODABLE):
-            self._own = own_kinds(msgspec.msgpack.decode(payload, type=Description))
 
     def flush_when_due(self) -> None:
         """Write what waits, a few times a second."""

@@ -36,7 +36,10 @@ class RobotTime:
         """Robot time in ns: of the message's own tick, or of the newest clock when it names none or none near it."""
         try:
             if key == keys.CLOCK:
-                self._tick(self._clock.decode(payload))
+                clock = self._clock.decode(payload)
+                self.went_back = self.clock is not None and clock.tick < self.clock.tick
+                self.clock = clock
+                self._now_ns = min(max(clock.tick * clock.period_ns, 0), LATEST_NS)
                 return self._now_ns
             dated = self._dated.decode(payload)
         except UNDECODABLE:
@@ -48,8 +51,3 @@ class RobotTime:
             if at_ns >= 0 and abs(at_ns - self._now_ns) <= MAX_AWAY_NS:
                 return at_ns
         return self._now_ns
-
-    def _tick(self, clock: _Clock) -> None:
-        self.went_back = self.clock is not None and clock.tick < self.clock.tick
-        self.clock = clock
-        self._now_ns = min(max(clock.tick * clock.period_ns, 0), LATEST_NS)

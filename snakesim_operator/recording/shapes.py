@@ -78,12 +78,11 @@ def body(robot: Description, time_ns: int) -> list[SceneEntity]:
             id=link.name,
             frame_locked=True,
             cylinders=[
-                CylinderPrimitive(
-                    pose=Pose(position=Vector3(x=0.5 * link.length_m), orientation=_ALONG_X),
-                    size=Vector3(x=2 * link.radius_m, y=2 * link.radius_m, z=link.length_m),
-                    bottom_scale=1.0,
-                    top_scale=1.0,
-                    color=SNAKE,
+                _cylinder(
+                    Pose(position=Vector3(x=0.5 * link.length_m), orientation=_ALONG_X),
+                    link.radius_m,
+                    link.length_m,
+                    SNAKE,
                 )
             ],
             spheres=[
@@ -110,10 +109,7 @@ def obstacles(found: Iterable[Obstacle], name: str, colour: Color, time_ns: int)
             size = Vector3(**{axis: 2 * half for axis, half in zip("xyz", one.half_size_m, strict=True)})
             entity.cubes.append(CubePrimitive(pose=pose, size=size, color=colour))
         else:
-            size = Vector3(x=2 * one.radius_m, y=2 * one.radius_m, z=one.height_m)
-            entity.cylinders.append(
-                CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
-            )
+            entity.cylinders.append(_cylinder(pose, one.radius_m, one.height_m, colour))
     return entity
 
 
@@ -182,6 +178,11 @@ def calibration(image: DepthImage | ColourImage, frame_id: str, time_ns: int) ->
         R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
         P=[fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
     )
+
+
+def _cylinder(pose: Pose, radius_m: float, length_m: float, colour: Color) -> CylinderPrimitive:
+    size = Vector3(x=2 * radius_m, y=2 * radius_m, z=length_m)
+    return CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
 
 
 def _ball(x: float, y: float, z: float, diameter_m: float, colour: Color) -> SpherePrimitive:

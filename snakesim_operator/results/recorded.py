@@ -53,12 +53,10 @@ class Contents:
     config: Configuration | None = None
     status: Status | None = None  # the last one
     streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_STREAMS})
-    at: dict[str, dict[int, Any]] = field(
-        default_factory=lambda: {key: {} for key in _TICKED}
-    )  # key -> tick -> message
-    own: dict[str, list[RecordedMessage]] = field(
-        default_factory=dict[str, list[RecordedMessage]]
-    )  # of own sensors, by key
+    # key -> tick -> message
+    at: dict[str, dict[int, Any]] = field(default_factory=lambda: {key: {} for key in _TICKED})
+    # of own sensors, by key
+    own: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a turn of navigation -> work in it
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason

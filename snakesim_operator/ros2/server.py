@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.network.foreign_network import RawQueryable, RawQuestion
+from snakesim_hal.network.foreign_network import RawQueryable
 from snakesim_hal.terminal import Say
 from snakesim_operator.ros2.graph import Node, Topic, answering
 from snakesim_operator.ros2.service_types import Service
@@ -44,10 +44,7 @@ class Server:
         if attached is None or request is None:
             self.rejected += 1
             return
-        self._answered = self._thread.submit(self._reply, question, request, attached)
-
-    def _reply(self, question: RawQuestion, request: Any, attached: bytes) -> None:
-        question.reply(self._answer(request), attached)
+        self._answered = self._thread.submit(lambda: question.reply(self._answer(request), attached))
 
     def close(self) -> None:
         """Wait for what is being answered."""

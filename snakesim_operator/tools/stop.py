@@ -35,7 +35,8 @@ def estop(where: RobotSelection, say: Say = say) -> int:
         here = [result for future in asked_here if (result := future.result()) is not None]
         there = [result for future in asked_there if (result := future.result()) is not None]
         shown = [result for future in asked_all for result in future.result()]
-    results = [*here, *_confirmed(there, shown), *_others(here, there, shown)]
+    only_there = [result for result in shown if not any(_same(result, other) for other in (*here, *there))]
+    results = [*here, *_confirmed(there, shown), *only_there]
     for robot in results:
         say(f"{robot.name}: {'stopped' if robot.stopped else 'NOT STOPPED'}: {robot.text} ({robot.endpoint})")
     for robot in shown:
@@ -67,11 +68,6 @@ def _confirmed(there: list[StopResult], shown: list[StopResult]) -> list[StopRes
         for result in there
         if result.stopped or not any(_same(result, other) and other.stopped for other in shown)
     ]
-
-
-def _others(here: list[StopResult], there: list[StopResult], shown: list[StopResult]) -> list[StopResult]:
-    """Robots that only the network reports."""
-    return [result for result in shown if not any(_same(result, other) for other in (*here, *there))]
 
 
 def _same(a: StopResult, b: StopResult) -> bool:

@@ -53,21 +53,15 @@ def _ask(session: Session, link: Link, limit_s: float) -> list[StopResult]:
     for name in dict.fromkeys([*names, *answers]):
         given = answers.get(name, [])
         if not given:
-            results.append(
-                StopResult(
-                    name, link.endpoint, stopped=False, text=f"NO ANSWER for {limit_s:g} s: use its own emergency stop"
-                )
-            )
+            text = f"NO ANSWER for {limit_s:g} s: use its own emergency stop"
+            results.append(StopResult(name, link.endpoint, stopped=False, text=text))
             continue
         reader = statuses.get(name) or session.latched_reader(_of(name, link, keys.STATUS), Status)
         doubt, _ = judge(given, reader)
         refused = next((answer.reason for answer in given if not answer.ok), None)
         wrong = doubt or refused
-        results.append(
-            StopResult(
-                name, link.endpoint, stopped=wrong is None, text=wrong or given[0].reason, in_doubt=doubt is not None
-            )
-        )
+        text, in_doubt = wrong or given[0].reason, doubt is not None
+        results.append(StopResult(name, link.endpoint, stopped=wrong is None, text=text, in_doubt=in_doubt))
     return results
 
 

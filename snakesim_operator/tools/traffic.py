@@ -76,10 +76,8 @@ class Traffic:
             self._times.setdefault(arrival.key, deque(maxlen=KEPT)).append(arrival.monotonic_ns)
             for suffix, message in TIMED.items():
                 if f"/{arrival.key}".endswith(f"/{suffix}") and len(arrival.payload) <= TIMED_BYTES:
-                    timed = self._timed.setdefault(
-                        (arrival.key.removesuffix(suffix), message), deque(maxlen=TIMED_KEPT)
-                    )
-                    timed.append(arrival)
+                    at = (arrival.key.removesuffix(suffix), message)
+                    self._timed.setdefault(at, deque(maxlen=TIMED_KEPT)).append(arrival)
 
     def lines(self, now_ns: int) -> list[KeyTraffic]:
         """Every key, sorted by robot and key."""

@@ -65,19 +65,8 @@ def playback(record: RunRecord) -> Playback | None:
             said.append(words)
         time_s = float(record.time_s[row]) - zero_s(record)
         propels = names.index(joint) if joint in names else -1
-        frames.append(
-            [
-                round(time_s, 3),
-                _flat(view, body_w),
-                propels,
-                said.index(words),
-                solved,
-                felt,
-                map_of[i],
-                path_of[i],
-                kinds,
-            ]
-        )
+        body_at, said_at = _flat(view, body_w), said.index(words)
+        frames.append([round(time_s, 3), body_at, propels, said_at, solved, felt, map_of[i], path_of[i], kinds])
     labels = Labels(view.width, view.height)
     snake = element("g", body(record, view, nodes[0], labels), class_="snake")
     picture = figure(

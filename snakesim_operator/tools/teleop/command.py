@@ -167,12 +167,8 @@ class Teleop:
         status, control, steering = self._status, self._control, self._steering
         robot = "no status yet" if status is None else f"{status.lifecycle}{_heard(self._status_s)}: {status.why}"
         backend = "" if status is None else f" ({status.backend})"
-        lines = [f"{self._link.namespace}{backend}: {robot}"]
-        lines.append(
-            "control: nothing heard"
-            if control is None
-            else f"control: {control.state}{_heard(self._control_s)}: {control.reason}"
-        )
+        said = "nothing heard" if control is None else f"{control.state}{_heard(self._control_s)}: {control.reason}"
+        lines = [f"{self._link.namespace}{backend}: {robot}", f"control: {said}"]
         towards = "the mission's way" if steering.heading_w_rad is None else _degrees(steering.heading_w_rad)
         body = "unknown" if self._body_w_rad is None else _degrees(self._body_w_rad)
         asked = f"asked: {steering.speed_m_s:+.2f} m/s, {towards}; body: {body}"
