@@ -84,17 +84,9 @@ class Controls:
                 self._target = client.gui.add_text("Target", TARGETS["joint"])
                 inject = client.gui.add_button_group("Fault", ("Inject", "End it"))
         admission.admit(self._take, self.viewer)
-        for control in (
-            self._lifecycle,
-            time_buttons,
-            self._time_speed,
-            self._heading,
-            self._speed,
-            self._kind,
-            inject,
-        ):
+        driven = (self._lifecycle, time_buttons, self._time_speed, self._heading, self._speed)
+        for control in (*driven, self._kind, self._target, inject):
             admission.admit(control, self.viewer, self._in_control)
-        admission.admit(self._target, self.viewer, self._in_control)
         admission.admit(self._arm_unchecked, self.viewer, lambda: self._in_control() and self._offers_unchecked)
         admission.admit(self._drive, self.viewer, self._in_control, DRIVE_HZ)
         self._take.on_click(lambda _: self._take_or_release())

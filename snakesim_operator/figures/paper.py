@@ -173,15 +173,13 @@ def _ground(axes: Axes, record: RunRecord, instant: Instant) -> None:
 
 def _forces(axes: Axes, balance: Balance) -> None:
     scale = ARROW_M / max(*balance.size_n, balance.commanded_n)
+    solved = zip(balance.contacts, balance.contact_n, balance.size_n, strict=True)
     drawn = [
         (contact.position_w[:2], force, f"$f_{i + 1}$ {size:.1f} N", SOLVED)
-        for i, (contact, force, size) in enumerate(
-            zip(balance.contacts, balance.contact_n, balance.size_n, strict=True)
-        )
+        for i, (contact, force, size) in enumerate(solved)
     ]
-    drawn.append(
-        (balance.contacts[0].position_w[:2], balance.tether_n, f"$f_s$ {balance.commanded_n:.1f} N", COMMANDED)
-    )
+    tether = f"$f_s$ {balance.commanded_n:.1f} N"
+    drawn.append((balance.contacts[0].position_w[:2], balance.tether_n, tether, COMMANDED))
     for at, force, name, colour in drawn:
         tip = np.array(at) + scale * np.asarray(force)
         _arrow(axes, at, tip, colour)

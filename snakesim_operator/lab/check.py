@@ -30,7 +30,7 @@ from snakesim_hal.wire.roles import RECORDER, TABLE, Role
 from snakesim_operator.lab.certificates import RENEW_AT, read_certificate
 from snakesim_operator.lab.identities import Identity, identities
 from snakesim_operator.lab.lab_file import Lab
-from snakesim_operator.lab.zenoh_files import session_settings
+from snakesim_operator.lab.zenoh_files import session_settings, tls_files
 
 CONNECT_MS = 2000
 LISTEN_S = 1.0
@@ -231,12 +231,7 @@ def _settings(identity: Identity, lab: Lab, folder: Path, endpoints: list[str] |
     settings = session_settings(identity, lab)
     settings.pop("namespace", None)
     settings["connect"] |= {"timeout_ms": CONNECT_MS, "endpoints": endpoints or lab.endpoints()}
-    tls = _tls(identity, folder)
-    settings["transport"]["link"]["tls"] |= {
-        "root_ca_certificate": str(tls / "authority.pem"),
-        "connect_certificate": str(tls / f"{identity.label}.pem"),
-        "connect_private_key": str(tls / f"{identity.label}.key"),
-    }
+    settings["transport"]["link"]["tls"] |= tls_files(identity, str(_tls(identity, folder)), "connect")
     return settings
 
 

@@ -15,7 +15,8 @@ LEASE_MS = 2000  # after which a silent link is given up
 def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
     """A router: TLS on the machine's address, a certificate asked of everybody, and the access rules."""
     earlier = list(lab.file.routers)[: list(lab.file.routers).index(identity.of)]
-    tls = {**_tls(identity, lab, "listen"), **_tls(identity, lab, "connect"), "enable_mtls": True}
+    folder = f"{lab.file.machines[identity.machine].folder}/tls"
+    tls = {**tls_files(identity, folder, "listen"), **tls_files(identity, folder, "connect"), "enable_mtls": True}
     return {
         "mode": "router",
         "listen": {"endpoints": [lab.endpoint(identity.of)], "exit_on_failure": True},
@@ -35,6 +36,7 @@ def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
 
 def session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
     """A session of one role: a client of the routers, with its certificate, listening nowhere."""
+    folder = f"{lab.file.machines[identity.machine].folder}/tls"
     settings: dict[str, Any] = {
         "mode": "client",
         "connect": {"endpoints": lab.endpoints(), "timeout_ms": 5000, "exit_on_failure": True},
@@ -42,7 +44,7 @@ def session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
         "scouting": ALONE,
         "timestamping": STAMPED,
         "transport": {
-            "link": _link({**_tls(identity, lab, "connect"), "enable_mtls": True}),
+            "link": _link({**tls_files(identity, folder, "connect"), "enable_mtls": True}),
             "shared_memory": {"enabled": False},
         },
     }
@@ -61,8 +63,8 @@ def _link(tls: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _tls(identity: Identity, lab: Lab, side: str) -> dict[str, Any]:
-    folder = f"{lab.file.machines[identity.machine].folder}/tls"
+def tls_files(identity: Identity, folder: str, side: str) -> dict[str, Any]:
+    """The authority, and the certificate and key of an identity, in a folder; side: `listen` or `connect`."""
     return {
         "root_ca_certificate": f"{folder}/authority.pem",
         f"{side}_certificate": f"{folder}/{identity.label}.pem",

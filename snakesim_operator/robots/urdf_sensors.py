@@ -43,11 +43,8 @@ def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], sca
                 sensor.read = False
                 continue
             index = link_of[reference]
-            pose = (
-                frames[index]
-                @ _in_metres(row.bodies[index].frames[reference], scale)
-                @ _in_metres(_pose(sensor), scale)
-            )
+            root_from_link = row.bodies[index].frames[reference]
+            pose = frames[index] @ _in_metres(root_from_link, scale) @ _in_metres(_pose(sensor), scale)
             values |= {"name": plain(name, "sensor"), "link": index} | _place(pose, name, warn)
             values |= _camera(sensor) if kind in DEPTH else _lidar(sensor)
             group = "depth" if kind in DEPTH else "range"

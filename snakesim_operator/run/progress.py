@@ -58,7 +58,9 @@ class Progress(OneLine):
         now = time.monotonic()
         if status is None:
             return
-        self._count(status)
+        before, self._before = self._before, status
+        if before is not None and before.lifecycle == "armed":
+            self._armed_s += max(status.tick - before.tick, 0) / self._rate_hz
         if now < self._next and armed == self._armed:
             return
         if armed and self._origin is None:
@@ -71,11 +73,6 @@ class Progress(OneLine):
         if self.terminal or text != self._last:
             self.put(text)
         self._last = text
-
-    def _count(self, status: Status) -> None:
-        before, self._before = self._before, status
-        if before is not None and before.lifecycle == "armed":
-            self._armed_s += max(status.tick - before.tick, 0) / self._rate_hz
 
     def _running(self, status: Status, control: ControlState | None, now: float) -> str:
         assert self._origin is not None

@@ -84,10 +84,12 @@ def run(request: RunRequest) -> int:
     with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         names = (request.config.robot.name, request.config.backend)
+        common = [str(config_file), "--namespace", request.network_name, *_meeting(link)]
         with (
             interruptible(ending),
             registered(LocalRobot.on(link, *names, stop_port, str(config_file.absolute()))) as failure,
-            _console(request, link, files, config_file),  # first, because somebody waits for it
+            # first, because somebody waits for it
+            console_beside(common, files, say) if request.console else contextlib.nullcontext(),
         ):
             if failure is not None:
                 say(failure)
@@ -142,14 +144,6 @@ def _check_router(request: RunRequest) -> None:
     wanted = [injection for injection in planned(request.config) if injection.target == ROUTER]
     if wanted:
         raise ConfigError(f"fault {str(wanted[0])!r}: this run has no router of its own; add --with-router")
-
-
-def _console(
-    request: RunRequest, link: Link, files: RunFiles, config_file: Path
-) -> contextlib.AbstractContextManager[None]:
-    if not request.console:
-        return contextlib.nullcontext()
-    return console_beside([str(config_file), "--namespace", request.network_name, *_meeting(link)], files, say)
 
 
 def _conduct(
