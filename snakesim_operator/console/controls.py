@@ -101,7 +101,8 @@ class Controls:
         self._commissioning = CommissioningControls(client, tab, about, admission, self._in_control, self.do)
         self._kind.on_update(lambda _: self._suggest_target())
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
-        self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
+        # The page repeats this while the button is held; without it, motion stops.
+        self._drive.on_hold(lambda _: self._ask_for(self._speed.value, BUTTON_NS), callback_hz=DRIVE_HZ)
         self._apply.on_click(lambda _: self._configure())
         self.show()
 
@@ -191,10 +192,6 @@ class Controls:
         if self._in_control():
             order = SimulatorOrder(action, speed=float(self._time_speed.value), who=self.who)
             self.do("Simulator", lambda: self._operations.change_time(self.who, order))
-
-    def _go(self) -> None:
-        """The button is held: the page repeats this ten times a second; without it, motion stops."""
-        self._ask_for(self._speed.value, BUTTON_NS)
 
     def press(self, key: str) -> None:
         """A key of `KEYS` was pressed, or its keyboard repeats it; only the last one of several is repeated."""

@@ -37,10 +37,8 @@ def _write(noted: LastRun) -> None:
         write_whole(_file(), msgspec.json.encode(noted))
 
 
-def recall() -> tuple[str, str] | None:
-    """Folder and ending of the last run, or None."""
-    try:
-        noted = msgspec.json.decode(_file().read_bytes(), type=LastRun)
-    except (OSError, *UNDECODABLE):
-        return None
-    return noted.folder, noted.ended
+def recall() -> LastRun | None:
+    """The last run; None when there is none."""
+    with contextlib.suppress(OSError, *UNDECODABLE):
+        return msgspec.json.decode(_file().read_bytes(), type=LastRun)
+    return None

@@ -34,7 +34,8 @@ def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], sca
         reference = gazebo.get("reference", "")
         for sensor in gazebo.all("sensor"):
             kind, name = sensor.get("type", ""), sensor.get("name", "sensor")
-            values = _common(sensor)
+            rate_hz = sensor.text_number("update_rate", 0.0)
+            values: dict[str, Any] = {"rate_hz": rate_hz} if rate_hz > 0 else {}
             if kind in EVERYWHERE:
                 listed = table.values.get("sensors", {}).get(EVERYWHERE[kind]) or {}
                 table.put(f"sensors.{EVERYWHERE[kind]}", listed | values, urdf.source)
@@ -50,11 +51,6 @@ def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], sca
             group = "depth" if kind in DEPTH else "range"
             listed = table.values.get("sensors", {}).get(group, [])
             table.put(f"sensors.{group}", [*listed, values], urdf.source)
-
-
-def _common(sensor: Element) -> dict[str, Any]:
-    rate_hz = sensor.text_number("update_rate", 0.0)
-    return {"rate_hz": rate_hz} if rate_hz > 0 else {}
 
 
 def _pose(sensor: Element) -> Floats:

@@ -100,10 +100,8 @@ class Bridge:
 
     def _put_static(self) -> None:
         fixed = [*self._frames.fixed, *(one for some in self._sensors.values() for one in some)]
-        self._tf_static.put(ros.transforms(self._now_ns(), fixed))
-
-    def _now_ns(self) -> int:
-        return self._ros_time.of(0 if self._clock is None else self._clock.stamp_ns)
+        now_ns = self._ros_time.of(0 if self._clock is None else self._clock.stamp_ns)
+        self._tf_static.put(ros.transforms(now_ns, fixed))
 
     def _make_relays(self, robot: m.Description) -> list[Relay[Any]]:
         images = self._every(self._options.images_hz)
@@ -223,7 +221,7 @@ class Bridge:
         """Pass on what is due, both ways."""
         self._look_at_clock(time.monotonic())
         for relay in self._relays:
-            relay.turn(self._turns, self._fits)
+            relay.turn(self._turns, lambda message: mismatch(message, self._robot) is None)
         if self._options.cmd_vel:
             self._steer()
         if self._world is not None and self._turns % self._every(MARKERS_HZ) == 0:
@@ -255,9 +253,6 @@ class Bridge:
         described = self._descriptions.newest(is_consistent)
         if described is not None and described != self._robot:
             self._meet(described)
-
-    def _fits(self, message: m.Message) -> bool:
-        return mismatch(message, self._robot) is None
 
     def _draw(self, world: m.World) -> None:
         at_ns = world.stamp_ns if world.contacts_stamp_ns is None else world.contacts_stamp_ns

@@ -139,8 +139,9 @@ class RunFiles:
                 self._append(self.folder, task)
             elif task.kind == "put":
                 write_whole(self.folder / task.name, task.content)
-            else:
-                self._rename(self.folder, task.name, task.content.decode())
+            elif task.name in self._handles:
+                os.close(self._handles.pop(task.name))
+                (self.folder / task.name).rename(self.folder / task.content.decode())
         except OSError as error:
             return f"{self.folder}: {error.strerror}"
         return ""
@@ -160,8 +161,3 @@ class RunFiles:
                 with contextlib.suppress(OSError):
                     path.unlink()
             raise
-
-    def _rename(self, folder: Path, name: str, to: str) -> None:
-        if name in self._handles:
-            os.close(self._handles.pop(name))
-            (folder / name).rename(folder / to)

@@ -34,7 +34,11 @@ KEPT = 4  # images: a few of noise do not displace the valid one
 
 def preview(where: RobotSelection, hz: float, width: int) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    _check(hz, width)
+    extras.check("preview", "`snakesim preview`")
+    if not 0.01 <= hz <= MAX_HZ:
+        raise ConfigError(f"--hz {hz:g}: give from 0.01 to {MAX_HZ:g} Hz")
+    if not NARROWEST <= width <= WIDEST:
+        raise ConfigError(f"--width {width}: give from {NARROWEST} to {WIDEST} pixels")
     link = only_robot(where, "preview")
     with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
@@ -49,14 +53,6 @@ def preview(where: RobotSelection, hz: float, width: int) -> int:
                 if (why := camera.turn()) is not None:
                     say(why)
             time.sleep(1.0 / hz)
-
-
-def _check(hz: float, width: int) -> None:
-    extras.check("preview", "`snakesim preview`")
-    if not 0.01 <= hz <= MAX_HZ:
-        raise ConfigError(f"--hz {hz:g}: give from 0.01 to {MAX_HZ:g} Hz")
-    if not NARROWEST <= width <= WIDEST:
-        raise ConfigError(f"--width {width}: give from {NARROWEST} to {WIDEST} pixels")
 
 
 def cameras_of(session: Session, robot: Description, width: int) -> list["Camera"]:

@@ -41,7 +41,7 @@ def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
     if not found and not silent:
         noted = last_run.recall()
-        last = f"; the last run on this computer ended so: {noted[1]} ({noted[0]})" if noted is not None else ""
+        last = f"; the last run on this computer ended so: {noted.ended} ({noted.folder})" if noted is not None else ""
         say(f"no robot answers on {', '.join(where.endpoints())}{last}")
         say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
         return 1

@@ -38,17 +38,14 @@ class Labels:
     ) -> str:
         """A label near a point, at the distance and in the direction that covers least."""
         width = text_width(words, SIZE)
-        best: tuple[float, Box] | None = None
+        places: list[tuple[float, Box]] = []
         for gap in gaps:
             for turn in TURNS_DEG:
                 c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
                 x, y = at[0] + c * (gap + width / 2), at[1] + s * (gap + SIZE / 2)
                 box = (x - width / 2, y - SIZE / 2, x + width / 2, y + SIZE / 2)
-                cost = self._cost(box) + 0.15 * gap + _towards(at, (c, s), away_from)
-                if best is None or cost < best[0]:
-                    best = (cost, box)
-        assert best is not None
-        box = best[1]
+                places.append((self._cost(box) + 0.15 * gap + _towards(at, (c, s), away_from), box))
+        _, box = min(places, key=lambda place: place[0])
         self.keep_off(box, 4.0)
         return text((box[0] + box[2]) / 2, box[3] - 2.5, words, class_, anchor="middle")
 

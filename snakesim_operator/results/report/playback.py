@@ -59,7 +59,8 @@ def playback(record: RunRecord) -> Playback | None:
     frames: list[list[Any]] = []
     for i, (row, body_w, state, world) in enumerate(zip(rows, nodes, states, worlds, strict=True)):
         joint = state.propulsion_joint if state is not None else None
-        solved, kinds, felt = *_solved(view, state, world, units), _felt(view, world, units)
+        solved, kinds = _solved(view, state, world, units)
+        felt = _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in _contacts(world)], units)
         words = f"{in_words(state.state)}: {state.reason}" if state is not None else "the controller says nothing"
         if words not in said:
             said.append(words)
@@ -135,11 +136,6 @@ def _solved(view: View, state: ControlState | None, world: World | None, units: 
     feet = [view.at(contact.position_w) for contact in balance.contacts]
     pairs = list(zip([*feet, feet[0]], [*balance.contact_n, balance.resultant_n], strict=True))
     return _arrows(view, pairs, units), balance.kinds(_contacts(world))
-
-
-def _felt(view: View, world: World | None, units: float) -> list[float]:
-    felt = _contacts(world)
-    return _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in felt], units)
 
 
 def _contacts(world: World | None) -> list[WorldContact]:
