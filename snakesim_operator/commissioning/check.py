@@ -1,6 +1,5 @@
 """`snakesim joints check`: the record of a run of the joint check, judged and printed."""
 
-from collections.abc import Iterable, Mapping
 from datetime import date
 from pathlib import Path
 
@@ -10,19 +9,16 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.checked import Checked, mounting_digest
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.process import user_name
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Description, Imu
+from snakesim_hal.wire.messages import Imu
 from snakesim_operator.commissioning.judge import Measured, judged
 from snakesim_operator.commissioning.robot_edit import joints_on_drives, must_be_own, write_checked
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
-
-COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
 
 
 def check(run: Path, path: Path | None, *, straight: bool, by_hand: bool) -> int:
@@ -36,7 +32,7 @@ def check(run: Path, path: Path | None, *, straight: bool, by_hand: bool) -> int
             f"{run}: its controller was {record.config.controller!r}; make a run with `snakesim run joint_check`, or "
             "any other scenario with --controller joint_check"
         )
-    rows = judged(_of(record), straight=straight)
+    rows = judged(_measured(record), straight=straight)
     for row in rows:
         moved = f"moved {row.moved_rad:5.3f} rad" if row.moved_rad is not None else "not moved yet  "
         turned = "link unknown    " if row.turned is None else f"link {row.turned:+5.2f} of it"
@@ -77,38 +73,30 @@ def _write(path: Path, record: RunRecord, by_hand: list[str], *, wrong: int) -> 
     say(f"{path}: checked by {checked.by} on {checked.on}; restart the host with it, and it is armed as any other")
 
 
-def _of(record: RunRecord) -> Measured:
-    decoder = Decoder(Imu)
+def _measured(record: RunRecord) -> Measured:
+    """What joints, IMUs and motion capture say."""
+    config, robot, decoder = record.config, record.description, Decoder(Imu)
     path = record.folder if record.alone else record.folder / RECORDING
-    messages = RecordingReader(path).messages([keys.IMU])
-    imus = (decoder.decode(message.payload, message.encoding) for message in messages)
-    ticks = np.round(record.time_s * record.config.rate_hz).astype(int).tolist()
-    columns: dict[str, Floats] = {name: getattr(record, name) for name in COLUMNS}
-    return measured(record.config, record.description, ticks, columns, imus)
-
-
-def measured(
-    config: RunConfig, robot: Description, ticks: Iterable[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
-) -> Measured:
-    """What joints, IMUs and motion capture say. columns: those of `COLUMNS`, one row a tick."""
+    ticks = np.round(record.time_s * config.rate_hz).astype(int).tolist()
     rows = {tick: row for row, tick in enumerate(ticks)}
     rates, forces = (np.full((len(rows), len(robot.links), 3), np.nan) for _ in range(2))
-    for imu in imus:
+    for message in RecordingReader(path).messages([keys.IMU]):
+        imu = decoder.decode(message.payload, message.encoding)
         row = rows.get(imu.tick)
         if row is not None:
             rates[row, imu.link] = imu.angular_velocity_rad_s
             forces[row, imu.link] = imu.acceleration_m_s2
     late = 0 if config.robot.sensors.pose is None else round(config.robot.sensors.pose.delay_s * config.rate_hz)
-    poses = np.full_like(columns["orientation_wxyz"], np.nan)
-    poses[: len(poses) - late] = columns["orientation_wxyz"][late:]
+    poses = np.full_like(record.orientation_wxyz, np.nan)
+    poses[: len(poses) - late] = record.orientation_wxyz[late:]
     return Measured(
         names=[joint.name for joint in robot.joints],
         axes=[joint.axis for joint in robot.joints],
         drives=[joint.drive for joint in config.robot.joint_table],
-        angle_rad=columns["angle_rad"],
-        velocity_rad_s=columns["velocity_rad_s"],
-        torque_nm=columns["torque_nm"],
-        target_rad=columns["target"],
+        angle_rad=record.angle_rad,
+        velocity_rad_s=record.velocity_rad_s,
+        torque_nm=record.torque_nm,
+        target_rad=record.target,
         link_rate_rad_s=rates,
         link_force_m_s2=forces,
         base_turn_rad=_turns(poses),
