@@ -88,10 +88,9 @@ class LiveSignals:
 def numbers(message: Message, robot: Description) -> dict[str, float]:
     """Of a message, by signal."""
     found: dict[str, float] = {}
+    prefix = type(message).__name__.removesuffix("State").lower()
     for field in units(type(message)):
-        _spread(
-            f"{type(message).__name__.removesuffix('State').lower()}.{field}", getattr(message, field), robot, found
-        )
+        _spread(f"{prefix}.{field}", getattr(message, field), robot, found)
     return found
 
 

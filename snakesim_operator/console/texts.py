@@ -61,18 +61,12 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
 
 
-def badge(text: str, colour: str) -> str:
-    """A word on a colour."""
-    return (
-        f"<span style='background:{colour};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
-        f"white-space:nowrap'>{plain(text)}</span>"
-    )
-
-
 def _state(word: str, colour: str, why: str, above: str) -> str:
+    """A word on a colour, and why."""
     return (
         f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{above}'>"
-        f"{badge(word, colour)}<span>{plain(why)}</span></div>"
+        f"<span style='background:{colour};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
+        f"white-space:nowrap'>{plain(word)}</span><span>{plain(why)}</span></div>"
     )
 
 

@@ -50,6 +50,6 @@ class LiveServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._relay.__exit__()
+        self._relay.close()
         with suppress(RuntimeError):  # it ends with its process in any case
             self._server.stop()

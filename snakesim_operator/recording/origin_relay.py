@@ -5,7 +5,6 @@ import contextlib
 import secrets
 import threading
 from collections.abc import Callable, Collection
-from typing import Self
 
 from snakesim_hal.errors import NotConnectedError
 from snakesim_operator.page_origin import why_head_refused
@@ -83,16 +82,14 @@ class OriginRelay:
         finally:
             to_behind.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+    def close(self) -> None:
+        """Let nobody in any more, and hang up."""
+        asyncio.run_coroutine_threadsafe(self._hang_up(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
 
-    async def _close(self) -> None:
+    async def _hang_up(self) -> None:
         self._server.close()
         for task in list(self._connections):
             task.cancel()

@@ -45,9 +45,7 @@ class Advance:
     @staticmethod
     def along(goal: HeadingGoal | WaypointGoal | None, robot: Description, time_s: Floats, nodes: Floats) -> "Advance":
         """nodes: (m, joints + 2, 3), as of `nodes_w`."""
-        masses = np.array([link.mass_kg for link in robot.links])[:, None]
-        centre = (0.5 * (nodes[:, :-1, :2] + nodes[:, 1:, :2]) * masses).sum(axis=1) / masses.sum()
-        return Advance(goal, time_s, centre, nodes[:, -1, :2])
+        return Advance(goal, time_s, body_centre_w(robot, nodes), nodes[:, -1, :2])
 
     @property
     def goal_m(self) -> float | None:
@@ -158,6 +156,12 @@ class GoalWatch:
                 self._nodes.append(nodes_w(self._robot, *pose))
                 return True
         return False
+
+
+def body_centre_w(robot: Description, nodes: Floats) -> Floats:
+    """Centre of mass on the ground, (..., 2), of nodes (..., joints + 2, 3)."""
+    masses = np.array([link.mass_kg for link in robot.links])[:, None]
+    return (0.5 * (nodes[..., :-1, :2] + nodes[..., 1:, :2]) * masses).sum(axis=-2) / masses.sum()
 
 
 def energy_j_per_m(record: RunRecord, advance: Advance) -> float | None:

@@ -32,8 +32,8 @@ def cleaned(
         bad = _bad(columns[name])
         found[name] = np.where(bad, np.nan, columns[name])
         if name in OF_JOINTS:
-            counts = {joint.name: int(count) for joint, count in zip(robot.joints, bad.sum(axis=0), strict=True)}
-            said += _words(name, {joint: count for joint, count in counts.items() if count}, len(bad))
+            counts = zip(robot.joints, bad.sum(axis=0).tolist(), strict=True)
+            said += _words(name, ", ".join(f"{joint.name} {count}" for joint, count in counts if count), len(bad))
             continue
         rows = np.array(bad.any(axis=1) if bad.ndim > 1 else bad)
         if name in POSE:
@@ -62,8 +62,5 @@ def _bad(values: NDArray[Any]) -> NDArray[np.bool_]:
     return ~(np.abs(values) < LARGEST)
 
 
-def _words(signal: str, count: int | dict[str, int], of: int) -> list[str]:
-    if not count:
-        return []
-    counts = ", ".join(f"{joint} {n}" for joint, n in count.items()) if isinstance(count, dict) else str(count)
-    return [f"{signal}: {counts} of {of} samples are not numbers"]
+def _words(signal: str, count: int | str, of: int) -> list[str]:
+    return [f"{signal}: {count} of {of} samples are not numbers"] if count else []

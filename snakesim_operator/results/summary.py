@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.arithmetic import foreign
 from snakesim_hal.wire.messages import Fault, Mode, Pace, Timing
-from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
+from snakesim_operator.results.advance import Advance, body_centre_w, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.came_true import came_true
 from snakesim_operator.results.effort import Effort
 from snakesim_operator.results.estimates import Estimates
@@ -258,12 +258,7 @@ def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
     first, last = record.nodes_w(row), record.nodes_w(last_row)
     if first is None or last is None:
         return None, None, 0.0
-    masses = np.array([link.mass_kg for link in record.description.links])[:, None]
-
-    def centre(nodes: np.ndarray) -> np.ndarray:
-        return (0.5 * (nodes[:-1] + nodes[1:]) * masses).sum(axis=0) / masses.sum()
-
-    net = float(np.linalg.norm((centre(last) - centre(first))[:2]))
+    net = float(np.linalg.norm(body_centre_w(record.description, last) - body_centre_w(record.description, first)))
     start, end = arc_position_m(record, row), arc_position_m(record, last_row)
     known_s = (last_row - row + 1) * record.config.period_ns * 1e-9
     return (None if start is None or end is None else end - start), net, known_s
