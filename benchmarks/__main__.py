@@ -52,7 +52,7 @@ def main() -> int:
             ticks[step].append(lockstep_tick_us(step))
             unrecorded.append(lockstep_tick_us(step, "--no-record"))
             points, controller_us = motion(stepped)
-            floors.append(BareLoop(stepped).tick_us(points)[0] + echo_us(state, command) + controller_us)
+            floors.append(BareLoop(stepped).tick_us(points) + echo_us(state, command) + controller_us)
         what, bare = f"lockstep tick, three GNC processes; {physics}", "bare physics + raw echo + controller"
         say(compare(what, bare, ticks[step], floors, 1.5).row())
         say(compare(f"the same without a recording (`--no-record`); {physics}", bare, unrecorded, floors, 1.5).row())

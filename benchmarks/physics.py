@@ -63,32 +63,34 @@ class BareLoop:
 
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
-        self._model, self._data = self._backend.sim.model, self._backend.data
-        self._state = np.empty(mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION))
 
-    def tick_us(self, points: Sequence[SetPoints]) -> tuple[float, float]:
-        """Mean time of a control period over these set-points, and of what of it is MuJoCo's.
-
-        That is measured beside it, from the same states, by `mj_step`: without ground and friction, which are ours.
-        """
-        physics, steps, whole = (
-            self._backend.physics,
-            self._backend.sim.steps_per_tick,
-            mujoco.mjtState.mjSTATE_INTEGRATION,
-        )
-        spent = mujoco_alone = 0.0
+    def tick_us(self, points: Sequence[SetPoints]) -> float:
+        """Mean time of a control period over these set-points; handing them over is not counted."""
+        physics, steps = self._backend.physics, self._backend.sim.steps_per_tick
+        spent = 0.0
         for now in points:
             self._backend.enact(now, "armed")
-            mujoco.mj_getState(self._model, self._data, self._state, whole)
-            begin = time.perf_counter()
-            for _ in range(steps):
-                mujoco.mj_step(self._model, self._data)
-            mujoco_alone += time.perf_counter() - begin
-            mujoco.mj_setState(self._model, self._data, self._state, whole)
             begin = time.perf_counter()
             physics.step(steps)
             spent += time.perf_counter() - begin
-        return spent / len(points) * 1e6, mujoco_alone / len(points) * 1e6
+        return spent / len(points) * 1e6
+
+    def mujoco_us(self, points: Sequence[SetPoints]) -> float:
+        """The same for `mj_step`, from the states of that motion: without ground and friction, which are ours."""
+        model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
+        whole = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(model, whole))
+        spent = 0.0
+        for now in points:
+            self._backend.enact(now, "armed")
+            mujoco.mj_getState(model, data, state, whole)
+            begin = time.perf_counter()
+            for _ in range(steps):
+                mujoco.mj_step(model, data)
+            spent += time.perf_counter() - begin
+            mujoco.mj_setState(model, data, state, whole)
+            self._backend.physics.step(steps)
+        return spent / len(points) * 1e6
 
 
 def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
@@ -104,10 +106,11 @@ def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
 
 def sensing(config: RunConfig) -> tuple[list[float], list[float], list[float]]:
     """Per block, the time of a tick (in µs) with all sensors published, of its physics alone, and of MuJoCo alone."""
-    full, loop = open_simulator(config), BareLoop(config)
+    full, physics, beneath = open_simulator(config), BareLoop(config), BareLoop(config)
     points, _ = motion(config)
     published: list[float] = []
-    bare: list[tuple[float, float]] = []
+    alone: list[float] = []
+    mujoco_alone: list[float] = []
     endpoint = free_endpoint()  # what is published really goes over the wire
     with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
         first = full.sample(0, 0)
@@ -123,10 +126,11 @@ def sensing(config: RunConfig) -> tuple[list[float], list[float], list[float]]:
                 full.enact(now, "armed")
                 full.advance()
             published.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
-            bare.append(loop.tick_us(block))
+            alone.append(physics.tick_us(block))
+            mujoco_alone.append(beneath.mujoco_us(block))
         assert all(reader.drain() for reader in readers), "nobody heard what was published"
     full.close()
-    return published, [physics for physics, _ in bare], [alone for _, alone in bare]
+    return published, alone, mujoco_alone
 
 
 def wire_bytes(config: RunConfig) -> tuple[bytes, bytes]:

@@ -99,19 +99,21 @@ class FlatGround:
         slipped_xy += self._moved_xy
         height -= self._radius_m
         # N = k depth - d (dz/dt), and never a pull
-        self._sunk *= self._lift_damping
+        self._sunk *= self._lift_damping  # from here on in N
         self._sunk += self._lift * height
         self.push_n = push = np.maximum(self._sunk, self._nothing)
         most = max(self._friction, self.least) * push
-        bound = np.maximum(most, self._hardly)
+        bound = np.maximum(most, self._hardly)  # of what is divided by: mu N, and never 0
         self._slip_xy += slipped_xy
         self._slip_xy *= (most / np.maximum(self._stiffness * np.abs(self._slip), bound)).repeat(2)
+        # Spring and damper pull back, together no harder than mu N
         np.multiply(self._pull_xy, self._slip_xy, self._rub_xy)
         slipped_xy *= self._drag_xy
         self._rub_xy += slipped_xy
         forces, arms, moments = self._forces, self._arms, self._moments
         np.multiply(self._rub_by_axis, most / np.maximum(np.abs(self._rub), bound), forces[:2])
         forces[2], forces[3:] = push, forces[:2]
+        # Moments: arm x force, about where MuJoCo's axes of motion are told
         np.subtract(self._now_by_axis, self._about_xy, arms[:2])
         np.subtract(height, self._about_z, arms[2])
         arms[3:] = arms[:2]

@@ -1,7 +1,6 @@
 """Arguments of `snakesim train`. Importable without the extra that it needs."""
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +77,14 @@ def _train(arguments: argparse.Namespace) -> int:
         environment,
         arguments.form,
         arguments.begin,
-        Effort(**{one.name: getattr(arguments, one.name) for one in dataclasses.fields(Effort)}),
+        Effort(
+            arguments.generations,
+            arguments.population,
+            arguments.fields,
+            arguments.check_fields,
+            arguments.seed,
+            arguments.spread,
+        ),
         arguments.out,
         workers=arguments.workers,
         cluster=arguments.cluster,

@@ -81,7 +81,7 @@ class RunMonitor:
                 while self._supervisor.goes_on() and not self._ending.interrupted:
                     self._take_in()
                     self._see_to_faults()
-                    if self._ending.reason is not None and (self._silent or not (self._armed or self._may_arm)):
+                    if self._ending.reason is not None and (self._over_before_it_began() or self._silent):
                         break
                     self._arm_once()
                     self._finish_at_goal()
@@ -161,6 +161,9 @@ class RunMonitor:
         stat = Path(f"/proc/{self._supervisor.pids()[HOST]}/stat").read_text()
         how = SILENCES.get(stat.rpartition(")")[2].split()[0], "is there")
         return f"the host has said nothing for {SILENT_S:g} s, since tick {status.tick}; its process {how}"
+
+    def _over_before_it_began(self) -> bool:
+        return not self._armed and not self._may_arm
 
     def _tell(self, status: Status) -> None:
         """Print once how to recover from a fault."""
