@@ -24,7 +24,10 @@ from tests.harness.wait import wait_until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
-RUN = ("triplet", "--controller", "lateral_undulation", "--duration", "600", "--stay", "--console")
+RUN = (
+    *("triplet", "--controller", "lateral_undulation", "--pace", "realtime", "--set", "rate_hz=50"),
+    *("--duration", "600", "--stay", "--console"),
+)
 STOP_LIMIT_S = 10.0  # from the key to motors that are off: far above what it takes when no other tests run beside
 SILENT = "THE STOP DOES NOT ANSWER"
 COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
