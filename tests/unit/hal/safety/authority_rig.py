@@ -49,6 +49,11 @@ class Rig:
         self.authority.expire(self.now_ns, self.tick)
         return self.authority.decide()
 
+    def tick_with(self, *command: Any, **other: Any) -> Decision:
+        """A command, and what is decided at the end of its tick."""
+        self.send(*command, **other)
+        return self.pass_tick()
+
 
 def commanded(target: Any = 0.1, mode: Any = Mode.POSITION, **robot: Any) -> Rig:
     """Not armed yet: its joints are at 0.1 rad, and a holder of the lease commands it."""

@@ -1,8 +1,10 @@
 """A robot of three joints, and its limits as the gate has them."""
 
+from typing import Any
+
 import numpy as np
 
-from snakesim_hal.safety.gate import Applied, JointLimits, Measured, bumpless_target, limit
+from snakesim_hal.safety.gate import Applied, JointLimits, Measured, bumpless_target, limit, why_limited
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.messages import JointCommand, Mode
 from tests.unit.hal.rig import description
@@ -23,10 +25,26 @@ def bumpless(modes: list[Mode], measured: Measured) -> list[float]:
     return [bumpless_target(joint, mode, *state) for joint, mode, state in zip(ROBOT.joints, modes, now, strict=True)]
 
 
+def every(angle: float = 0.0, velocity: float = 0.0, torque: float = 0.0) -> Measured:
+    """Every joint is measured like this."""
+    return Measured(np.full(JOINTS, angle), np.full(JOINTS, velocity), np.full(JOINTS, torque))
+
+
+def before(mode: Mode, target: float = 0.0) -> Applied:
+    """What was applied last: the same to every joint, and the whole torque."""
+    return Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), LIMITS.torque_nm)
+
+
+def limited(asked: JointCommand, measured: Measured, last: Applied, share: Any = COOL) -> Applied:
+    return limit(asked, measured=measured, last=last, limits=LIMITS, share=share)
+
+
+def words(asked: JointCommand, applied: Applied, measured: Measured, share: Any = COOL) -> dict[int, str]:
+    return why_limited(asked, applied, measured=measured, limits=LIMITS, share=share)
+
+
 def applied_for(
-    asked: JointCommand, angle: float = 0.0, velocity: float = 0.0, torque: float = 0.0, before: Mode = Mode.PASSIVE
+    asked: JointCommand, angle: float = 0.0, velocity: float = 0.0, torque: float = 0.0, mode: Mode = Mode.PASSIVE
 ) -> Applied:
-    """What is applied when every joint is in the same situation; the target before was 1."""
-    measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, velocity), np.full(JOINTS, torque))
-    last = Applied(np.full(JOINTS, int(before)), np.ones(JOINTS), LIMITS.torque_nm)
-    return limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    """What is applied when every joint is in the same situation; the mode before was this, and the target 1."""
+    return limited(asked, every(angle, velocity, torque), before(mode, 1.0))

@@ -83,8 +83,7 @@ def test_a_robot_that_does_not_know_its_joints_is_not_armed_and_does_not_stay_ar
     rig.observe(0.1)
     assert rig.arm().ok
     rig.observe(**bad)
-    rig.send(0.2)
-    decision = rig.pass_tick()
+    decision = rig.tick_with(0.2)
     assert rig.authority.state == "fault" and decision.sequence is None
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
     assert joint in rig.authority.faults[0].cause
@@ -121,8 +120,7 @@ def test_what_is_told_of_a_long_robot_fits_into_a_message() -> None:
 def test_a_state_at_the_end_of_its_time_is_still_good() -> None:
     rig = armed()
     rig.observe(0.1, age_ns=[FRESH_NS] * JOINTS)
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     assert rig.authority.state == "armed"
 
 
@@ -136,8 +134,7 @@ def test_arming_is_refused_while_a_target_is_far_and_names_the_joint() -> None:
 
 def test_a_first_command_may_use_the_whole_torque() -> None:
     rig = armed()
-    rig.send(0.1)
-    assert rig.pass_tick().set_points.torque_limit_nm == [4.0] * JOINTS
+    assert rig.tick_with(0.1).set_points.torque_limit_nm == [4.0] * JOINTS
 
 
 def test_the_very_first_decision_is_passive() -> None:
@@ -154,8 +151,7 @@ def test_right_after_arming_the_pose_is_held_until_a_new_command_comes() -> None
     decision = rig.pass_tick()
     assert decision.sequence is None  # the command from before arming is not enacted
     assert modes(decision) == {Mode.POSITION} and decision.set_points.target == [0.1] * JOINTS
-    rig.send(0.11)
-    assert rig.pass_tick().set_points.target == pytest.approx([0.11] * JOINTS)
+    assert rig.tick_with(0.11).set_points.target == pytest.approx([0.11] * JOINTS)
 
 
 def test_arming_needs_commands_that_still_come() -> None:
@@ -184,13 +180,11 @@ def test_a_passive_stream_may_be_armed_whatever_its_targets() -> None:
 
 def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_lease() -> None:
     rig = armed()
-    rig.send(0.1, arming=1)
-    rig.pass_tick()
+    rig.tick_with(0.1, arming=1)
     for other in (0, 2, 0, 2):
         assert rig.send(0.2, arming=other) == "before_arming"
         assert rig.pass_tick().set_points.target == pytest.approx([0.1] * JOINTS)
-    rig.send(0.2, arming=0)
-    rig.pass_tick()
+    rig.tick_with(0.2, arming=0)
     assert rig.authority.state == "fault" and rig.authority.faults[0].what == "lease_expired"
     assert rig.authority.rejected == {"before_arming": 5}
     assert (rig.authority.accepted, rig.authority.standby) == (1, 1)
@@ -198,8 +192,7 @@ def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_l
 
 def test_after_a_disarm_arming_needs_a_new_command() -> None:
     rig = armed()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.authority.decide()
     assert rig.arm().reason == "no commands from control yet"
@@ -287,8 +280,7 @@ def test_what_counted_in_an_earlier_arming_does_not_count_in_the_next() -> None:
 def test_no_arming_before_the_motors_were_told_of_a_stop(stop: str) -> None:
     """Cleared and armed again within one period, the backend would never have heard of it."""
     rig = armed()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     if stop == "estop":
         rig.authority.on_estop(ESTOP, rig.tick)
     elif stop == "fault":

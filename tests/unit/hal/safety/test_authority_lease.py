@@ -61,15 +61,13 @@ def test_commands_keep_the_lease_and_silence_ends_it_with_a_fault() -> None:
 )
 def test_refused_commands_neither_keep_the_lease_nor_reach_a_motor(wrong: dict[str, Any]) -> None:
     rig = armed()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     good = rig.sequence
     for _ in range(4):
         assert rig.send(**{"target": 0.2, **wrong}) is not None
         decision = rig.pass_tick()
         assert decision.sequence == good and decision.set_points.target == pytest.approx([0.1] * JOINTS)
-    rig.send(**{"target": 0.2, **wrong})
-    rig.pass_tick()
+    rig.tick_with(**{"target": 0.2, **wrong})
     assert rig.authority.state == "fault"
     assert sum(rig.authority.rejected.values()) == 5
 
@@ -99,8 +97,7 @@ def test_disarmed_the_lease_can_be_kept_by_asking_and_simply_runs_out() -> None:
 
 def test_preemption_stops_the_robot_and_voids_what_the_old_holder_sends() -> None:
     rig = armed()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     assert not rig.acquire("teleop").ok and rig.authority.state == "armed"
     answer = rig.acquire("teleop", priority=200)
     assert answer.ok and answer.epoch == 2 and answer.lifecycle == "disarmed"

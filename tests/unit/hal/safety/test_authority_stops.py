@@ -16,17 +16,14 @@ from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JO
 
 def test_an_estop_is_latched_and_only_clear_and_arm_lead_back() -> None:
     rig = armed()
-    rig.send(0.2)
-    rig.pass_tick()
+    rig.tick_with(0.2)
     assert rig.authority.on_estop(ESTOP, rig.tick).ok
     for _ in range(3):
-        rig.send(0.2)
-        decision = rig.pass_tick()
+        decision = rig.tick_with(0.2)
         assert modes(decision) == {Mode.PASSIVE} and decision.sequence is None
     assert not rig.arm().ok and not rig.authority.on_lifecycle(DISARM, rig.now_ns).ok
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
-    rig.send(0.2)
-    assert modes(rig.pass_tick()) == {Mode.PASSIVE}
+    assert modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
     assert rig.arm().ok
     assert rig.pass_tick().set_points.target == [0.1] * JOINTS  # resumes from the measured pose
 
@@ -90,8 +87,7 @@ def test_all_joints_that_are_hot_are_named() -> None:
     rig = armed()
     receive(rig, [90.0] * JOINTS)
     rig.pass_tick()
-    rig.send(0.1, torque_limit_nm=[4.0] * JOINTS)
-    assert rig.pass_tick().limited == dict.fromkeys(range(JOINTS), "thermal")
+    assert rig.tick_with(0.1, torque_limit_nm=[4.0] * JOINTS).limited == dict.fromkeys(range(JOINTS), "thermal")
 
 
 def test_a_held_pose_stays_inside_the_angle_limits() -> None:
@@ -187,8 +183,7 @@ def test_what_the_gate_changes_is_counted_by_limit() -> None:
     rig = armed()
     rig.observe(0.1)
     rig.pass_tick()
-    rig.send([0.1, 1.0, 2.0])
-    decision = rig.pass_tick()
+    decision = rig.tick_with([0.1, 1.0, 2.0])
     assert decision.limited == {1: "angle_rate", 2: "angle"}
     assert rig.authority.limited == {"angle_rate": 1, "angle": 1}
 
@@ -212,12 +207,10 @@ def test_a_lease_epoch_is_never_accepted_twice() -> None:
 def test_a_glitch_of_an_encoder_moves_no_motor_and_stops_the_robot() -> None:
     rig = armed(safety__action="hold")
     rig.observe(0.1)
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     rig.stamp_ns += PERIOD_NS - 10**9
     rig.observe([0.1, 0.9, 0.1])
-    rig.send([0.1, 0.9, 0.1])
-    decision = rig.pass_tick()
+    decision = rig.tick_with([0.1, 0.9, 0.1])
     (fault,) = rig.authority.faults
     assert (fault.what, fault.joint, fault.tick) == ("state_invalid", "joint_2", rig.tick)
     assert "joint_2 by +0.80 rad" in fault.cause
@@ -248,8 +241,7 @@ def test_a_frozen_joint_stops_an_armed_robot() -> None:
     for k in range(12):
         rig.stamp_ns += PERIOD_NS - 10**9
         rig.observe(0.1, 0.0, [0.1, 0.5, 0.1 * k])
-        rig.send([0.1, 0.1 + 0.02 * k, 0.1 + 0.02 * k])
-        rig.pass_tick()
+        rig.tick_with([0.1, 0.1 + 0.02 * k, 0.1 + 0.02 * k])
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("joint_frozen", "joint_2")]
 
 
@@ -259,8 +251,7 @@ def test_a_frozen_joint_stops_an_armed_robot() -> None:
 def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> None:
     rig = armed()
     receive(rig, [20.0, 92.5, 20.0])
-    rig.send(0.1)
-    decision = rig.pass_tick()
+    decision = rig.tick_with(0.1)
     assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
     assert decision.limited == {1: "thermal"} and rig.authority.limited == {"thermal": 1}
     assert rig.authority.derated == {"joint_2": pytest.approx(0.6)}
@@ -270,8 +261,7 @@ def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> No
     assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also of the safe action
     rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     rig.acquire()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     answer = rig.arm()
     assert rig.authority.state == "disarmed" and answer.refusal == "not_ready" and "joint_2 is at 110" in answer.reason
     receive(rig, [20.0, 70.0, 20.0])
@@ -292,8 +282,7 @@ def test_a_weak_supply_stops_an_armed_robot_within_50_ms() -> None:
     receive(rig, [20.0] * JOINTS, volts=12.0)
     for _ in range(5):
         assert rig.authority.state == "armed"
-        rig.send(0.1)
-        rig.pass_tick()
+        rig.tick_with(0.1)
     assert {fault.what for fault in rig.authority.faults} == {"undervoltage"}
 
 
@@ -302,12 +291,10 @@ def test_a_weak_supply_stands_against_arming_once_with_the_field_to_change() -> 
     rig.acquire()
     for _ in range(7):
         receive(rig, [20.0] * JOINTS, volts=12.0)
-        rig.send(0.1)
-        rig.pass_tick()
+        rig.tick_with(0.1)
     rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     rig.acquire()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     answer = rig.arm()
     assert answer.refusal == "not_ready" and answer.reason.count("12.0 V") == 1 and FIELD in answer.reason
 
@@ -318,8 +305,7 @@ def test_time_may_stand_still_until_a_robot_is_armed_so_no_report_is_awaited() -
     rig.authority = Authority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power]))
     rig.observe(0.1)
     rig.acquire()
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     rig.send(0.1)
     assert rig.arm().ok
 

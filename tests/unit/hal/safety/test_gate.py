@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.gate import Applied, JointLimits, Measured, Refusal, as_set_points, limit, refuse, why_limited
+from snakesim_hal.safety.gate import JointLimits, Refusal, as_set_points, refuse
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
 from tests.unit.hal.rig import LEASE_NS, command, description
-from tests.unit.hal.safety.gate_rig import COOL, JOINTS, LEASE, LIMITS, ROBOT, applied_for
+from tests.unit.hal.safety.gate_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
 
 
 def judge(given: JointCommand, **changes: Any) -> Refusal | None:
@@ -102,21 +102,18 @@ def test_what_is_checked_first_is_told_first() -> None:
 
 def test_heat_bounds_the_torque_limit_and_is_named() -> None:
     share = np.array([1.0, 0.5, 0.25])
-    last = Applied(np.full(JOINTS, int(Mode.TORQUE)), np.full(JOINTS, 2.0), LIMITS.torque_nm)
-    still = Measured(*np.zeros((3, JOINTS)))
 
-    def words(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
-        applied = limit(asked, measured=still, last=last, limits=LIMITS, share=share)
-        named = why_limited(asked, applied, measured=still, limits=LIMITS, share=share)
-        return applied.torque_limit_nm.tolist(), named
+    def judged(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
+        applied = limited(asked, every(), before(Mode.TORQUE, 2.0), share)
+        return applied.torque_limit_nm.tolist(), words(asked, applied, every(), share)
 
-    assert words(command(ROBOT, 2.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"})
-    assert words(command(ROBOT, 9.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {0: "torque", 1: "thermal", 2: "thermal"})
-    assert words(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[2.0] * 3)) == ([2.0, 2.0, 1.0], {2: "thermal"})
-    assert words(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[1.0] * 3))[1] == dict.fromkeys(range(3), "torque")
-    far = words(command(ROBOT, 9.0, Mode.POSITION))[1]
+    assert judged(command(ROBOT, 2.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"})
+    assert judged(command(ROBOT, 9.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {0: "torque", 1: "thermal", 2: "thermal"})
+    assert judged(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[2.0] * 3)) == ([2.0, 2.0, 1.0], {2: "thermal"})
+    assert judged(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[1.0] * 3))[1] == dict.fromkeys(range(3), "torque")
+    far = judged(command(ROBOT, 9.0, Mode.POSITION))[1]
     assert far == dict.fromkeys(range(3), "angle")  # a target that was changed is named by what changed it
-    assert words(command(ROBOT, 9.0, Mode.PASSIVE))[1] == {}
+    assert judged(command(ROBOT, 9.0, Mode.PASSIVE))[1] == {}
 
 
 # --- words -----------------------------------------------------------------------------------------------------
@@ -143,13 +140,9 @@ def test_heat_bounds_the_torque_limit_and_is_named() -> None:
     ],
 )
 def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word: str | None) -> None:
-    zero = np.zeros(JOINTS)
     asked = command(ROBOT, [0.0, wanted, 0.0], mode)
-    last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
-    measured = Measured(zero, zero, zero)
-    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
-    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
-    assert words == ({} if word is None else {1: word})
+    applied = limited(asked, every(), before(mode))
+    assert words(asked, applied, every()) == ({} if word is None else {1: word})
 
 
 def test_set_points_for_the_backend_are_plain_python() -> None:

@@ -31,7 +31,11 @@ from tests.unit.hal.safety.gate_rig import (
     TINY,
     TORQUE_STEP,
     applied_for,
+    before,
     bumpless,
+    every,
+    limited,
+    words,
 )
 
 
@@ -77,7 +81,7 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
 @settings(max_examples=300)
 def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
     asked, measured, last = case
-    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    applied = limited(asked, measured, last)
     assert np.isfinite(applied.target).all() and np.isfinite(applied.torque_limit_nm).all()
     assert (applied.torque_limit_nm >= 0).all() and (applied.torque_limit_nm <= LIMITS.torque_nm).all()
     if asked.torque_limit_nm is not None:
@@ -115,44 +119,33 @@ def test_what_needs_no_change_is_not_changed_and_what_was_changed_is_named(
     case: tuple[JointCommand, Measured, Applied],
 ) -> None:
     asked, measured, last = case
-    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
-    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
+    applied = limited(asked, measured, last)
     changed = {i for i in range(JOINTS) if asked.mode[i] != Mode.PASSIVE and applied.target[i] != asked.target[i]}
-    assert set(words) == changed
-    again = limit(
-        msgspec.structs.replace(asked, target=applied.target.tolist()),
-        measured=measured,
-        last=applied,
-        limits=LIMITS,
-        share=COOL,
-    )
+    assert set(words(asked, applied, measured)) == changed
+    again = limited(msgspec.structs.replace(asked, target=applied.target.tolist()), measured, applied)
     assert (again.target == applied.target).all()  # what came out once passes unchanged
 
 
 @given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
 def test_a_stream_of_wild_targets_never_moves_faster_than_the_limit(stream: list[list[float]]) -> None:
     """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
-    zero = np.zeros(JOINTS)
-    last = Applied(np.full(JOINTS, int(Mode.POSITION)), zero, LIMITS.torque_nm)
+    zero, last = np.zeros(JOINTS), before(Mode.POSITION)
     for target in stream:
-        measured = Measured(last.target, zero, zero)
-        applied = limit(command(ROBOT, target), measured=measured, last=last, limits=LIMITS, share=COOL)
+        applied = limited(command(ROBOT, target), Measured(last.target, zero, zero), last)
         assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
         last = applied
 
 
 def test_a_target_that_waits_is_reached() -> None:
-    zero = np.zeros(JOINTS)
     for mode, wanted, step in (
         (Mode.POSITION, 0.2, ANGLE_STEP),
         (Mode.VELOCITY, 4.0, SPEED_STEP),
         (Mode.TORQUE, 3.0, TORQUE_STEP),
     ):
-        last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
-        measured = Measured(zero, zero, zero)
+        last = before(mode)
         steps = int(np.ceil(wanted / step - 1e-9))
         for k in range(1, steps + 1):
-            last = limit(command(ROBOT, wanted, mode), measured=measured, last=last, limits=LIMITS, share=COOL)
+            last = limited(command(ROBOT, wanted, mode), every(), last)
             assert last.target[0] == pytest.approx(min(k * step, wanted))
 
 
@@ -207,12 +200,12 @@ def motor_torque(target: float, angle: float, velocity: float) -> float:
     velocity=st.floats(-2, 2),
     torque=st.floats(-4, 4),
     wanted=st.floats(-10, 10),
-    before=st.sampled_from([Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE]),
+    mode=st.sampled_from([Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE]),
 )
 def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
-    angle: float, velocity: float, torque: float, wanted: float, before: Mode
+    angle: float, velocity: float, torque: float, wanted: float, mode: Mode
 ) -> None:
-    applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, before)
+    applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, mode)
     implied = motor_torque(applied.target[0], angle, velocity)
     assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
 
@@ -220,12 +213,12 @@ def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
 @given(
     torque=st.floats(-4, 4),
     wanted=st.floats(-10, 10),
-    before=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
+    mode=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
 )
 def test_a_switch_to_torque_mode_goes_on_with_the_torque_that_is_there(
-    torque: float, wanted: float, before: Mode
+    torque: float, wanted: float, mode: Mode
 ) -> None:
-    applied = applied_for(command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, before)
+    applied = applied_for(command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, mode)
     assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
 
 
@@ -240,9 +233,8 @@ def test_a_switch_to_velocity_mode_goes_on_with_the_torque_that_is_there(velocit
 
 
 def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
-    before = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
-    measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = limit(command(ROBOT, 0.3, Mode.POSITION), measured=measured, last=before, limits=LIMITS, share=COOL)
+    none = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
+    applied = limited(command(ROBOT, 0.3, Mode.POSITION), every(), none)
     assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
 
 
@@ -265,8 +257,7 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     assert bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.of(msgspec.structs.replace(ROBOT, joints=joints))
-    measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 4.0))
-    last = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), LIMITS.torque_nm)
+    measured, last = every(torque=4.0), before(Mode.PASSIVE)
     applied = limit(command(ROBOT, 0.0), measured=measured, last=last, limits=soft, share=COOL)
     assert np.abs(applied.target).max() <= 0.3
 
@@ -288,11 +279,10 @@ def test_a_joint_can_stop_before_its_end() -> None:
 def test_a_joint_that_is_driven_at_its_end_by_velocity_stops_before_it(side: int, delay: int) -> None:
     """A joint that turns as it is told, one or two periods later."""
     angle, reported = 0.0, [0.0] * delay
-    last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
+    last = before(Mode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
-        measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, reported[0]), np.zeros(JOINTS))
-        last = limit(command(ROBOT, side * 5.0, Mode.VELOCITY), measured=measured, last=last, limits=LIMITS, share=COOL)
+        last = limited(command(ROBOT, side * 5.0, Mode.VELOCITY), every(angle, reported[0]), last)
         reported = [*reported[1:], float(last.target[0])]
         angle += reported[0] * 0.01
         speeds.append(abs(reported[0]))
@@ -306,26 +296,19 @@ def test_a_joint_that_is_driven_at_its_end_by_velocity_stops_before_it(side: int
 @pytest.mark.parametrize("beyond", [0.0, 0.2])
 def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float) -> None:
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
-        for before in (mode, Mode.POSITION):
-            last = Applied(np.full(JOINTS, int(before)), np.full(JOINTS, side * 3.0), LIMITS.torque_nm)
-            measured = Measured(np.full(JOINTS, side * (1.5 + beyond)), np.full(JOINTS, velocity), np.zeros(JOINTS))
+        for last in (before(mode, side * 3.0), before(Mode.POSITION, side * 3.0)):
             for wanted in (-9.0, 9.0):
-                asked = command(ROBOT, wanted, mode)
-                applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+                applied = limited(command(ROBOT, wanted, mode), every(side * (1.5 + beyond), velocity), last)
                 assert (side * applied.target <= 0.0).all()
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_joint_that_comes_too_fast_is_braked_in_torque_mode(side: int) -> None:
-    last = Applied(np.full(JOINTS, int(Mode.TORQUE)), np.full(JOINTS, side * 4.0), LIMITS.torque_nm)
-    measured = Measured(np.full(JOINTS, side * 1.4), np.full(JOINTS, side * 5.0), np.zeros(JOINTS))
-    asked = command(ROBOT, side * 4.0, Mode.TORQUE)
-    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    measured, asked = every(side * 1.4, side * 5.0), command(ROBOT, side * 4.0, Mode.TORQUE)
+    applied = limited(asked, measured, before(Mode.TORQUE, side * 4.0))
     allowed = stoppable_speed(0.1, 100.0, 0.01)
     assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))  # gain 1 N·m·s/rad
-    assert why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL) == dict.fromkeys(
-        range(JOINTS), "angle"
-    )
+    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
 
 
 def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
@@ -342,14 +325,9 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
 
 def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
     asked = command(ROBOT, 5.0, Mode.VELOCITY)
-    measured = Measured(np.full(JOINTS, 1.45), np.zeros(JOINTS), np.zeros(JOINTS))
-    last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.full(JOINTS, 5.0), np.full(JOINTS, 4.0))
-    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
-    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
-    assert words == dict.fromkeys(range(JOINTS), "angle")
-    elsewhere = Measured(np.zeros(JOINTS), np.full(JOINTS, 1.45), np.zeros(JOINTS))
-    words = why_limited(asked, applied, measured=elsewhere, limits=LIMITS, share=COOL)
-    assert words == dict.fromkeys(range(JOINTS), "acceleration")
+    applied = limited(asked, every(1.45), before(Mode.VELOCITY, 5.0))
+    assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
+    assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
 
 
 BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
@@ -370,11 +348,9 @@ def test_the_tightest_limit_is_the_one_that_is_named(
     side: int, angle: float, wanted: float, speed_limit: float, word: str
 ) -> None:
     robot = description(limits__speed_rad_s=speed_limit)
-    measured = Measured(np.full(JOINTS, side * angle), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
     asked, limits = command(robot, side * wanted, Mode.VELOCITY), JointLimits.of(robot)
-    words = why_limited(asked, applied, measured=measured, limits=limits, share=COOL)
-    assert words == dict.fromkeys(range(JOINTS), word)
+    named = why_limited(asked, before(Mode.VELOCITY), measured=every(side * angle), limits=limits, share=COOL)
+    assert named == dict.fromkeys(range(JOINTS), word)
 
 
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])

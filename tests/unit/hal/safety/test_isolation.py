@@ -15,8 +15,7 @@ def lame(**robot: Any) -> Rig:
     """An armed robot that has lost joint_2."""
     rig = armed(safety__may_lose_joints=1, **robot)
     rig.observe(0.1, valid=SAYS_NO)
-    rig.send(0.1)
-    rig.pass_tick()
+    rig.tick_with(0.1)
     assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2"]
     return rig
 
@@ -53,8 +52,7 @@ def test_a_joint_that_fails_is_passive_and_the_others_go_on() -> None:
 
 def test_nothing_is_limited_where_nothing_is_asked() -> None:
     rig = lame()
-    rig.send([0.1, 0.0, 0.1], [Mode.POSITION, Mode.PASSIVE, Mode.POSITION])
-    assert rig.pass_tick().limited == {}
+    assert rig.tick_with([0.1, 0.0, 0.1], [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]).limited == {}
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -125,8 +123,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
     rig.observe(0.1, valid=SAYS_NO)
     rig.send([0.1, 1.4, 0.1])  # where nobody knows the joint to be
     assert rig.arm().ok
-    rig.send(0.1)
-    assert rig.pass_tick().set_points.isolated == {1}
+    assert rig.tick_with(0.1).set_points.isolated == {1}
 
 
 def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
@@ -143,8 +140,7 @@ def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
     rig.observe(0.1)
     rig.send(0.1)
     assert rig.arm().ok
-    rig.send(0.1)
-    assert rig.pass_tick().set_points.mode == [Mode.POSITION] * JOINTS
+    assert rig.tick_with(0.1).set_points.mode == [Mode.POSITION] * JOINTS
 
 
 @pytest.mark.parametrize("action", ["passive", "damp", "hold"])
@@ -167,16 +163,14 @@ def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
 def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
     rig = armed(safety__may_lose_joints=1)
     receive(rig, [20.0, 110.0, 20.0])
-    rig.send(0.1)
-    assert rig.pass_tick().set_points.isolated == {1} and rig.authority.state == "armed"
+    assert rig.tick_with(0.1).set_points.isolated == {1} and rig.authority.state == "armed"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok  # it stays hot, and is not asked
     receive(rig, [20.0, 110.0, 20.0], volts=12.0)
     for _ in range(7):
-        rig.send(0.1)
-        rig.pass_tick()
+        rig.tick_with(0.1)
     assert rig.authority.state == "fault" and rig.authority.faults[-1].what == "undervoltage"
 
 
