@@ -28,7 +28,7 @@ from snakesim_hal.host.outbox import Outbox, Outgoing
 from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
-from snakesim_hal.host.status_messages import applied_message, status_message
+from snakesim_hal.host.status_messages import applied_message, waiting
 from snakesim_hal.host.timing import BackendTime, Deadlines, PublishTimes
 from snakesim_hal.injection import HAL
 from snakesim_hal.model.scenario import RunConfig, written
@@ -421,7 +421,7 @@ class Host:
     def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
         """A command, and its time of arrival."""
         if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arming(command):
-            self._delivered(self.authority.lease.holder, command.tick)
+            self.take_done(self.authority.lease.holder, command.tick)
         safety_ns, published_ns = self._published.of(command.tick)
         now_ns = self._safety_now(monotonic_ns)
         refusal = self.authority.offer(command, now_ns=now_ns, tick=self._tick, age_ns=now_ns - safety_ns)
@@ -430,11 +430,8 @@ class Host:
             if self.authority.state == "armed":
                 self.statistics.state_to_command.add((monotonic_ns - published_ns) / 1000)
 
-    def take_done(self, service: str, tick: int) -> None:
+    def take_done(self, service: str | None, tick: int) -> None:
         """A service has completed a tick."""
-        self._delivered(service, tick)
-
-    def _delivered(self, service: str | None, tick: int) -> None:
         if tick <= self._tick:
             self.participants.delivered(service, tick)
 
@@ -550,21 +547,47 @@ class Host:
 
     def status(self) -> Status:
         """The present status of the robot."""
-        return status_message(
-            self.authority,
-            self.participants,
+        authority, robot = self.authority, self.description
+        against = authority.against_arming(self._time.safety_ns(self._tick))
+        missing, differing = self._missing(), self._differing()
+        slow_backend = self._backend_time.too_slow() if self._pace == "realtime" else []
+        why = authority.why
+        if authority.state == "disarmed" and (against or missing or differing):
+            lacks = self._processes.waits()
+            waits = [waiting(name, lacks.get(name, ())) for name in missing]
+            why = "; ".join([why, *slow_backend, *differing, *waits, *against])[:500]
+        return Status(
             tick=self._tick,
+            stamp_ns=self._tick * robot.period_ns,
+            robot=robot.robot,
+            backend=robot.backend,
             pace=self._pace,
-            time=self._time,
-            missing=self._missing(),
-            waits=self._processes.waits(),
-            differing=self._differing(),
+            rate_hz=1e9 / robot.period_ns,
+            lifecycle=authority.state,
+            why=why,
+            lease_holder=authority.lease.holder,
+            lease_epoch=authority.lease.epoch,
+            commands_accepted=authority.accepted,
+            commands_standby=authority.standby,
+            commands_rejected=dict(authority.rejected),
+            commands_limited=dict(authority.limited),
+            faults=authority.faults,
+            faults_left_out=authority.since_clear.left_out,
+            alive=self.participants.present(),
+            waiting_for=missing,
             overruns=self.statistics.overruns,
             tick_times=self.statistics.times.timings(),
-            realtime_warnings=self._realtime_warnings,
-            slow_backend=self._backend_time.too_slow() if self._pace == "realtime" else [],
+            realtime_warnings=[*self._realtime_warnings, *slow_backend, *self._time.slow()],
             injected=list(self.faults.on),
-            held_up=self._held_up(),
+            ready_to_arm=not against and not missing and not differing,
+            derated=authority.derated,
+            isolated=authority.isolated,
+            host=robot.host,
+            paused_by=self._time.paused_by if self._time.stands else None,
+            speed=self._time.speed,
+            real_time_factor=self._time.factor,
+            held_up=self._held_up()[:500],
+            unchecked=authority.unchecked[:500],
         )
 
     def _held_up(self) -> str:
@@ -585,7 +608,7 @@ class Host:
         self._status_shown = mark
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
         status = self.status()
-        self._outbox.put_status(status)
+        self._outbox.put((keys.STATUS, status, None))
         self._starter.say(HostMessage(status=status))
 
     # --- time and endings ----------------------------------------------------------------------------------

@@ -97,10 +97,6 @@ class Outbox:
         for key, message, encoded in messages:
             self._publisher(key, type(message)).put(message, encoded)
 
-    def put_status(self, status: Status) -> None:
-        """Publish the status."""
-        self.put((keys.STATUS, status, None))
-
     def answer(self, question: Question, answer: Answer) -> None:
         """Answer a query. The requester may be slow."""
         self._answers.do(lambda: question.reply(answer))
