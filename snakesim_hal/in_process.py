@@ -86,7 +86,6 @@ class InProcessRun:
                 f"backend {config.backend!r} moves real hardware, which nobody could stop from outside: run it in "
                 "processes of their own"
             )
-        ticks = round(config.duration_s * config.rate_hz)
         session = self.network.session()
         opened.callback(session.close)
         faulty, faults = faults_of_host(config, backend, session)
@@ -94,7 +93,7 @@ class InProcessRun:
             config,
             faulty,
             session,
-            max_ticks=ticks,
+            max_ticks=round(config.duration_s * config.rate_hz),
             end_after_fault_s=AFTER_FAULT_S,
             pace_after_fault="free",
             faults=faults,
@@ -114,20 +113,22 @@ class InProcessRun:
 
         The joints are safe at the end, also when this generator is closed early.
         """
-        joined, limit_s = False, min(ARM_LIMIT_S, self.config.start_limit_s)
+        limit_s = min(ARM_LIMIT_S, self.config.start_limit_s)
         give_up = time.monotonic() + limit_s
         with closing(self.host.turns()) as turns:
             for turn, _ in enumerate(turns):
-                if not joined:
+                if turn == 0:
                     for loop in self._loops.values():
                         loop.join()
-                    joined = True
                 if before_services:
                     yield
                 self._let_act()
                 if not self.host.authority.arming and not self.failed:
-                    too_late = turn > ARM_LIMIT_TURNS and time.monotonic() > give_up
-                    self._arm(given_up_after_s=limit_s if too_late else None)
+                    status = self.host.status()
+                    if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
+                        raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.why}")
+                    if status.ready_to_arm:
+                        self.host.ask(request_to_arm(self.host.description, WHO), lambda _answer: None)
                 if not before_services:
                     yield
 
@@ -144,10 +145,3 @@ class InProcessRun:
                 self.failed.append(f"{name} ended: {error}")
                 del self._loops[name]
                 self._parts[name].close()
-
-    def _arm(self, *, given_up_after_s: float | None) -> None:
-        status = self.host.status()
-        if given_up_after_s is not None:
-            raise RefusedError(f"not ready to arm within {given_up_after_s:g} s: {status.why}")
-        if status.ready_to_arm:
-            self.host.ask(request_to_arm(self.host.description, WHO), lambda _answer: None)
