@@ -11,7 +11,7 @@ from numpy.random import Generator
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright, made_of
+from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright, block, made_of, peg
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
@@ -110,15 +110,7 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
 def _draw(field: RandomField, random: Generator, name: str) -> Obstacle:
     x, y = random.uniform(field.low_m, field.high_m).tolist()
     radius_m = float(random.uniform(*field.radius_m))
-    centre = (x, y, field.height_m / 2)
     if field.box_share == 0 or random.uniform() >= field.box_share:
-        return Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius_m, height_m=field.height_m)
+        return peg(name, (x, y), radius_m, field.height_m)
     length_m, width_m = random.uniform(*field.box_size_m, size=2).tolist()
-    return Obstacle(
-        name=name,
-        shape="box",
-        position_w=centre,
-        yaw_rad=float(random.uniform(0.0, math.pi)),
-        half_size_m=(length_m / 2, width_m / 2, field.height_m / 2),
-        height_m=field.height_m,
-    )
+    return block(name, (x, y), (length_m, width_m, field.height_m), float(random.uniform(0.0, math.pi)))

@@ -17,7 +17,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Capsule, Coordinate, Friction, Heading, Outlines, Point, Size
 from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles, solids_of
 from snakesim_hal.model.route import Route, sine_points
-from snakesim_hal.model.solids import Solid, Upright, made_of
+from snakesim_hal.model.solids import Solid, Upright, block, made_of, peg
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name, above
 
@@ -176,9 +176,9 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
     _check_count(scene)
     placed: list[Placed] = []
     for i, c in enumerate(scene.cylinder):
-        placed.append(_placed(_peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m), c))
+        placed.append(_placed(peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m), c))
     for i, b in enumerate(scene.box):
-        placed.append(_placed(_block(b.name or f"box_{i}", b.position_m, b.size_m, b.yaw_rad), b))
+        placed.append(_placed(block(b.name or f"box_{i}", b.position_m, b.size_m, b.yaw_rad), b))
     for i, s in enumerate(scene.sphere):
         ball = Obstacle(
             name=s.name or f"sphere_{i}",
@@ -195,10 +195,10 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
             raise ConfigError(f"scene {scene.name!r}: `wall.{i}`: `from_m` and `to_m` are the same point")
         middle = ((w.from_m[0] + w.to_m[0]) / 2, (w.from_m[1] + w.to_m[1]) / 2)
         size = (length, w.thickness_m, w.height_m)
-        placed.append(_placed(_block(w.name or f"wall_{i}", middle, size, math.atan2(run[1], run[0])), w))
+        placed.append(_placed(block(w.name or f"wall_{i}", middle, size, math.atan2(run[1], run[0])), w))
     for i, p in enumerate(scene.step):
         size = (*p.size_m, p.height_m)
-        platform = _block(p.name or f"step_{i}", p.position_m, size, p.yaw_rad)
+        platform = block(p.name or f"step_{i}", p.position_m, size, p.yaw_rad)
         placed.append(Placed(obstacle=platform, friction=p.friction, walkable=True))
     route = route_of(scene)
     for i, row in enumerate(scene.pegs_along_route):
@@ -224,22 +224,6 @@ def _check_count(scene: SceneFile) -> None:
         raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
 
 
-def _peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
-    centre = (float(position[0]), float(position[1]), height / 2)
-    return Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius, height_m=height)
-
-
-def _block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:
-    return Obstacle(
-        name=name,
-        shape="box",
-        position_w=(*position, size[2] / 2),
-        yaw_rad=yaw,
-        half_size_m=(size[0] / 2, size[1] / 2, size[2] / 2),
-        height_m=size[2],
-    )
-
-
 def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:
     where = f"scene {scene.name!r}: `pegs_along_route.{index}`"
     if route is None:
@@ -260,7 +244,7 @@ def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route 
         push = left if left @ forward > 0 else -left  # from the peg into the body
         centre = route.position_w(s) - push * (row.corridor_m + row.radius_m)
         name = f"peg_{index}_{row.first + k}"
-        pegs.append(_placed(_peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m), row))
+        pegs.append(_placed(peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m), row))
     return pegs
 
 

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.outlines import Friction, Heading
+from snakesim_hal.model.outlines import Friction, Heading, Point
+from snakesim_hal.wire.messages import Obstacle
 
 GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless configured otherwise
 PEG_FRICTION = 0.2  # of a plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/scenes.md
@@ -44,3 +45,21 @@ def made_of(solid: Solid) -> dict[str, Any]:
     """The fields that any obstacle has, of one with more: of an upright one also how it leans."""
     kind = Upright if isinstance(solid, Upright) else Solid
     return {name: getattr(solid, name) for name in kind.__struct_fields__}
+
+
+def peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
+    """An upright cylinder on the ground, in m."""
+    centre = (float(position[0]), float(position[1]), height / 2)
+    return Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius, height_m=height)
+
+
+def block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:
+    """A box on the ground, in m, turned by so many rad."""
+    return Obstacle(
+        name=name,
+        shape="box",
+        position_w=(*position, size[2] / 2),
+        yaw_rad=yaw,
+        half_size_m=(size[0] / 2, size[1] / 2, size[2] / 2),
+        height_m=size[2],
+    )
