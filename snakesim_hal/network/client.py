@@ -97,7 +97,6 @@ class Client:
         self._clock_decoder = Decoder(Clock)
         self._feeds: dict[str, Feed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
-        self._done: Publisher[Done] | None = None
         self._robot: Description | None = None
         self._clock: Clock | None = None
         self._ahead: Clock | None = None  # taken from the queue, but not due yet
@@ -258,21 +257,19 @@ class Client:
         except WireError as error:
             tick = "" if (at := getattr(message, "tick", None)) is None else f" of tick {short(str(at), 20)}"
             raise WireError(error.reason, f"{key}{tick} cannot be published: {error.detail}") from None
-        publisher = self._publishers.get(key)
-        if publisher is None:
-            lossless = self._clock is not None and self._clock.pace == "lockstep"
-            publisher = self.session.publisher(key, type(message), lossless=lossless)
-            self._publishers[key] = publisher
-        publisher.put(message, payload)
+        self._publisher(key, type(message)).put(message, payload)
 
     def done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""
-        if self.commanded_tick == tick:
-            return
-        if self._done is None:
+        if self.commanded_tick != tick:
+            self._publisher(keys.done(self.service), Done).put(Done(tick=tick))
+
+    def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
+        publisher = self._publishers.get(key)
+        if publisher is None:
             lossless = self._clock is not None and self._clock.pace == "lockstep"
-            self._done = self.session.publisher(keys.done(self.service), Done, lossless=lossless)
-        self._done.put(Done(tick=tick))
+            publisher = self._publishers[key] = self.session.publisher(key, message, lossless=lossless)
+        return publisher
 
 
 class Commander:
