@@ -8,7 +8,7 @@ from msgspec import Meta
 from snakesim_hal.drivers.mocap import check_pose
 from snakesim_hal.drivers.mocap_twin import PoseSender
 from snakesim_hal.drivers.mounted import Mounted, check_mounted
-from snakesim_hal.drivers.twin_body import FAULTS, TwinBody, make_plant, twin_body
+from snakesim_hal.drivers.twin_body import FAULTS, Motion, TwinBody, make_plant
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.fault_plan import check_backend_can
 from snakesim_hal.model.files import FileStruct
@@ -41,7 +41,8 @@ class DriveSettings(BodySettings, frozen=True, kw_only=True):
 def body_of(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> TwinBody:
     """What emulated drives move. pose: where its motion capture sends, HOST:PORT. Raises ConfigError."""
     plant = make_plant(config, settings, backend)
-    return twin_body(config, plant, settings.mounted, PoseSender(pose) if pose else None)
+    motion = Motion(config, plant, settings.mounted, PoseSender(pose) if pose else None)
+    return TwinBody(motion, range(config.robot.chain.modules))
 
 
 def check_body(

@@ -38,19 +38,6 @@ def make_plant(config: RunConfig, settings: Any, backend: str) -> Plant:
     return factory(as_built(config, settings.mounted), own)
 
 
-def twin_body(
-    config: RunConfig,
-    plant: Plant,
-    mounted: Mapping[str, Mounted],
-    send_pose: Callable[[bytes], None] | None = None,
-) -> "TwinBody":
-    """The body of a whole robot.
-
-    mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period.
-    """
-    return TwinBody(_Motion(config, plant, mounted, send_pose), range(config.robot.chain.modules))
-
-
 def serve_until_stopped(ready: str, twin: Callable[[], object], wait: Callable[[float], object]) -> None:
     """Emulated drives in a process of their own, until a stop signal. wait: for frames or bytes, at most so long."""
     running = [True]
@@ -62,7 +49,7 @@ def serve_until_stopped(ready: str, twin: Callable[[], object], wait: Callable[[
         wait(POLL_S)
 
 
-class _Motion:
+class Motion:
     """Plant, motors, heat and camera, on one clock: what all emulated drives of a robot share."""
 
     def __init__(
@@ -72,6 +59,7 @@ class _Motion:
         mounted: Mapping[str, Mounted],
         send_pose: Callable[[bytes], None] | None,
     ) -> None:
+        """mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period."""
         self.plant, self.joints = plant, built(config.robot, mounted)
         self.motors, self.thermal = Motors(as_built(config, mounted).robot, plant.step_s), Thermal(self.joints)
         self.now_us, self.each_step = 0.0, list[Callable[[float], None]]()
@@ -87,6 +75,7 @@ class _Motion:
             self._camera = PoseCamera(camera, plant, (config.seed, len(self.joints)), config.period_ns)
 
     def advance_to(self, clock_us: float) -> None:
+        """Physics until then."""
         if clock_us - self._skipped_us - self.now_us > MAX_AT_ONCE_US:
             self._skipped_us = clock_us - self.now_us - MAX_AT_ONCE_US
         until_us = clock_us - self._skipped_us
@@ -113,7 +102,7 @@ class _Motion:
 class TwinBody:
     """The body, and motors in it: all, or those of one family. Drives are numbered tail to head; idle at first."""
 
-    def __init__(self, motion: _Motion, at: Sequence[int]) -> None:
+    def __init__(self, motion: Motion, at: Sequence[int]) -> None:
         """at: the numbers that these drives have in the robot."""
         self._all, self._at = motion, list(at)
         self.plant, self.motors, self.thermal, self.lock = motion.plant, motion.motors, motion.thermal, motion.lock
