@@ -50,23 +50,20 @@ class _FailSafeStream(io.TextIOBase):
         except UnicodeEncodeError:
             return self.write(text.encode("ascii", "backslashreplace").decode())
         except OSError:
-            self._give_up()
+            discard(self._stream)
             return len(text)
 
     def flush(self) -> None:
         try:
             self._stream.flush()
         except OSError:
-            self._give_up()
+            discard(self._stream)
 
     def isatty(self) -> bool:
         return self._stream.isatty()
 
     def fileno(self) -> int:
         return self._stream.fileno()
-
-    def _give_up(self) -> None:
-        discard(self._stream)
 
 
 def discard(stream: TextIO) -> None:

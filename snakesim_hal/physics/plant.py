@@ -5,16 +5,11 @@ can use the physics of another without importing it.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
-
-import msgspec
+from typing import Protocol
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import Vector
-
-if TYPE_CHECKING:
-    from snakesim_hal.model.scenario import RunConfig
 
 
 @dataclass(frozen=True)
@@ -27,7 +22,10 @@ class LinkLoad:
 
 
 class Plant(Protocol):
-    """Joints that turn under motor torques, with or without a world around them. Time advances only in `advance`."""
+    """Joints that turn under motor torques, with or without a world around them. Time advances only in `advance`.
+
+    Its class has `Settings`, a Struct, and is made from a `RunConfig` and those: at the run's start pose, at rest.
+    """
 
     step_s: float  # the longest time for which torques may be held constant
 
@@ -59,14 +57,4 @@ class Plant(Protocol):
 
     def pose(self) -> Pose | None:
         """Pose of the base, as from motion capture; None in a plant without a world. Its tick is 0."""
-        ...
-
-
-class PlantFactory(Protocol):
-    """The object of an entry point in the group `snakesim.plants`: usually the plant's class."""
-
-    Settings: type[msgspec.Struct]
-
-    def __call__(self, config: "RunConfig", settings: Any) -> Plant:
-        """Create the plant at the run's start pose, at rest."""
         ...
