@@ -96,7 +96,6 @@ class Bench:
         """The backend behind a real host, shared like the rig."""
         if self._hosted is None:
             self._hosted = Hosted(self.open(), self.config)
-            self._hosted.start()
         return self._hosted
 
     def spoil(self) -> None:

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from snakesim_hal.backend import Backend, Samples, SetPoints
@@ -117,37 +117,31 @@ class Controller:
 
 
 class Hosted:
-    """Host, controller and observer, each with a session of its own."""
+    """Host, controller and observer, each with a session and a thread of its own, until `close`."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        namespace = f"contract/{config.robot.name}"
+        link = Link(endpoint, f"contract/{config.robot.name}")
         self.backend = RecordingBackend(backend)
         self.controller = Controller()
         self.config = config
-        self._link = Link(endpoint, namespace)
-        self._own_link = Link(endpoint, namespace, listen=True)
-        self._open = contextlib.ExitStack()
-
         self.armed_at = 0  # tick
         self._threads: list[threading.Thread] = []
-
-    def start(self) -> None:
-        """Open the sessions and start the threads."""
+        self._open = contextlib.ExitStack()
         self._open.callback(self.backend.close)
         self._open.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
         try:
-            own = self._open.enter_context(open_session(self._own_link))
-            self.host = Host(self.config, GuardedBackend(self.backend), own)
+            own = self._open.enter_context(open_session(replace(link, listen=True)))
+            self.host = Host(config, GuardedBackend(self.backend), own)
             self.robot = self.host.description
-            self.session: Session = self._open.enter_context(open_session(self._link))
+            self.session: Session = self._open.enter_context(open_session(link))
             self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
             wait_until(self._commands.heard, "the host receives our commands")  # earlier ones are lost
             self._start("host", self.host.run, self.host.stop)
-            self._start("controller", lambda: self.controller.run(self._link), self.controller.stopped.set)
+            self._start("controller", lambda: self.controller.run(link), self.controller.stopped.set)
         except BaseException:
             self._open.close()
             raise
