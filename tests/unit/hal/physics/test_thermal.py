@@ -32,12 +32,6 @@ def test_it_is_exact_whatever_the_step() -> None:
     assert coarse.winding_c[0] == pytest.approx(20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60)))
 
 
-@pytest.mark.parametrize(("celsius", "share"), [(20, 1.0), (80, 1.0), (85, 0.84), (92.5, 0.6), (105, 0.2), (120, 0.2)])
-def test_derating_is_linear(celsius: float, share: float) -> None:
-    assert LIMITS.share_left(celsius) == pytest.approx(share)
-    assert HeatLimits(celsius, celsius + 10.0).share_left(celsius + 5.0) == pytest.approx(0.6)
-
-
 def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cooled() -> None:
     heat = windings(2)
     for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):

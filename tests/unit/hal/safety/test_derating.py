@@ -9,9 +9,8 @@ from snakesim_hal.safety.derating import FIELD, KNOWN_FOR_NS, Derating
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
 from tests.unit.hal.rig import description, power
+from tests.unit.hal.safety.gate_rig import JOINTS
 
-ROBOT = description()
-JOINTS = len(ROBOT.joints)
 MS = 1_000_000
 S = 1000 * MS
 

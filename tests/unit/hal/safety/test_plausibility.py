@@ -14,10 +14,8 @@ from snakesim_hal.safety.plausibility import Mask, PlausibilityCheck, readable
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
+from tests.unit.hal.safety.gate_rig import JOINTS, LIMITS, ROBOT
 
-ROBOT = description()
-LIMITS = JointLimits.of(ROBOT)
-JOINTS = len(ROBOT.joints)
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
 NOBODY: Mask = np.zeros(JOINTS, dtype=np.bool_)

@@ -5,23 +5,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.gate import Applied, JointLimits, Measured
+from snakesim_hal.safety.gate import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import description
+from tests.unit.hal.safety.gate_rig import ANGLE_STEP, JOINTS, TINY, before, every
 
 ROBOT = description(motor__damping_nm_s_per_rad=2.0)
 LIMITS = JointLimits.of(ROBOT)
-JOINTS = len(ROBOT.joints)
-STEP = 5.0 * 0.01  # rad a period
-TINY = 1e-9
 
 
 def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: float) -> StopRamp:
-    measured = Measured(*(np.full(JOINTS, value) for value in (angle, velocity, torque)))
-    return StopRamp.begin(
-        measured, Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), LIMITS.torque_nm), LIMITS
-    )
+    return StopRamp.begin(every(angle, velocity, torque), before(mode, target), LIMITS)
 
 
 def targets(halt: StopRamp, periods: int) -> list[float]:
@@ -70,7 +65,7 @@ def test_whatever_it_begins_with_no_target_jumps_or_leaves_its_range(
     angle: float, velocity: float, torque: float, mode: Mode, target: float
 ) -> None:
     way = np.array(targets(beginning(angle, velocity, torque, mode, target), 60))
-    assert np.abs(way).max() <= 1.5 and np.abs(np.diff(way)).max() <= STEP + TINY
+    assert np.abs(way).max() <= 1.5 and np.abs(np.diff(way)).max() <= ANGLE_STEP + TINY
     assert way[-1] == way[-2] == way[-10]
     stops_at = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
-    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= STEP / 2  # it slows down in whole periods
+    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP / 2  # it slows down in whole periods
