@@ -25,8 +25,19 @@ def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
     return run.ask(keys.fault("hal"), FaultRequest(kind=kind, target=target, **more))
 
 
-def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_it() -> None:
+def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is_refused_with_the_reason() -> None:
     with commanded(run_config(**ALLOWED)) as (run, _):
+        for asked, refusal, words in (
+            (FaultRequest(kind="mote", target="joint_1"), "cannot", "knows no 'mote'"),
+            (FaultRequest(kind="mute", target="joint_9"), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
+            (FaultRequest(kind="leak", target="joint_1"), "cannot", "backend 'lag' cannot do leak to joint_1"),
+            (FaultRequest(kind="kill", target="control"), "wrong_part", "is carried out by run"),
+            (FaultRequest(kind="drop", target="actuator/joints"), "wrong_part", "is carried out by control"),
+            (FaultRequest(kind="mute", target="joint_1", end=True), "wrong_state", "is not active; active: nothing"),
+        ):
+            answer = run.ask(keys.fault("hal"), asked)
+            assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
+        assert run.host.faults.noted == []
         answer = ask(run, "mute", "joint_2")
         assert answer.ok and answer.reason.startswith("mute of joint_2 has begun, at ") and answer.lifecycle == "armed"
         run.reaches("fault")
@@ -39,21 +50,6 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_
         run.arm()
         assert [text.split()[-1] for text in run.host.faults.noted] == ["begins", "ends"]
         assert all(text.startswith("tick ") for text in run.host.faults.noted)
-
-
-def test_what_cannot_be_is_refused_with_the_reason() -> None:
-    with running(run_config(**ALLOWED)) as run:
-        for asked, refusal, words in (
-            (FaultRequest(kind="mote", target="joint_1"), "cannot", "knows no 'mote'"),
-            (FaultRequest(kind="mute", target="joint_9"), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
-            (FaultRequest(kind="leak", target="joint_1"), "cannot", "backend 'lag' cannot do leak to joint_1"),
-            (FaultRequest(kind="kill", target="control"), "wrong_part", "is carried out by run"),
-            (FaultRequest(kind="drop", target="actuator/joints"), "wrong_part", "is carried out by control"),
-            (FaultRequest(kind="mute", target="joint_1", end=True), "wrong_state", "is not active; active: nothing"),
-        ):
-            answer = run.ask(keys.fault("hal"), asked)
-            assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
-        assert run.host.faults.noted == []
 
 
 def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:

@@ -72,16 +72,12 @@ def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None
         assert run.status.lifecycle == "estop" and not run.lifecycle("arm").ok
 
 
-def test_speed_scales_real_time_and_tells_when_it_is_not_reached() -> None:
+def test_speed_scales_real_time_and_a_reset_ends_the_host_disarmed() -> None:
     with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")
         assert run.status.speed == 0.2 and run.status.real_time_factor == pytest.approx(0.2, rel=0.3)
         assert run.status.lifecycle == "armed", run.status.why
-
-
-def test_a_reset_ends_the_host_disarmed() -> None:
-    with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
         ask(run, "reset")
         wait_until(run.ended, "the host's end")
         assert run.host.ended == "reset" and run.host.authority.state == "disarmed"

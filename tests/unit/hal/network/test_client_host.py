@@ -67,13 +67,6 @@ def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
     assert followed == pytest.approx(0.5 * (columns["target"][:-1, 0] - columns["angle_rad"][:-1, 0]))
 
 
-def test_time_stands_still_before_the_first_arming() -> None:
-    with running(run_config()) as run, following(run.link, Follower()) as control:
-        wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
-        assert set(control.ticks_seen) == {0} and run.backend.advanced == 0 and not run.backend.enacted
-        assert run.status.tick == 0 and run.host.black_box.ticks == 0
-
-
 def test_a_slow_participant_is_waited_for() -> None:
     """Guidance owes tick t only at the end of tick t + lag - 1, and no tick passes without it."""
     config = run_config(services={"control": {}, "guidance": {"every_ticks": 5, "lag_ticks": 5}})
@@ -170,12 +163,15 @@ def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
 
 
-def test_arming_waits_for_everybody_and_says_for_whom() -> None:
+def test_arming_waits_for_everybody_and_says_for_whom_and_time_stands_still_until_then() -> None:
     with running(run_config()) as run:
         assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.why
         answer = run.lifecycle("arm")
         assert not answer.ok and answer.reason == "waiting for control"
-        with following(run.link, Follower()):
+        with following(run.link, Follower()) as control:
+            wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
+            assert set(control.ticks_seen) == {0} and run.backend.advanced == 0 and not run.backend.enacted
+            assert run.status.tick == 0 and run.host.black_box.ticks == 0
             run.arm()
         assert run.status.alive == ["control"] or run.host.authority.faults
 

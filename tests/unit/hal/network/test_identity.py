@@ -18,19 +18,18 @@ from snakesim_hal.network.private_channel import HostEnd, HostMessage, StarterEn
 from snakesim_hal.network.run_key import RUN_KEY, is_proven, new_run_key, proven
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, LifecycleRequest
+from snakesim_hal.wire.messages import Description, request_to_arm
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, following, running
-from tests.unit.hal.rig import run_config
+from tests.unit.hal.rig import description, run_config
 
 
 def test_a_description_is_proven_by_the_runs_key_alone() -> None:
-    with running(run_config()) as run:
-        described, key = run.host.description, new_run_key()
-        ours = proven(described, key)
-        assert is_proven(ours, key) and is_proven(described, None)
-        assert not is_proven(described, key) and not is_proven(ours, new_run_key())
-        assert not is_proven(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
+    described, key = description(), new_run_key()
+    ours = proven(described, key)
+    assert is_proven(ours, key) and is_proven(described, None)
+    assert not is_proven(described, key) and not is_proven(ours, new_run_key())
+    assert not is_proven(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
 
 
 def test_a_service_of_a_run_does_not_take_a_forged_description(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,14 +55,7 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
         wait_until(ready, "a status that is ready")
         robot = starter.description
         assert robot == run.host.description and robot is not None
-        arm = LifecycleRequest(
-            action="arm",
-            who="the run",
-            host=robot.host,
-            robot=robot.robot,
-            backend=robot.backend,
-            config_hash=robot.config_hash,
-        )
+        arm = request_to_arm(robot, "the run")
         starter.ask(msgspec.structs.replace(arm, host="another"))
         wait_until(lambda: starter.take_in() or starter.answers, "an answer")
         refused = starter.answers.pop()
@@ -79,10 +71,10 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
 
 def test_a_starter_that_does_not_read_holds_up_nothing() -> None:
     ours, its = socket_pair()
-    with ours, its, running(run_config()) as run:
+    with ours, its:
         host = HostEnd(its)
         for _ in range(5000):
-            host.say(HostMessage(description=run.host.description))
+            host.say(HostMessage(description=description()))
 
 
 def a_robot() -> LocalRobot:

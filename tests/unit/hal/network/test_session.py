@@ -40,24 +40,20 @@ def test_a_latched_value_reaches_readers_that_come_later_and_only_the_newest() -
 
 
 def test_a_reader_that_comes_first_gets_the_value_when_the_publisher_comes() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)), open_session(Link(endpoint, "worm")) as early:
+    with meeting("worm", "worm", "worm") as (_, early, hal):
         reader = early.latched_reader(keys.JOINTS, JointState)
-        with open_session(Link(endpoint, "worm")) as hal:
-            hal.latched_publisher(keys.JOINTS, JointState).put(state(ROBOT, tick=7))
-            assert received(reader, "the value")[0].tick == 7
+        hal.latched_publisher(keys.JOINTS, JointState).put(state(ROBOT, tick=7))
+        assert received(reader, "the value")[0].tick == 7
 
 
 def test_a_stream_is_not_given_to_those_who_come_late() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal:
+    with meeting("worm", "worm") as (hal, session):
         publisher = hal.publisher(keys.JOINTS, JointState)
         publisher.put(state(ROBOT, tick=1))
-        with open_session(Link(endpoint, "worm")) as late:
-            reader = late.reader(keys.JOINTS, JointState)
-            wait_until(publisher.heard, "the subscription")
-            publisher.put(state(ROBOT, tick=2))
-            assert [joints.tick for joints in received(reader, "the sample")] == [2]
+        reader = session.reader(keys.JOINTS, JointState)
+        wait_until(publisher.heard, "the subscription")
+        publisher.put(state(ROBOT, tick=2))
+        assert [joints.tick for joints in received(reader, "the sample")] == [2]
 
 
 def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
