@@ -12,7 +12,6 @@ import threading
 import time
 import traceback
 from contextlib import closing
-from types import TracebackType
 from typing import Self
 
 from threadpoolctl import threadpool_limits
@@ -46,9 +45,7 @@ class Beside:
             thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._closing.set()
         until = time.monotonic() + END_S
         for thread in self._threads:  # one that hangs ends with the process

@@ -12,7 +12,6 @@ them. So a configuration drives the motors alike in both, to the bit. What needs
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, closing
-from types import TracebackType
 from typing import Self
 
 from threadpoolctl import threadpool_limits
@@ -70,9 +69,7 @@ class InProcessRun:
             self._opened = opening.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._opened.close()
 
     def _open(self, opened: ExitStack) -> None:

@@ -11,7 +11,6 @@ import os
 import threading
 from itertools import count
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, Self
 
 import msgspec
@@ -57,9 +56,7 @@ class HostRecordWriter:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         """Write the rest, and how the host ended. Waits for a hanging disk no longer than CLOSE_LIMIT_S."""
         self._closing.set()
         self._thread.join(CLOSE_LIMIT_S)
