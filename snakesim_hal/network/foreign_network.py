@@ -5,7 +5,7 @@ it is another session, samples are dropped rather than waited for, and only the 
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 from snakesim_hal.network.session import Link, open_zenoh
 
 WAITING = 10  # queries at one key, as rmw's profile of services has it
+CONNECT_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -126,12 +127,8 @@ class ForeignNetwork:
 
 
 @contextmanager
-def open_foreign_network(
-    endpoint: str, *, largest_bytes: int, connect_timeout_s: float = 5.0
-) -> Iterator[ForeignNetwork]:
+def open_foreign_network(endpoint: str, *, largest_bytes: int) -> Iterator[ForeignNetwork]:
     """Connect to a router. largest_bytes: of a payload from there. Raises NotConnectedError."""
-    session = ForeignNetwork(open_zenoh(Link(endpoint, largest_bytes=largest_bytes), connect_timeout_s))
-    try:
-        yield session
-    finally:
-        session.close()
+    session = open_zenoh(Link(endpoint, largest_bytes=largest_bytes), CONNECT_TIMEOUT_S)
+    with closing(ForeignNetwork(session)) as network:
+        yield network

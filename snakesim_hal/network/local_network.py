@@ -7,7 +7,7 @@ one that answers it (`LocalNetwork.answer`), because both are in the same thread
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from queue import Empty
 from typing import Any
 
@@ -100,7 +100,8 @@ class LocalReader(Reader[MessageT]):
 class LocalQuery:
     """Takes the answer to a question."""
 
-    answers: Mailbox[tuple[str, bytes, str]]
+    asked: int  # how many have been asked
+    answers: Mailbox[tuple[str, bytes, str]] = field(default_factory=Mailbox[tuple[str, bytes, str]])
 
     def reply(self, key: str, payload: bytes, encoding: str) -> None:
         """From any thread."""
@@ -205,23 +206,17 @@ class LocalSession(Session):
 
     def put_question(self, pattern: str, request: Message) -> LocalQuery:
         """Ask, without waiting: whoever answers may have to take a turn first."""
-        query = LocalQuery(Mailbox())
-        self._put_question(pattern, request, query)
-        return query
-
-    def _put_question(self, pattern: str, request: Message, query: LocalQuery) -> int:
-        """Returns how many have been asked."""
         asked = [(key, take) for key, take in self._network.askable if intersects(pattern, key)]
+        query = LocalQuery(len(asked))
         for key, take in asked:
             take(Question(key, encode(request), encoding_of(type(request)), query))
-        return len(asked)
+        return query
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        query, decoder = LocalQuery(Mailbox()), Decoder(Answer)
-        asked = self._put_question(pattern, request, query)
+        query, decoder = self.put_question(pattern, request), Decoder(Answer)
         self._network.answer()
         deadline = time.monotonic() + timeout_s
-        for _ in range(asked):
+        for _ in range(query.asked):
             try:
                 key, payload, encoding = query.answers.get(deadline - time.monotonic())
             except Empty:

@@ -44,7 +44,5 @@ def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
             session = zenoh.open(settings)
         except zenoh.ZError as error:
             raise refused_by_zenoh(config, error) from error
-        try:
+        with session:
             yield
-        finally:
-            session.close()

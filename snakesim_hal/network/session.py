@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic
@@ -31,12 +31,29 @@ from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT
 from snakesim_hal.wire.messages import Answer, Message, Preview
 
 ENVELOPE_BYTES = 4096  # around a payload: key, encoding, and the numbers of an image
-# Connections that stay silent are closed after a second, and many of them are allowed.
-UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}
-# A subscriber that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them hardly delay
-# a writer. With less, bursts to good subscribers are lost: at 0 ms, two thirds of six express messages in a row.
-TX = {"lease": 2000, "queue/congestion_control/drop/wait_before_drop": 100}
-MAX_MESSAGE = "transport/link/rx/max_message_size"
+# Of every session, whatever its session file says.
+OURS: dict[str, Any] = {
+    "scouting/delay": 0,
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "timestamping/enabled": {"router": True, "peer": True, "client": True},
+    "transport/shared_memory/enabled": False,
+    "listen/exit_on_failure": True,
+    "connect/exit_on_failure": True,
+    "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
+}
+# A session file may have others for its own network, such as a longer lease on a bad link.
+UNLESS_GIVEN: dict[str, Any] = {
+    # Connections that stay silent are closed after a second, and many of them are allowed.
+    "transport/unicast/accept_timeout": 1000,
+    "transport/unicast/accept_pending": 1000,
+    "transport/unicast/max_sessions": 4000,
+    "transport/link/tx/lease": 2000,
+    # A subscriber that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them hardly
+    # delay a writer. With less, bursts to good subscribers are lost: at 0 ms, two thirds of six express messages in a
+    # row.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 100,
+}
 # Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
 # froze together blocked the controller's commands for long enough to end its lease.
 # A client has one connection to read; with two threads each message would wake both. With Zenoh's `handover: app` none
@@ -417,10 +434,8 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
     for_images = None if link.listen else partial(open_zenoh, link, connect_timeout_s, configure_for_images)
     with _receiving_threads(RECEIVERS_LISTENING if link.listen else RECEIVERS_CONNECTED):
         session = Session(open_zenoh(link, connect_timeout_s), for_images)
-    try:
+    with closing(session):
         yield session
-    finally:
-        session.close()
 
 
 @contextmanager
@@ -453,36 +468,14 @@ def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:
         config.insert_json5("mode", json.dumps("router" if link.listen else "client"))
         for verb, does in (("listen", link.listen), ("connect", not link.listen)):
             config.insert_json5(f"{verb}/endpoints", json.dumps([link.endpoint] if does else []))
-    for key, value in _ours(link, connect_timeout_s).items():
-        config.insert_json5(key, json.dumps(value))
-    set_unless_given(config, _unless_given(link))
-    return config
-
-
-def _ours(link: Link, connect_timeout_s: float) -> dict[str, Any]:
-    settings: dict[str, Any] = {
-        "scouting/delay": 0,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "timestamping/enabled": {"router": True, "peer": True, "client": True},
-        "transport/shared_memory/enabled": False,
-        "listen/exit_on_failure": True,
-        "connect/timeout_ms": round(connect_timeout_s * 1000),
-        "connect/exit_on_failure": True,
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
-    }
+    settings = {**OURS, "connect/timeout_ms": round(connect_timeout_s * 1000)}
     if link.namespace is not None:
         settings["namespace"] = link.namespace
-    return settings
-
-
-def _unless_given(link: Link) -> dict[str, Any]:
-    """Settings that a session file may have for its own network, such as a longer lease on a bad link."""
-    return {
-        **{f"transport/unicast/{key}": value for key, value in UNICAST.items()},
-        **{f"transport/link/tx/{key}": value for key, value in TX.items()},
-        MAX_MESSAGE: link.largest_bytes + ENVELOPE_BYTES,
-    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    largest = {"transport/link/rx/max_message_size": link.largest_bytes + ENVELOPE_BYTES}
+    set_unless_given(config, UNLESS_GIVEN | largest)
+    return config
 
 
 def open_zenoh(
