@@ -7,8 +7,8 @@ import msgspec
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.rig import Record, Rig
-from snakesim_hal.model.robot import describe, layout_hash
-from snakesim_hal.model.scenario import config_hash
+from snakesim_hal.model.robot import layout_hash
+from snakesim_hal.model.scenario import description_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import Description, Imu
@@ -17,14 +17,7 @@ from snakesim_hal.wire.own_sample import own_kinds
 
 def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:
     """Joints (count, order, names, axes, limits, gains), links, period, lease and safety come from the run's files."""
-    config, robot = bench.config, rig.robot
-    wanted = describe(
-        config.robot,
-        backend=robot.backend,
-        period_ns=config.period_ns,
-        lease_ns=config.lease_ns,
-        config_hash=config_hash(config),
-    )
+    robot, wanted = rig.robot, description_of(bench.config)
     assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
     for joint, expected in zip(robot.joints, wanted.joints, strict=True):
         drive = {"serial": joint.serial, "firmware": joint.firmware}  # which the drive says, not the file

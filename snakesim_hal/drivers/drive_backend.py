@@ -18,8 +18,8 @@ from snakesim_hal.drivers.mocap import MocapReceiver
 from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
-from snakesim_hal.model.robot import describe, identified
-from snakesim_hal.model.scenario import RunConfig, config_hash
+from snakesim_hal.model.robot import identified
+from snakesim_hal.model.scenario import RunConfig, description_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Message, Mode, SensorDescription
 
@@ -210,14 +210,7 @@ class DriveBackend:
             raise BackendError("the buses are closed; open a new backend")
 
     def _describe(self, config: RunConfig, name: str, hardware: str) -> Description:
-        plain = describe(
-            config.robot,
-            backend=name,
-            period_ns=config.period_ns,
-            lease_ns=config.lease_ns,
-            config_hash=config_hash(config),
-            emulated=self._drives.emulated,
-        )
+        plain = description_of(config, name, emulated=self._drives.emulated)
         camera = config.robot.sensors.pose
         delay_s = camera.delay_s if self._mocap is not None and camera is not None else None
         return msgspec.structs.replace(plain, sensors=self._described(config, delay_s), hardware=hardware)

@@ -346,10 +346,15 @@ def start_of(config: RunConfig) -> StartPose:
     return StartPose(lay.tail_w, lay.heading_rad, chain_angles(robot.axes, lay.angles_rad))
 
 
-def description_of(config: RunConfig) -> Description:
-    """The robot in it, before there is a backend."""
+def description_of(config: RunConfig, backend: str = "", *, emulated: bool = False) -> Description:
+    """The robot in it. backend: its name for itself, where that may be another than the scenario's for it."""
     return describe(
-        config.robot, backend=config.backend, period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
+        config.robot,
+        backend=backend or config.backend,
+        period_ns=config.period_ns,
+        lease_ns=config.lease_ns,
+        config_hash=config_hash(config),
+        emulated=emulated,
     )
 
 

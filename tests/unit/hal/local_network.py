@@ -16,8 +16,7 @@ from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
-from snakesim_hal.model.robot import describe
-from snakesim_hal.model.scenario import RunConfig, config_hash
+from snakesim_hal.model.scenario import RunConfig, description_of
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.wire import keys
@@ -90,18 +89,10 @@ class LagBackend:
 
     def describe(self) -> Description:
         """From the robot file, and the pose."""
-        config = self._config
-        described = describe(
-            config.robot,
-            backend="lag",
-            period_ns=config.period_ns,
-            lease_ns=config.lease_ns,
-            config_hash=config_hash(config),
-            simulated_time=True,
-        )
+        described = msgspec.structs.replace(description_of(self._config, "lag"), simulated_time=True)
         if any(sensor.key == keys.POSE for sensor in described.sensors):
             return described
-        pose_sensor = SensorDescription(key=keys.POSE, rate_hz=0.2e9 / config.period_ns, delay_s=0.0)
+        pose_sensor = SensorDescription(key=keys.POSE, rate_hz=0.2e9 / self._config.period_ns, delay_s=0.0)
         return msgspec.structs.replace(described, sensors=[*described.sensors, pose_sensor])
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
