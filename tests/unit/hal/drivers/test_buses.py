@@ -52,8 +52,11 @@ class Robot(DriveRig):
         return {servo.on for servo in self.servos._twin.servos}
 
 
+Opens = Callable[..., Robot]
+
+
 @pytest.fixture
-def opened() -> Iterator[Callable[..., Robot]]:
+def opened() -> Iterator[Opens]:
     """Opens robots, and closes them in the end."""
     robots: list[Robot] = []
 
@@ -66,7 +69,7 @@ def opened() -> Iterator[Callable[..., Robot]]:
         robot.backend.close()
 
 
-def test_joints_of_two_families_move_as_one_robot_and_say_who_they_are(opened: Callable[..., Robot]) -> None:
+def test_joints_of_two_families_move_as_one_robot_and_say_who_they_are(opened: Opens) -> None:
     robot = opened()
     described = robot.backend.describe()
     assert [joint.serial[:4] for joint in described.joints] == ["3855", "3855", "", ""] and described.emulated
@@ -78,9 +81,7 @@ def test_joints_of_two_families_move_as_one_robot_and_say_who_they_are(opened: C
     assert robot.axes_follow() == robot.servos_follow() == {False}
 
 
-def test_a_failed_reading_leaves_the_last_value_with_its_age_and_does_not_touch_another_bus(
-    opened: Callable[..., Robot],
-) -> None:
+def test_a_failed_reading_leaves_the_last_value_with_its_age_and_does_not_touch_another_bus(opened: Opens) -> None:
     robot = opened()
     robot.run(20, "armed")
     before = robot.angles(SERVOS)
@@ -96,7 +97,7 @@ def test_a_failed_reading_leaves_the_last_value_with_its_age_and_does_not_touch_
     assert robot.joints.valid == [True, True, False, False] and robot.angles(SERVOS) == before
 
 
-def test_a_fault_of_a_drive_is_injected_and_reported_by_its_number_in_the_robot(opened: Callable[..., Robot]) -> None:
+def test_a_fault_of_a_drive_is_injected_and_reported_by_its_number_in_the_robot(opened: Opens) -> None:
     robot = opened()
     robot.run(20, "armed")
     robot.go_wrong("overheat:joint_4@0-9")
@@ -105,9 +106,7 @@ def test_a_fault_of_a_drive_is_injected_and_reported_by_its_number_in_the_robot(
         robot.go_wrong("cut:bus_3@0")
 
 
-def test_a_bus_of_half_the_rate_is_asked_and_told_every_second_tick_and_stops_at_once(
-    opened: Callable[..., Robot],
-) -> None:
+def test_a_bus_of_half_the_rate_is_asked_and_told_every_second_tick_and_stops_at_once(opened: Opens) -> None:
     robot = opened(dynamixel={"every_ticks": 2})
     assert robot.backend.describe().sensors[0].delay_s == 0.01, "so old may a joint state be by itself"
     ages: list[list[float]] = []
@@ -120,35 +119,29 @@ def test_a_bus_of_half_the_rate_is_asked_and_told_every_second_tick_and_stops_at
 
 
 class Held:
-    """From `hold` on a reading of servos blocks, as long as it is to."""
+    """A reading of servos blocks while `go` is not set."""
 
     def __init__(self, robot: Robot) -> None:
-        self.there, self._go = threading.Event(), threading.Event()
-        self._go.set()
+        self.there, self.go = threading.Event(), threading.Event()
+        self.go.set()
         read = robot.servos.read
 
         def wait_and_read() -> None:
-            if not self._go.is_set():
+            if not self.go.is_set():
                 self.there.set()
-                self._go.wait()
+                self.go.wait()
             read()
 
         robot.servos.read = wait_and_read
 
-    def hold(self) -> None:
-        self._go.clear()
 
-    def let_go(self) -> None:
-        self._go.set()
-
-
-def test_a_bus_that_blocks_grows_old_alone_and_a_stop_reaches_the_others(opened: Callable[..., Robot]) -> None:
+def test_a_bus_that_blocks_grows_old_alone_and_a_stop_reaches_the_others(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     held = Held(robot)
     for _ in range(10):
         robot.run(1, "armed")
         time.sleep(0.005)
-    held.hold()
+    held.go.clear()
     robot.run(2, "armed")
     assert held.there.wait(10.0)
     robot.run(1, "armed")  # takes what was read before
@@ -163,14 +156,12 @@ def test_a_bus_that_blocks_grows_old_alone_and_a_stop_reaches_the_others(opened:
     robot.run(1, "disarmed")
     wait_until(lambda: robot.axes_follow() == {False}, "axes that are let go", 10.0)
     assert robot.servos_follow() == {True}, "nobody can reach them: their own watchdog stops them"
-    held.let_go()
+    held.go.set()
     wait_until(lambda: robot.servos_follow() == {False}, "servos that are let go", 10.0)
     wait_until(lambda: robot.run(1, "disarmed") == [] and max(robot.ages_ms(SERVOS)) < ages[-1], "news", 10.0)
 
 
-def test_a_bus_that_takes_20_ms_a_reading_is_not_waited_for_and_reads_at_its_own_rate(
-    opened: Callable[..., Robot],
-) -> None:
+def test_a_bus_that_takes_20_ms_a_reading_is_not_waited_for_and_reads_at_its_own_rate(opened: Opens) -> None:
     robot = opened("realtime")
     read, readings = robot.servos.read, [0]
 
@@ -188,7 +179,7 @@ def test_a_bus_that_takes_20_ms_a_reading_is_not_waited_for_and_reads_at_its_own
     assert readings[0] > 5 and max(robot.ages_ms(SERVOS)) > 0
 
 
-def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(opened: Callable[..., Robot]) -> None:
+def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     wait_until(
         lambda: (robot.run(1, "armed") and False) or robot.axes_follow() == robot.servos_follow() == {True}, "arms"
@@ -197,7 +188,7 @@ def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(open
     assert not any(axis.errors for axis in robot.axes._twin.axes), "not by their watchdogs"
 
 
-def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened: Callable[..., Robot]) -> None:
+def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     wait_until(lambda: (robot.run(1, "armed") and False) or robot.servos_follow() == {True}, "arms")
     robot.axes.wire._bus.shutdown()

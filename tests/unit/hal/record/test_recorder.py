@@ -96,10 +96,10 @@ def test_a_host_that_is_started_again_leaves_the_record_of_the_one_before(tmp_pa
 
 
 class Disk:
-    """A disk that takes so many bytes of rows, and is then full, or hangs; everything else goes its way."""
+    """A disk that takes `space` bytes of rows, and is then full, or hangs; everything else goes its way."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, memory: int, space: int) -> None:
-        self.space, self.hangs, self.goes_on = space, False, Event()
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
+        self.space, self.hangs, self.goes_on = 2**30, False, Event()
         self._memory, self._pwrite = memory, os.pwrite
         monkeypatch.setattr(under_test.os, "pwrite", self.pwrite)
         monkeypatch.setattr(under_test, "PERIOD_S", 0.02)
@@ -115,12 +115,16 @@ class Disk:
         return self._pwrite(handle, content[:room], offset)
 
 
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch, memory: int) -> Disk:
+    return Disk(monkeypatch, memory)
+
+
 def test_what_a_full_disk_did_not_take_is_written_when_there_is_room_again(
-    tmp_path: Path, memory: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, memory: int, disk: Disk, capfd: pytest.CaptureFixture[str]
 ) -> None:
     box = BlackBox(ROBOT)
-    begins = len(box.layout.header())
-    disk = Disk(monkeypatch, memory, begins + 7 * ROW + 11)  # the eighth row is torn
+    disk.space = len(box.layout.header()) + 7 * ROW + 11  # the eighth row is torn
     with recorder(box, tmp_path, memory):
         fill(box, *range(20))
         wait_until(lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it")
@@ -132,12 +136,10 @@ def test_what_a_full_disk_did_not_take_is_written_when_there_is_room_again(
     assert capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"  # once
 
 
-def test_what_is_never_written_is_counted_and_seen_in_the_ticks(
-    tmp_path: Path, memory: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_never_written_is_counted_and_seen_in_the_ticks(tmp_path: Path, memory: int, disk: Disk) -> None:
     box = BlackBox(ROBOT, memory_bytes=10 * ROW)
     begins = len(box.layout.header())
-    disk = Disk(monkeypatch, memory, begins + 3 * ROW)
+    disk.space = begins + 3 * ROW
     with recorder(box, tmp_path, memory):
         fill(box, *range(5))
         wait_until(lambda: ticks_on_disk(tmp_path) == [0, 1, 2], "the first rows")
@@ -159,9 +161,8 @@ def test_a_folder_that_cannot_be_written_to_leaves_no_empty_file(tmp_path: Path,
 
 
 def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
-    tmp_path: Path, memory: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk = Disk(monkeypatch, memory, 2**30)
     monkeypatch.setattr(under_test, "CLOSE_LIMIT_S", 0.3)
     with (
         running(run_config(pace="lockstep"), max_ticks=75) as run,
@@ -188,10 +189,9 @@ def test_without_a_folder_only_the_memory_knows(memory: int) -> None:
 
 
 def test_numbers_are_written_although_the_disk_never_catches_up(
-    tmp_path: Path, memory: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     box = BlackBox(ROBOT)
-    disk = Disk(monkeypatch, memory, 2**30)
     taken = disk.pwrite
 
     def slow(handle: int, content: bytes, offset: int) -> int:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.safety.cables import Cables
 from snakesim_hal.wire.messages import Answer, EstopRequest, LeaseRequest, LifecycleRequest, Mode
 from tests.unit.hal.rig import PERIOD_NS, command, description, power, state
 
@@ -16,9 +17,9 @@ ESTOP = EstopRequest(who="a person")
 class Rig:
     """An authority with a clock; every step is one a host would take."""
 
-    def __init__(self, **robot: Any) -> None:
+    def __init__(self, *, unchecked: str = "", cables: Cables | None = None, **robot: Any) -> None:
         self.robot = description(**robot)
-        self.authority = Authority(self.robot)
+        self.authority = Authority(self.robot, unchecked=unchecked, cables=cables)
         self.now_ns = 0
         self.tick = 0
         self.sequence = 0

@@ -332,10 +332,7 @@ def test_every_no_has_a_word() -> None:
 
 
 def test_a_robot_that_nobody_checked_is_armed_by_an_explicit_word_alone() -> None:
-    rig = Rig()
-    rig.authority = Authority(rig.robot, unchecked="nobody has checked it")
-    rig.observe(0.1)
-    assert rig.acquire().ok and rig.send(0.1) is None
+    rig = commanded(unchecked="nobody has checked it")
     refused = rig.arm()
     assert refused.refusal == "not_checked" and "nobody has checked it; to arm it" in refused.reason
     armed = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, unchecked=True), rig.now_ns)
@@ -343,11 +340,6 @@ def test_a_robot_that_nobody_checked_is_armed_by_an_explicit_word_alone() -> Non
 
 
 def test_a_cable_of_which_nobody_knows_how_far_it_is_wound_is_not_overruled_by_a_word() -> None:
-    rig = Rig()
-    rig.authority = Authority(
-        rig.robot, unchecked="nobody has checked it", cables=Cables((), {}, {"joint_2": "unknown"})
-    )
-    rig.observe(0.1)
-    assert rig.acquire().ok and rig.send(0.1) is None
+    rig = commanded(unchecked="nobody has checked it", cables=Cables((), {}, {"joint_2": "unknown"}))
     refused = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, unchecked=True), rig.now_ns)
     assert (refused.refusal, refused.reason) == ("cable", "joint_2: unknown")
