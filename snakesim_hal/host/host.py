@@ -28,7 +28,7 @@ from snakesim_hal.host.outbox import Outbox, Outgoing
 from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
-from snakesim_hal.host.status_messages import applied_message, waiting
+from snakesim_hal.host.status_messages import applied_message, waiting_for
 from snakesim_hal.host.timing import BackendTime, Deadlines, PublishTimes
 from snakesim_hal.injection import HAL
 from snakesim_hal.model.scenario import RunConfig, written
@@ -470,8 +470,8 @@ class Host:
             answer = self._answer(ok=False, reason="; ".join(differing), refusal="settings_differ")
         else:
             answer = self.authority.on_lifecycle(request, now_ns)
-            if request.action == "arm" and answer.ok:
-                self._expect_first_command()
+            if request.action == "arm" and answer.ok and (holder := self._holder()) is not None:
+                holder.done_tick = self._answered = -1  # commands from before the arming do not answer its tick
             if request.action == "finish":
                 by = f" by {request.who}" if request.who else ""
                 self._end("finished", f"on request{by}")
@@ -497,12 +497,6 @@ class Host:
 
     def _holder(self) -> Participant | None:
         return self.participants.get(self.authority.lease.holder or "")
-
-    def _expect_first_command(self) -> None:
-        """Commands sent before the arming do not answer the tick of arming."""
-        holder = self._holder()
-        if holder is not None:
-            holder.done_tick = self._answered = -1
 
     def _used_command_tick(self) -> int | None:
         """In lockstep: the newest tick whose command is used at the end of this one."""
@@ -554,7 +548,7 @@ class Host:
         why = authority.why
         if authority.state == "disarmed" and (against or missing or differing):
             lacks = self._processes.waits()
-            waits = [waiting(name, lacks.get(name, ())) for name in missing]
+            waits = [waiting_for(name, lacks.get(name, ())) for name in missing]
             why = "; ".join([why, *slow_backend, *differing, *waits, *against])[:500]
         return Status(
             tick=self._tick,

@@ -24,7 +24,7 @@ def applied_message(description: Description, tick: int, decision: Decision) -> 
     )
 
 
-def waiting(service: str, lacks: Sequence[str]) -> str:
+def waiting_for(service: str, lacks: Sequence[str]) -> str:
     """That a service is waited for, and which keys it lacks."""
     if not lacks:
         return f"waiting for {service}"
