@@ -22,16 +22,17 @@ NOTICED = {"failure", "error"}
 BUS = "./tests/contract/workbench.py"
 
 
-def run_suite(*arguments: str, cwd: Path = ROOT, limit_s: float = 800.0) -> subprocess.CompletedProcess[str]:
-    """The suite in a process of its own, as a user runs it. pytest refuses a plugin that is named twice."""
+def python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     environment = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
-    command = [sys.executable, "-m", "pytest", "--pyargs", "snakesim_hal.conformance", "-p", "no:cacheprovider"]
-    if not any(entry.value == PLUGIN for entry in entry_points(group="pytest11")):
-        command += ["-p", PLUGIN]
-    command += arguments
-    return subprocess.run(
-        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=limit_s, check=False
-    )
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=800, check=False)
+
+
+def run_suite(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """The suite in a process of its own, as a user runs it. pytest refuses a plugin that is named twice."""
+    known = any(entry.value == PLUGIN for entry in entry_points(group="pytest11"))
+    plugins = ["-p", "no:cacheprovider", *([] if known else ["-p", PLUGIN])]
+    return python("-m", "pytest", "--pyargs", "snakesim_hal.conformance", *plugins, *arguments, cwd=cwd)
 
 
 def clauses() -> set[str]:
@@ -68,15 +69,8 @@ def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
     (tmp_path / "workbench.py").write_text(text_of_the_example())
-    given = [
-        "--snakesim-backend",
-        "./workbench.py:Workbench",
-        "--snakesim-mute",
-        "./workbench.py:mute",
-        "--snakesim-table",
-        "table.md",
-    ]
-    ran = run_suite(*given, "-q", cwd=tmp_path)
+    given = ["--snakesim-backend", "./workbench.py:Workbench", "--snakesim-mute", "./workbench.py:mute"]
+    ran = run_suite(*given, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout
     assert ran.stdout.count("skipped:") == 1
     assert "joint_1 is described with every mode" in ran.stdout  # so there is none that it lacks
@@ -118,17 +112,10 @@ def test_a_project_beside_ours_may_have_options_of_the_usual_names(tmp_path: Pat
     (tmp_path / "test_it.py").write_text(
         "def test_it(pytestconfig):\n    assert pytestconfig.getoption('--backend') == 'x'\n"
     )
-    ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--backend", "x"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ran = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "--backend", "x", cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
 def test_the_plugin_loads_nothing_of_ours_until_it_is_used() -> None:
     code = f"import sys, {PLUGIN}; print([name for name in sys.modules if name.startswith('snakesim_')])"
-    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == str(["snakesim_hal", "snakesim_hal.conformance", PLUGIN])
+    assert python("-c", code).stdout.strip() == str(["snakesim_hal", "snakesim_hal.conformance", PLUGIN])
