@@ -3,10 +3,12 @@
 As a pytest plugin (`-p tests.contract.mutants`) it runs each mutant against those clauses only.
 """
 
+import dataclasses
 import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,65 +36,82 @@ class Mutant:
 MUTANTS: list[Mutant] = []
 
 
-def breaks(*clauses: str) -> Callable[[Any], Any]:
-    """Register a broken backend with the clauses that must fail on it."""
+class Liar(Workbench):
+    """Is told, says or does something else than is true: what one of three functions makes of it."""
 
-    def register(backend: Any) -> Any:
+    def __init__(self, config: Any, settings: Any) -> None:
+        super().__init__(config, settings)
+        self.description = self.describes(self.description)
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        return Samples(self.reads(super().sample(tick, stamp_ns).joints))
+
+    def enact(self, set_points: SetPoints, lifecycle: Any) -> None:
+        super().enact(self.hears(set_points), lifecycle)
+
+    def describes(self, robot: Description) -> Description:
+        return robot
+
+    def reads(self, joints: JointState) -> JointState:
+        return joints
+
+    def hears(self, points: SetPoints) -> SetPoints:
+        return points
+
+
+def breaks(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
+    """Register a broken backend with the clauses that must fail on it.
+
+    lie: a function of `Liar`; then no backend is registered, but what is to stand in place of that.
+    """
+
+    def register(broken: Any) -> Any:
+        backend = type(broken.__name__, (Liar,), {lie: staticmethod(broken)}) if lie else broken
         MUTANTS.append(Mutant(backend.__name__, backend, tuple(f"test_{clause}" for clause in clauses)))
-        return backend
+        return broken
 
     return register
+
+
+describes, reads, hears = (partial(breaks, lie=lie) for lie in ("describes", "reads", "hears"))
 
 
 # --- the description -------------------------------------------------------------------------------------------
 
 
-class Misdescribed(Workbench):
-    """Says something else than it is."""
-
-    def __init__(self, config: Any, settings: Any) -> None:
-        super().__init__(config, settings)
-        self.description = self.mistold(self.description)
-
-    def mistold(self, robot: Description) -> Description:
-        raise NotImplementedError
+def listing(robot: Description, key: str, rate_hz: float = 50.0) -> Description:
+    """With one sensor more."""
+    return replace(robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)])
 
 
-@breaks("the_description_is_what_the_robot_file_says")
-class NamedFromTheHead(Misdescribed):
-    def mistold(self, robot):
-        return replace(robot, joints=robot.joints[::-1])
+@describes("the_description_is_what_the_robot_file_says")
+def named_from_the_head(robot):
+    return replace(robot, joints=robot.joints[::-1])
 
 
-@breaks("the_description_is_what_the_robot_file_says")
-class LimitsInDegrees(Misdescribed):
-    def mistold(self, robot):
-        return replace(robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints])
+@describes("the_description_is_what_the_robot_file_says")
+def limits_in_degrees(robot):
+    return replace(robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints])
 
 
-@breaks("the_layout_is_the_hash_of_the_joints")
-class LayoutOfAnother(Misdescribed):
-    def mistold(self, robot):
-        return replace(robot, layout="0" * 16)
+@describes("the_layout_is_the_hash_of_the_joints")
+def layout_of_another(robot):
+    return replace(robot, layout="0" * 16)
 
 
-@breaks("the_description_survives_the_wire")
-class BeyondBounds(Misdescribed):
-    def mistold(self, robot):
-        return replace(robot, max_step_rad=20.0)
+@describes("the_description_survives_the_wire")
+def beyond_bounds(robot):
+    return replace(robot, max_step_rad=20.0)
 
 
-@breaks("every_sensor_listed_is_a_key_of_the_hal_once")
-class ListsASonar(Misdescribed):
-    def mistold(self, robot):
-        sonar = SensorDescription(key="sensor/sonar", rate_hz=10, delay_s=0)
-        return replace(robot, sensors=[*robot.sensors, sonar])
+@describes("every_sensor_listed_is_a_key_of_the_hal_once")
+def lists_a_sonar(robot):
+    return listing(robot, "sensor/sonar", rate_hz=10.0)
 
 
-@breaks("every_sensor_listed_delivers_at_about_its_rate")
-class ListsWhatItLacks(Misdescribed):
-    def mistold(self, robot):
-        return replace(robot, sensors=[*robot.sensors, SensorDescription(key=keys.IMU, rate_hz=25, delay_s=0)])
+@describes("every_sensor_listed_delivers_at_about_its_rate")
+def lists_what_it_lacks(robot):
+    return listing(robot, keys.IMU, rate_hz=25.0)
 
 
 @breaks("the_description_is_readable_at_once_and_stays")
@@ -107,44 +126,30 @@ class NoisyDescription(Workbench):
 # --- samples ---------------------------------------------------------------------------------------------------
 
 
-class Misread(Workbench):
-    """Reports something else than what is."""
-
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
-        return Samples(self.misread(super().sample(tick, stamp_ns).joints))
-
-    def misread(self, joints: JointState) -> JointState:
-        raise NotImplementedError
+@reads("joints_carry_the_tick_and_stamp_that_were_asked_for")
+def stamped_by_itself(joints):
+    return replace(joints, stamp_ns=joints.stamp_ns + 1_000_000)
 
 
-@breaks("joints_carry_the_tick_and_stamp_that_were_asked_for")
-class StampedByItself(Misread):
-    def misread(self, joints):
-        return replace(joints, stamp_ns=joints.stamp_ns + 1_000_000)
+@reads("every_vector_has_one_entry_a_joint")
+def one_too_many(joints):
+    return replace(joints, valid=[*joints.valid, True])
 
 
-@breaks("every_vector_has_one_entry_a_joint")
-class OneTooMany(Misread):
-    def misread(self, joints):
-        return replace(joints, valid=[*joints.valid, True])
-
-
-@breaks("every_sample_survives_the_wire")
-class AbsurdTorque(Misread):
-    def misread(self, joints):
-        return replace(joints, torque_nm=[*joints.torque_nm[:-1], 1e6])
+@reads("every_sample_survives_the_wire")
+def absurd_torque(joints):
+    return replace(joints, torque_nm=[*joints.torque_nm[:-1], 1e6])
 
 
 @breaks("every_joint_is_valid_and_fresh_at_every_tick")
-class ReadsEveryThirdTick(Misread):
-    def misread(self, joints):
+class ReadsEveryThirdTick(Liar):
+    def reads(self, joints):
         return replace(joints, age_ns=[joints.tick % 3 * self.description.period_ns] * len(joints.age_ns))
 
 
-@breaks("what_is_not_known_yet_is_not_reported_as_valid")
-class ZeroForUnknown(Misread):
-    def misread(self, joints):
-        return joints if joints.tick else replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
+@reads("what_is_not_known_yet_is_not_reported_as_valid")
+def zero_for_unknown(joints):
+    return joints if joints.tick else replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
 
 
 @breaks("readings_follow_the_motion")
@@ -178,8 +183,7 @@ class FromTheFuture(WithPose):
 
     def __init__(self, config, settings):
         super().__init__(config, settings)
-        pose = SensorDescription(key=keys.POSE, rate_hz=50, delay_s=0)
-        self.description = replace(self.description, sensors=[*self.description.sensors, pose])
+        self.description = listing(self.description, keys.POSE)
 
 
 class WithSonar(Workbench):
@@ -189,8 +193,7 @@ class WithSonar(Workbench):
 
     def __init__(self, config, settings):
         super().__init__(config, settings)
-        sonar = SensorDescription(key=keys.ranges("sonar"), rate_hz=50, delay_s=0)
-        self.description = replace(self.description, sensors=[*self.description.sensors, sonar])
+        self.description = listing(self.description, keys.ranges("sonar"))
 
     def sample(self, tick, stamp_ns):
         sonar = Ranges(
@@ -221,93 +224,72 @@ class SaysTheFurthestForNothing(WithSonar):
 # --- modes and units -------------------------------------------------------------------------------------------
 
 
-class Mistold(Workbench):
-    """Makes something else of its set-points."""
-
-    def enact(self, set_points, lifecycle):
-        super().enact(self.heard(set_points, lifecycle), lifecycle)
-
-    def heard(self, points: SetPoints, lifecycle: Any) -> SetPoints:
-        raise NotImplementedError
+def let_go(points: SetPoints) -> SetPoints:
+    """With all joints passive."""
+    return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
 
-@breaks("position_mode_turns_the_joint_that_is_asked_and_no_other")
-class TargetsInDegrees(Mistold):
-    def heard(self, points, lifecycle):
-        return SetPoints(points.mode, [float(np.radians(target)) for target in points.target], points.torque_limit_nm)
+@hears("position_mode_turns_the_joint_that_is_asked_and_no_other")
+def targets_in_degrees(points):
+    return dataclasses.replace(points, target=np.radians(points.target).tolist())
 
 
-@breaks("position_mode_turns_the_joint_that_is_asked_and_no_other")
-class HeadToTail(Mistold):
-    def heard(self, points, lifecycle):
-        return SetPoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
+@hears("position_mode_turns_the_joint_that_is_asked_and_no_other")
+def head_to_tail(points):
+    return SetPoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
 
 
-@breaks("position_mode_turns_the_joint_that_is_asked_and_no_other", "torque_mode_pushes_with_the_torque_that_is_asked")
-class WrongWayRound(Mistold):
-    def heard(self, points, lifecycle):
-        return SetPoints(points.mode, [-target for target in points.target], points.torque_limit_nm)
+@hears("position_mode_turns_the_joint_that_is_asked_and_no_other", "torque_mode_pushes_with_the_torque_that_is_asked")
+def wrong_way_round(points):
+    return dataclasses.replace(points, target=[-target for target in points.target])
 
 
-@breaks("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
-class SpeedInTurns(Mistold):
-    def heard(self, points, lifecycle):
-        scale = [0.16 if mode == Mode.VELOCITY else 1.0 for mode in points.mode]
-        return SetPoints(
-            points.mode, [a * b for a, b in zip(points.target, scale, strict=True)], points.torque_limit_nm
-        )
+@hears("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
+def speed_in_turns(points):
+    scale = [0.16 if mode == Mode.VELOCITY else 1.0 for mode in points.mode]
+    return dataclasses.replace(points, target=np.multiply(points.target, scale).tolist())
 
 
-@breaks("joints_may_be_in_different_modes_at_once")
-class OneModeForAll(Mistold):
-    def heard(self, points, lifecycle):
-        return SetPoints([points.mode[1]] * len(points.mode), points.target, points.torque_limit_nm)
+@hears("joints_may_be_in_different_modes_at_once")
+def one_mode_for_all(points):
+    return dataclasses.replace(points, mode=[points.mode[1]] * len(points.mode))
 
 
-@breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
-class HoldsWhatIsLost(Mistold):
-    def heard(self, points, lifecycle):
-        held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
-        target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
-        return SetPoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
+@hears("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+def holds_what_is_lost(points):
+    held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
+    target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
+    return SetPoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
+
+
+@hears("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+def one_for_all(points):
+    return let_go(points) if points.isolated else points
 
 
 @breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
-class OneForAll(Mistold):
-    def heard(self, points, lifecycle):
-        passive = SetPoints([Mode.PASSIVE] * len(points.mode), [0.0] * len(points.mode), points.torque_limit_nm)
-        return passive if points.isolated else points
-
-
-@breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
-class TakesNothingBack(Mistold):
+class TakesNothingBack(Liar):
     lost: frozenset[int] = frozenset()
 
-    def heard(self, points, lifecycle):
+    def hears(self, points):
         self.lost |= points.isolated
-        return SetPoints(
-            [Mode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)],
-            points.target,
-            points.torque_limit_nm,
-        )
+        modes = [Mode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)]
+        return dataclasses.replace(points, mode=modes)
 
 
-@breaks("the_reported_velocity_is_the_change_of_the_reported_angle", "velocity_mode_turns_at_the_speed_that_is_asked")
-class NoSpeedometer(Misread):
-    def misread(self, joints):
-        return replace(joints, velocity_rad_s=[0.0] * len(joints.velocity_rad_s))
+@reads("the_reported_velocity_is_the_change_of_the_reported_angle", "velocity_mode_turns_at_the_speed_that_is_asked")
+def no_speedometer(joints):
+    return replace(joints, velocity_rad_s=[0.0] * len(joints.velocity_rad_s))
 
 
-@breaks("the_reported_velocity_is_the_change_of_the_reported_angle")
-class AngleInDegrees(Misread):
-    def misread(self, joints):
-        return replace(joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s])
+@reads("the_reported_velocity_is_the_change_of_the_reported_angle")
+def angle_in_degrees(joints):
+    return replace(joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s])
 
 
-@breaks("torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_set_points_is_kept")
-class NoTorqueSensor(Misread):
-    def misread(self, joints):
-        return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
+@reads("torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_set_points_is_kept")
+def no_torque_sensor(joints):
+    return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
 
 
 @breaks(
@@ -329,12 +311,12 @@ class PassivePushes(Workbench):
 
 
 @breaks("set_points_hold_until_the_next_ones")
-class ForgetsWhatIsRepeated(Mistold):
+class ForgetsWhatIsRepeated(Liar):
     last: Any = None
 
-    def heard(self, points, lifecycle):
+    def hears(self, points):
         repeated, self.last = points == self.last, points
-        return SetPoints([Mode.PASSIVE] * len(points.mode), points.target, []) if repeated else points
+        return let_go(points) if repeated else points
 
     def step(self):
         self.limit = np.full(len(self.angle), 4.0)
@@ -349,10 +331,10 @@ class ForgetsAfterAPeriod(Workbench):
 
 
 @breaks("a_mode_that_a_joint_lacks_is_refused_and_moves_nothing")
-class MovesAfterAll(Misdescribed):
+class MovesAfterAll(Liar):
     """Has no torque mode, and moves when it is told nothing."""
 
-    def mistold(self, robot):
+    def describes(self, robot):
         first = replace(robot.joints[0], modes=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY])
         return replace(robot, joints=[first, *robot.joints[1:]])
 
@@ -364,16 +346,14 @@ class MovesAfterAll(Misdescribed):
 # --- limits and switching --------------------------------------------------------------------------------------
 
 
-@breaks("the_torque_limit_of_the_set_points_is_kept", "a_torque_limit_of_zero_lets_nothing_move")
-class IgnoresTorqueLimit(Mistold):
-    def heard(self, points, lifecycle):
-        return SetPoints(points.mode, points.target, [4.0] * len(points.mode))
+@hears("the_torque_limit_of_the_set_points_is_kept", "a_torque_limit_of_zero_lets_nothing_move")
+def ignores_torque_limit(points):
+    return dataclasses.replace(points, torque_limit_nm=[4.0] * len(points.mode))
 
 
-@breaks("a_torque_limit_of_zero_lets_nothing_move")
-class ZeroIsNoLimit(Mistold):
-    def heard(self, points, lifecycle):
-        return SetPoints(points.mode, points.target, [limit or 4.0 for limit in points.torque_limit_nm])
+@hears("a_torque_limit_of_zero_lets_nothing_move")
+def zero_is_no_limit(points):
+    return dataclasses.replace(points, torque_limit_nm=[limit or 4.0 for limit in points.torque_limit_nm])
 
 
 @breaks("no_joint_goes_beyond_its_limits")
@@ -456,10 +436,9 @@ class CriesWolf(Workbench):
         return [] if reported else [Fault(tick=0, what="wolf", cause="none to be seen")]
 
 
-@breaks("a_silent_joint_grows_old_and_the_robot_stops")
-class NeverOld(Misread):
-    def misread(self, joints):
-        return replace(joints, age_ns=[0] * len(joints.age_ns))
+@reads("a_silent_joint_grows_old_and_the_robot_stops")
+def never_old(joints):
+    return replace(joints, age_ns=[0] * len(joints.age_ns))
 
 
 @breaks("a_silent_joint_grows_old_and_the_robot_stops")
@@ -469,12 +448,13 @@ class RepeatsItsFaults(Workbench):
 
 
 @breaks("bad_commands_are_refused_and_counted_and_move_nothing")
-class Creeps(Mistold):
+class Creeps(Workbench):
     crept = 0.0
 
-    def heard(self, points, lifecycle):
+    def enact(self, set_points, lifecycle):
         self.crept += 0.004 * (lifecycle == "armed")
-        return SetPoints(points.mode, [target + self.crept for target in points.target], points.torque_limit_nm)
+        beyond = [target + self.crept for target in set_points.target]
+        super().enact(dataclasses.replace(set_points, target=beyond), lifecycle)
 
 
 # --- closing ---------------------------------------------------------------------------------------------------
@@ -505,19 +485,18 @@ class KeepsItsBus(Workbench):
         super().__init__(config, settings)
 
 
-@breaks("in_lockstep_the_same_seed_and_commands_give_the_same_samples")
-class OwnDice(Misread):
-    def misread(self, joints):
-        return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
+@reads("in_lockstep_the_same_seed_and_commands_give_the_same_samples")
+def own_dice(joints):
+    return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
 
 
 @breaks("a_simulator_stands_still_on_request_and_a_robot_refuses")
-class ModulesThatTellThemselvesASimulator(Misdescribed):
+class ModulesThatTellThemselvesASimulator(Liar):
     """Their watchdog counts wall time."""
 
     stepped_s = 0.0
 
-    def mistold(self, robot):
+    def describes(self, robot):
         return replace(robot, simulated_time=True)
 
     def advance(self):
