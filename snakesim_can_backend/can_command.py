@@ -65,8 +65,9 @@ def parser() -> argparse.ArgumentParser:
     asked = commands.add_parser("load", help="print the worst-case load of a scenario's buses")
     asked.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
     asked.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value")
-    asked.add_argument("--joints", type=_joints, nargs="+", metavar="N", help="for a robot with this many joints")
-    asked.add_argument("--rates", type=_rate, nargs="+", metavar="HZ", help="for these control rates")
+    joints, rate_hz = number(1, LAST_NODE, "joints"), number(float(MIN_RATE_HZ), MAX_RATE_HZ, "Hz")
+    asked.add_argument("--joints", type=joints, nargs="+", metavar="N", help="for a robot with this many joints")
+    asked.add_argument("--rates", type=rate_hz, nargs="+", metavar="HZ", help="for these control rates")
     asked.set_defaults(act=_load)
 
     answering = commands.add_parser(
@@ -76,7 +77,8 @@ def parser() -> argparse.ArgumentParser:
     answering.add_argument(
         "--bit-rate", type=number(10_000, 1_000_000, "bit/s"), default=BIT_RATE, help="of an adapter (1000000)"
     )
-    answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
+    seconds = number(0.001, 3600, "s")
+    answering.add_argument("--seconds", type=seconds, default=1.0, help="how long to listen on each (default: 1)")
     answering.add_argument("--anyway", action="store_true", help="send identify also where others use the bus")
     answering.set_defaults(act=_scan)
 
@@ -265,34 +267,3 @@ def _expand(arguments: argparse.Namespace) -> int:
     write_text(arguments.out, expanded_dbc(), encoding="cp1252")
     say(str(arguments.out))
     return OK
-
-
-# --- arguments ---------------------------------------------------------------------------------------------
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number; give it without a unit") from None
-
-
-def _joints(text: str) -> int:
-    count = _number(text)
-    if not (1 <= count <= LAST_NODE and count == int(count)):
-        raise argparse.ArgumentTypeError(f"{text} joints; whole, from 1 to {LAST_NODE}, the last node id")
-    return int(count)
-
-
-def _rate(text: str) -> float:
-    rate_hz = _number(text)
-    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
-        raise argparse.ArgumentTypeError(f"{text} Hz; from {MIN_RATE_HZ} to {MAX_RATE_HZ}")
-    return rate_hz
-
-
-def _seconds(text: str) -> float:
-    seconds = _number(text)
-    if not 0 < seconds <= 3600:
-        raise argparse.ArgumentTypeError(f"{text} s; from above 0 to 3600")
-    return seconds

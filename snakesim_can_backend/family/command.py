@@ -14,8 +14,8 @@ from snakesim_can_backend.family.backend import CanDriveBackend
 from snakesim_hal.drivers.drive_backend import Clock
 from snakesim_hal.drivers.twin_body import serve_until_stopped
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.plugin_check import backend_settings
 from snakesim_hal.process import die_with_parent
 from snakesim_hal.terminal import exit_code, say
 
@@ -39,9 +39,8 @@ def run(backend: type[CanDriveBackend], command: str, argv: Sequence[str] | None
 def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Namespace) -> int:
     """Until a stop signal."""
     overrides = [Override("backend", backend.name, f"snakesim {command}"), *map(parse_set, arguments.set)]
-    config = load(arguments.scenario, overrides).config
-    table = Table(config.backends.get(backend.name, {}), arguments.scenario)
-    settings = decode(table, backend.Settings, f"backends.{backend.name}")
+    loaded = load(arguments.scenario, overrides)
+    config, settings = loaded.config, backend_settings(loaded.config, backend, loaded.table)
     settings = msgspec.structs.replace(settings, channels=arguments.channel or settings.channels or ["vcan0"])
     if arguments.load:
         load_ = backend.load(config.rate_hz, settings, config.robot.joint_table)

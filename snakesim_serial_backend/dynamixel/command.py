@@ -13,11 +13,11 @@ import msgspec
 from snakesim_hal.drivers.drive_backend import Clock
 from snakesim_hal.drivers.twin_body import serve_until_stopped
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.plugin_check import backend_settings
 from snakesim_hal.process import die_with_parent
 from snakesim_hal.terminal import exit_code, say
-from snakesim_serial_backend.dynamixel.backend import twin_on
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, twin_on
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
@@ -54,13 +54,11 @@ def parser() -> argparse.ArgumentParser:
 def serve(arguments: argparse.Namespace) -> int:
     """Until a stop signal."""
     overrides = [Override("backend", NAME, "snakesim dynamixels"), *map(parse_set, arguments.set)]
-    config = load(arguments.scenario, overrides).config
-    settings: DynamixelSettings = decode(
-        Table(config.backends.get(NAME, {}), arguments.scenario), DynamixelSettings, f"backends.{NAME}"
-    )
+    loaded = load(arguments.scenario, overrides)
+    config = msgspec.structs.replace(loaded.config, pace="realtime")
     links: list[Path] = arguments.link or [Path("servos")]
+    settings: DynamixelSettings = backend_settings(config, DynamixelBackend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
-    config = msgspec.structs.replace(config, pace="realtime")
     with named(links) as ptys:
         twin = twin_on(config, settings, ptys, Clock(config), arguments.pose)
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
