@@ -6,15 +6,18 @@ from collections.abc import Callable, Sequence
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.drivers.drive_settings import DriveSettings
 from snakesim_hal.drivers.twin_body import DriveTwin, TwinBody
 
 
 class CanTwin(DriveTwin):
     """All drives of a family on CAN."""
 
-    def __init__(self, body: TwinBody, wires: Sequence[Wire], watchdog_s: float, clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, settings: DriveSettings, body: TwinBody, wires: Sequence[Wire], clock_ns: Callable[[], int]
+    ) -> None:
         """wires: of every joint; clock_ns: the time, since anything."""
-        self.wires, self.watchdog_us = list(wires), watchdog_s * 1e6
+        self.wires, self.watchdog_us = list(wires), settings.watchdog_s * 1e6
         nodes = (joint.id for joint in body.joints)
         self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, nodes, strict=True))}
         super().__init__(body, wires, clock_ns)

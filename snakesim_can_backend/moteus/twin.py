@@ -5,11 +5,10 @@ feed-forward beside gains, position limits, the time that a start takes, arbitra
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.family.twin import CanTwin
 from snakesim_can_backend.moteus.controllers import TURN, configured
 from snakesim_can_backend.moteus.protocol import (
@@ -60,15 +59,8 @@ class Controller:
 class MoteusTwin(CanTwin):
     """All controllers of a family."""
 
-    def __init__(
-        self,
-        everybody: Sequence[Joint],
-        settings: Any,
-        body: TwinBody,
-        wires: Sequence[Wire],
-        clock_ns: Callable[[], int],
-    ) -> None:
-        super().__init__(body, wires, settings.watchdog_s, clock_ns)
+    def __init__(self, everybody: Sequence[Joint], settings: Any, body: TwinBody, *ends: Any) -> None:
+        super().__init__(settings, body, *ends)
         self.controllers = [Controller(joint.id) for joint in body.joints]
         self._kp, self._kd = configured(everybody, settings)
 

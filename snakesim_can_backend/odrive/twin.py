@@ -4,15 +4,13 @@ They do *not* simulate calibration, encoders that slip, the velocity integrator,
 """
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.family.twin import CanTwin
 from snakesim_can_backend.odrive.axes import TURN, TWIN_CONSTANT
 from snakesim_can_backend.odrive.protocol import PAYLOADS, Control, Error, Message, State, parted, write
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.drivers.drive_settings import DriveSettings
 from snakesim_hal.drivers.twin_body import TwinBody
 from snakesim_hal.wire.messages import Mode
 
@@ -44,15 +42,8 @@ class Axis:
 class OdriveTwin(CanTwin):
     """All axes of a family."""
 
-    def __init__(
-        self,
-        _everybody: object,
-        settings: DriveSettings,
-        body: TwinBody,
-        wires: Sequence[Wire],
-        clock_ns: Callable[[], int],
-    ) -> None:
-        super().__init__(body, wires, settings.watchdog_s, clock_ns)
+    def __init__(self, _everybody: object, settings: Any, body: TwinBody, *ends: Any) -> None:
+        super().__init__(settings, body, *ends)
         constants = [joint.motor.torque_constant_nm_per_a or TWIN_CONSTANT for joint in body.joints]
         self.axes = [Axis(joint.id, constant) for joint, constant in zip(body.joints, constants, strict=True)]
         self._heartbeat_us = -math.inf
