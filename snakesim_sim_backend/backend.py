@@ -24,7 +24,7 @@ from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.start import place_robot
 from snakesim_sim_backend.tether import Rope
-from snakesim_sim_backend.truth import TrueContact, TrueState
+from snakesim_sim_backend.truth import TrueState
 
 NAME = "sim"
 CLOSED = "the simulation is closed; open a new backend"
@@ -176,12 +176,8 @@ class SimBackend:
 
     def true_state(self) -> TrueState:
         """The state as it is, without noise, rate or delay."""
-        data, sim = self._data, self._sim
+        data = self._data
         angles_rad, velocities_rad_s = of_joints(data, self._motors.count)
-        contacts = [
-            TrueContact(t.body - sim.first_link_body, t.obstacle, *map(np.array, (t.position_w, t.normal_w, t.force_w)))
-            for t in TouchReader(sim, data, self._physics).read()
-        ]
         return TrueState(
             time_s=data.time,
             base_position_w=data.qpos[:3].copy(),
@@ -190,5 +186,5 @@ class SimBackend:
             angles_rad=angles_rad.copy(),
             velocities_rad_s=velocities_rad_s.copy(),
             torques_nm=self._motors.applied_nm().copy(),
-            contacts=contacts,
+            contacts=list(TouchReader(self._sim, data, self._physics).read()),
         )

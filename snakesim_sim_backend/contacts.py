@@ -20,7 +20,7 @@ NO_FORCE = (0.0, 0.0, 0.0)
 class Touch(NamedTuple):
     """One contact of a link with an obstacle over the last physics step; world frame."""
 
-    body: int  # MuJoCo's number
+    link: int  # 0 at the tail
     obstacle: str
     position_w: Vector
     normal_w: Vector  # from the obstacle into the body
@@ -34,7 +34,7 @@ class TouchReader:
         self._contact, self._made = data.contact, physics.contacts
         self._obstacles = sim.obstacle_of_geom
         self._struck = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
-        self._bodies: list[int] = sim.model.geom_bodyid.tolist()
+        self._links: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
 
     def read(self) -> Iterator[Touch]:
         """All contacts, in MuJoCo's order."""
@@ -50,7 +50,7 @@ class TouchReader:
             x, y, z = (sign * along for along in frames[i][:3])  # MuJoCo's is from the first geom to the second
             push_n, (fx, fy, fz) = made.push_n[i], made.rub_w.get(i, NO_FORCE)
             force_w = (fx + push_n * x, fy + push_n * y, fz + push_n * z)
-            yield Touch(self._bodies[link], self._obstacles[obstacle] or "", tuple(places[i]), (x, y, z), force_w)
+            yield Touch(self._links[link], self._obstacles[obstacle] or "", tuple(places[i]), (x, y, z), force_w)
 
     def sizes_n(self) -> dict[object, float]:
         """Size of the force between each link and each obstacle that it touches; for every physics step, so quick."""

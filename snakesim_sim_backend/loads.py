@@ -18,8 +18,8 @@ class LoadReader:
 
     def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
         self._touches = TouchReader(sim, data, physics)
-        self._first_body = sim.first_link_body
-        self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
+        first = sim.first_link_body
+        self._origins, self._rotations = data.xpos[first:], data.xmat[first:]  # of links and what follows
 
     def read(self) -> list[LinkLoad]:
         """Loads of the links in contact, tail to head; a contact without force is ignored."""
@@ -28,20 +28,20 @@ class LoadReader:
             (fx, fy, fz), (x, y, z) = touch.force_w, touch.position_w
             weight = math.sqrt(fx * fx + fy * fy + fz * fz)
             if weight > 0.0:
-                w, wx, wy, wz, sx, sy, sz = sums.get(touch.body, (0.0,) * 7)
-                sums[touch.body] = (
+                w, wx, wy, wz, sx, sy, sz = sums.get(touch.link, (0.0,) * 7)
+                sums[touch.link] = (
                     *(w + weight, wx + weight * x, wy + weight * y, wz + weight * z),
                     *(sx + fx, sy + fy, sz + fz),
                 )
-        return [self._load(body, sums[body]) for body in sorted(sums)]
+        return [self._load(link, sums[link]) for link in sorted(sums)]
 
-    def _load(self, body: int, sums: Sums) -> LinkLoad:
+    def _load(self, link: int, sums: Sums) -> LinkLoad:
         weight, x, y, z, *force_w = sums
-        rotation = self._rotations[body].tolist()  # world_from_link, row by row
-        ox, oy, oz = self._origins[body].tolist()
+        rotation = self._rotations[link].tolist()  # world_from_link, row by row
+        ox, oy, oz = self._origins[link].tolist()
         fx, fy, fz = force_w
         return LinkLoad(
-            link=body - self._first_body,
+            link=link,
             position_l=into(rotation, (x / weight - ox, y / weight - oy, z / weight - oz)),
             force_l=into(rotation, (fx, fy, fz)),
         )

@@ -3,17 +3,7 @@
 from dataclasses import dataclass
 
 from snakesim_hal.arrays import Floats
-
-
-@dataclass(frozen=True)
-class TrueContact:
-    """One contact of a link with an obstacle over the last physics step; world frame."""
-
-    link: int
-    obstacle: str
-    position_w: Floats  # (3,), m
-    normal_w: Floats  # (3,), from the obstacle into the body
-    force_w: Floats  # (3,), N, on the body
+from snakesim_sim_backend.contacts import Touch
 
 
 @dataclass(frozen=True)
@@ -27,4 +17,4 @@ class TrueState:
     angles_rad: Floats  # (n_joints,), tail to head
     velocities_rad_s: Floats  # (n_joints,)
     torques_nm: Floats  # (n_joints,), of the motors over the last physics step
-    contacts: list[TrueContact]
+    contacts: list[Touch]

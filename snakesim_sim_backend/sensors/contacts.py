@@ -26,8 +26,8 @@ class ContactReader:
         self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
     ) -> None:
         self._touches = TouchReader(sim, data, physics)
-        self._first_body = sim.first_link_body
-        self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
+        first = sim.first_link_body
+        self._origins, self._rotations = data.xpos[first:], data.xmat[first:]  # of links and what follows
         self._threshold_n = sensor.threshold_n
         self._sigma_m, self._sigma_n = sensor.position_noise_m, sensor.force_noise_n
         self._noise = noise if self._sigma_m or self._sigma_n else None
@@ -48,8 +48,8 @@ class ContactReader:
         self._felt.add(self._touches.sizes_n())
 
     def _in_link(self, touch: Touch) -> Contact:
-        rotation = self._rotations[touch.body].tolist()  # world_from_link, row by row
-        ox, oy, oz = self._origins[touch.body].tolist()
+        rotation = self._rotations[touch.link].tolist()  # world_from_link, row by row
+        ox, oy, oz = self._origins[touch.link].tolist()
         x, y, z = touch.position_w
         px, py, pz = into(rotation, (x - ox, y - oy, z - oz))
         fx, fy, fz = into(rotation, touch.force_w)
@@ -60,7 +60,7 @@ class ContactReader:
             px, py, pz, fx, fy, fz = px + m * a, py + m * b, pz + m * c, fx + n * d, fy + n * e, fz + n * f
         tangent_1, tangent_2 = tangents(normal)
         return Contact(
-            link=touch.body - self._first_body,
+            link=touch.link,
             obstacle=touch.obstacle,
             position_l=(px, py, pz),
             normal_l=normal,

@@ -160,7 +160,7 @@ def test_sliding_along_an_obstacle_rubs_with_the_obstacle_s_friction(obstacle):
         if not contacts:
             continue
         force = np.sum([c.force_w for c in contacts], axis=0)
-        normal = contacts[0].normal_w
+        normal = np.array(contacts[0].normal_w)
         push = force @ normal
         ratios.append(np.linalg.norm(force - push * normal) / push)
         assert force[0] <= 1e-6
