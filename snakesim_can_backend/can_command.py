@@ -26,7 +26,7 @@ from snakesim_can_backend.bus.strangers import Stranger, strangers
 from snakesim_can_backend.driver.bring_up import Bus, Identity, find
 from snakesim_can_backend.driver.modules import answer_limit_s
 from snakesim_can_backend.driver.offline import Replay, against_record, messages
-from snakesim_can_backend.driver.reports import Module, Reading
+from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
@@ -191,46 +191,30 @@ def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
 
 
 def _row(identity: Identity, reading: Reading) -> dict[str, str]:
-    node = identity.node
-    known = FIRST_NODE <= node <= LAST_NODE
-    emulated = "stepped" if identity.stepped else "yes" if identity.emulated else "no"
-    return {
+    row = dict.fromkeys(COLUMNS, UNKNOWN) | {
         "channel": identity.channel,
-        "node": str(node),
+        "node": str(identity.node),
         "serial": f"{identity.serial:08X}",
         "firmware": identity.firmware,
         "protocol": str(identity.protocol),
-        "emulated": emulated,
-        **(_heart(reading.modules[node - 1]) if known else dict.fromkeys(("state", "faults", "uptime"), UNKNOWN)),
-        **_inside(reading.health()[node - 1] if known else None),
-        "shaft": _shaft(reading.shaft_raw[node - 1] if known else None),
+        "emulated": "stepped" if identity.stepped else "yes" if identity.emulated else "no",
     }
-
-
-def _heart(module: Module) -> dict[str, str]:
-    if module.uptime_ms < 0:  # no heartbeat
-        return {"state": UNKNOWN, "faults": UNKNOWN, "uptime": UNKNOWN}
-    return {
-        "state": module.state.name.lower(),
-        "faults": "+".join(module.fault_names()) or "none",
-        "uptime": f"{module.uptime_ms / 1000:.1f} s",
-    }
-
-
-def _inside(raw: Sequence[int] | None) -> dict[str, str]:
-    if raw is None:
-        return {"voltage": UNKNOWN, "motor": UNKNOWN, "board": UNKNOWN}
-    signals = codec()[Opcode.HEALTH].signals
-    return {
-        "voltage": f"{signals['voltage'].value(raw[0]):.1f} V",
-        "motor": f"{signals['motor_temperature'].value(raw[2]):.0f} °C",
-        "board": f"{signals['board_temperature'].value(raw[3]):.0f} °C",
-    }
-
-
-def _shaft(raw: int | None) -> str:
-    """Known only while a host sends Syncs, and modules report their IMUs."""
-    return UNKNOWN if raw is None else f"{codec()[Opcode.SHAFT_LOAD].signals['torque'].value(raw):.3f} N·m"
+    if not FIRST_NODE <= identity.node <= LAST_NODE:
+        return row
+    i = identity.node - 1
+    module, health, shaft = reading.modules[i], reading.health()[i], reading.shaft_raw[i]
+    if module.uptime_ms >= 0:  # it has sent a heartbeat
+        row["state"] = module.state.name.lower()
+        row["faults"] = "+".join(module.fault_names()) or "none"
+        row["uptime"] = f"{module.uptime_ms / 1000:.1f} s"
+    if health is not None:
+        signals = codec()[Opcode.HEALTH].signals
+        row["voltage"] = f"{signals['voltage'].value(health[0]):.1f} V"
+        row["motor"] = f"{signals['motor_temperature'].value(health[2]):.0f} °C"
+        row["board"] = f"{signals['board_temperature'].value(health[3]):.0f} °C"
+    if shaft is not None:  # only while a host sends Syncs, and modules report their IMUs
+        row["shaft"] = f"{codec()[Opcode.SHAFT_LOAD].signals['torque'].value(shaft):.3f} N·m"
+    return row
 
 
 # --- replay ------------------------------------------------------------------------------------------------

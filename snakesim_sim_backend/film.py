@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]  # (height, width, 3)
 
 AZIMUTH_DEG, ELEVATION_DEG = 60.0, -58.0
 MARKS = 400  # arrows and the like in a picture
-BLUE = (0.0, 0.4, 0.75, 1.0)
+BLUE, ARROW_M = (0.0, 0.4, 0.75, 1.0), 0.012  # of arrows: colour and width
 BACKGROUND = (236, 240, 244)  # beyond the scene
 LINK, NEXT_LINK, HEAD = (0.20, 0.36, 0.54, 1.0), (0.30, 0.48, 0.68, 1.0), (0.09, 0.18, 0.33, 1.0)
 OBSTACLE, FLOOR, GRID = (0.80, 0.67, 0.47, 1.0), (0.90, 0.91, 0.93, 1.0), (0.62, 0.66, 0.72, 1.0)
@@ -78,7 +78,7 @@ class Film:
         if self._flat:
             self._add_grid(look_at_w)
         for start_w, end_w in arrows_w:
-            self._add_arrow(start_w, end_w)
+            self._add(mujoco.mjtGeom.mjGEOM_ARROW, ARROW_M, start_w, end_w, BLUE)
         mujoco.mjr_render(self._frame, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._depth, self._frame, self._context)
         picture = self._rgb.copy()
@@ -113,9 +113,6 @@ class Film:
                 start[along] -= reach_m
                 end[along] += reach_m
                 self._add(mujoco.mjtGeom.mjGEOM_CAPSULE, LINE_M, start, end, GRID)
-
-    def _add_arrow(self, start_w: Floats, end_w: Floats) -> None:
-        self._add(mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start_w, end_w, BLUE)
 
     def _add(self, kind: mujoco.mjtGeom, width_m: float, start_w: Floats, end_w: Floats, rgba: Sequence[float]) -> None:
         if self._scene.ngeom >= self._scene.maxgeom:

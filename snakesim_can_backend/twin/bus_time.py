@@ -55,7 +55,7 @@ class BusTime:
         self._proceed(now_us)
         took = self.frame_us[len(frame.data)]
         self._free_us = min(max(self._free_us, now_us) + took, now_us + MAX_AHEAD_US)
-        self._count(frame, took)
+        self.count(frame)
 
     def offer(self, sender: int, frame: Frame, now_us: float) -> None:
         """A module has a frame to send."""
@@ -89,8 +89,10 @@ class BusTime:
         return max(self._free_us, since) + self.frame_us[len(frame.data)]
 
     def count(self, frame: Frame) -> None:
-        """Add the bus time of a frame that is not delivered."""
-        self._count(frame, self.frame_us[len(frame.data)])
+        """Add the bus time of a frame."""
+        opcode = frame.id >> NODE_BITS
+        self._frames[opcode] += 1
+        self._busy_us[opcode] += self.frame_us[len(frame.data)]
 
     def babble(self, sender: int, frame: Frame | None, now_us: float) -> None:
         """From now on a module repeats a frame, as often as the bus allows; None ends that."""
@@ -136,12 +138,7 @@ class BusTime:
         self._free_us = start_us + took
         self._under_way = (frame, self._free_us)
         self._late_us = max(self._late_us, start_us - since_us)
-        self._count(frame, took)
-
-    def _count(self, frame: Frame, took_us: float) -> None:
-        opcode = frame.id >> NODE_BITS
-        self._frames[opcode] += 1
-        self._busy_us[opcode] += took_us
+        self.count(frame)
 
 
 def by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:

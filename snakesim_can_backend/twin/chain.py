@@ -74,12 +74,12 @@ class ModuleChain:
         self._step_us, self._steps, self._due_us = plant.step_s * 1e6, 0, 0.0
         self._sync_time: int | None = None
         self._pose_time: int | None = None
-        self._seed = config.seed
         starts = [0, *accumulate(self.counts)]
         self.slots: list[ModuleSlot] = []
         for channel, count in enumerate(self.counts):
             for joint in range(starts[channel], starts[channel] + count):
-                self._seat(joint, channel, self._serial(joint), -BOOT_US if stepped else 0.0)
+                serial = crc32(f"{config.seed}:{joint + 1}".encode())
+                self._seat(joint, channel, serial, -BOOT_US if stepped else 0.0)
         self._senses = [
             ModuleSensors(robot, plant, Mounting(self._joints[start : start + count]), start, (config.seed, channel))
             for channel, (start, count) in enumerate(zip(starts, self.counts, strict=False))
@@ -308,6 +308,3 @@ class ModuleChain:
         self.slots.append(
             ModuleSlot(len(self.slots), channel, number, module, joint, drives=drives and number not in self._loose)
         )
-
-    def _serial(self, joint: int) -> int:
-        return crc32(f"{self._seed}:{joint + 1}".encode())

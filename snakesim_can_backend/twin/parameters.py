@@ -54,7 +54,7 @@ class Parameters:
     def answer(self, node: int, data: bytes, armed: bool) -> Frame:
         """Carry out a ParameterRequest; returns the ParameterAnswer."""
         index, operation, raw = _read_request(data)
-        parameter = _known(index)
+        parameter = Parameter(index) if index in PARAMETERS else None
         result = Result.UNKNOWN_INDEX if parameter is None else self._do(parameter, operation, raw, armed)
         value = 0.0 if parameter is None else self.values[parameter]
         return _write_answer(node, (index, operation, result, int.from_bytes(_single.pack(value), "little")))
@@ -87,13 +87,6 @@ def within(allowed: ParameterRange, value: float) -> float | None:
     if not allowed.low - slack <= value <= allowed.high + slack:
         return None
     return min(max(value, allowed.low), allowed.high)
-
-
-def _known(index: int) -> Parameter | None:
-    try:
-        return Parameter(index)
-    except ValueError:
-        return None
 
 
 _read_request = codec()[Opcode.PARAMETER_REQUEST].reader("index", "operation", "value")

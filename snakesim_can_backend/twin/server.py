@@ -38,7 +38,8 @@ class TwinServer:
         arrived = [wire.receive() for wire in self.wires]
         if self.chain.stepped:
             for channel, frames in enumerate(arrived):
-                self._receive(channel, frames)
+                for frame in frames:
+                    self.chain.receive(channel, frame)
             self._send()
             return None
         if self._start_ns is None:
@@ -50,10 +51,6 @@ class TwinServer:
         now_us = self.chain.now_us
         wait_us = min(self.chain.next_us() - now_us, IN_STEP_US)
         return max(wait_us, FINEST_US) * 1e-6
-
-    def _receive(self, channel: int, frames: Sequence[Frame]) -> None:
-        for frame in frames:
-            self.chain.receive(channel, frame)
 
     def _receive_in_time(self, arrived: Sequence[Sequence[Frame]], clock_us: float) -> None:
         """Handle frames at their estimated times of arrival.

@@ -2,7 +2,6 @@
 
 from collections import Counter, deque
 from concurrent.futures import Future
-from typing import Protocol
 
 import msgspec
 import mujoco
@@ -22,14 +21,6 @@ from snakesim_sim_backend.sensors.registry import SYNCHRONOUS, mounted_reader, o
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
 from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, ticks_of
-
-
-class Channel(Protocol):
-    """One sensor with its rate and delay."""
-
-    def arriving(self, tick: int, stamp_ns: int) -> Message | None:
-        """Take a sample if due, and return the one that arrives at this tick."""
-        ...
 
 
 class Sensors:
@@ -54,13 +45,15 @@ class Sensors:
         self._joints = JointReader(data, has.joints, motors, scope.noise.standard_normal, config.period_ns)
         self.late: Counter[str] = Counter()  # samples that were dropped because they were not ready in time, by key
         self._reported: Counter[str] = Counter()  # how many of them have been reported
-        self._others: list[tuple[str, Channel]] = []
+        self._others: list[tuple[str, SynchronousSensor | ThreadedSensor]] = []
         self._snapshots = Snapshots(sim.model) if next(has.mounted(), None) else None
         for key, sensor in has.published():
             if isinstance(sensor, Mounted):
                 channel = self._threaded(key, sensor, scope)
             else:
-                channel = SynchronousSensor(SYNCHRONOUS[_message(key)](sensor, scope), sensor, config)
+                message = keys.message_at(key)
+                assert message is not None, key
+                channel = SynchronousSensor(SYNCHRONOUS[message](sensor, scope), sensor, config)
             self._others.append((key, channel))
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
@@ -103,7 +96,7 @@ class SynchronousSensor:
         self._line = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
 
     def arriving(self, tick: int, stamp_ns: int) -> Message | None:
-        """As a Channel does."""
+        """Take a sample if due, and return the one that arrives at this tick."""
         taken = self._read(tick, stamp_ns) if self._due.at(stamp_ns) else None
         return self._line.pass_on(tick, taken)
 
@@ -127,7 +120,7 @@ class ThreadedSensor:
         self._under_way: deque[tuple[int, Future[Message]]] = deque()  # with the tick of arrival
 
     def arriving(self, tick: int, stamp_ns: int) -> Message | None:
-        """As a Channel does."""
+        """Take a sample if due, and return the one that arrives at this tick."""
         if self._due.at(stamp_ns):
             sample = self._snapshots.begin(self._read, tick, stamp_ns, self._qpos)
             self._under_way.append((tick + self._delay_ticks, sample))
@@ -139,9 +132,3 @@ class ThreadedSensor:
         sample.cancel()
         self._late[self._key] += 1
         return None
-
-
-def _message(key: str) -> type[Message]:
-    message = keys.message_at(key)
-    assert message is not None, key
-    return message

@@ -10,7 +10,7 @@ from tests.unit.sim_backend.rig import Run, make_config, open_sim
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
 def test_masses_lengths_limits_and_motors_are_those_of_the_robot_file(name):
-    config = make_config(base_robot=name)
+    config = make_config({"motor": {"friction_nm": 0.12, "viscous_nm_s_per_rad": 0.03}}, base_robot=name)
     robot, model = config.robot, open_sim(config).sim.model
     links = [model.body(f"link_{i}") for i in range(robot.chain.modules + 1)]
     assert sum(float(link.mass[0]) for link in links) == pytest.approx(robot.chain.modules * robot.module.mass_kg)
@@ -26,17 +26,12 @@ def test_masses_lengths_limits_and_motors_are_those_of_the_robot_file(name):
         assert joint.range == pytest.approx([-robot.limits.angle_rad, robot.limits.angle_rad])
         assert model.dof_armature[joint.dofadr[0]] == robot.motor.armature_kg_m2
         assert model.body_pos[joint.bodyid[0]] == pytest.approx([robot.link_lengths_m[i], 0, 0])
+    assert model.dof_frictionloss[6:] == pytest.approx(0.12)
+    assert model.dof_damping[6:] == pytest.approx(0.03)
     assert model.actuator_forcerange[:, 1] == pytest.approx(robot.limits.torque_nm)
     assert [model.actuator(i).name for i in range(robot.chain.modules)] == [
         f"motor_joint_{i + 1}" for i in range(robot.chain.modules)
     ]
-
-
-def test_joint_friction_and_viscosity_are_those_of_the_robot_file():
-    config = make_config({"motor": {"friction_nm": 0.12, "viscous_nm_s_per_rad": 0.03}})
-    model = open_sim(config).sim.model
-    assert model.dof_frictionloss[6:] == pytest.approx(0.12)
-    assert model.dof_damping[6:] == pytest.approx(0.03)
 
 
 def test_inertia_of_a_link_is_that_of_a_capsule_of_its_mass():

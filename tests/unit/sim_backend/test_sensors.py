@@ -113,13 +113,6 @@ def test_pose_velocities_are_the_change_of_the_pose_in_the_world():
     assert after.angular_velocity_w[2] == pytest.approx((turned[1, 0] - turned[0, 1]) / 2 / 1e-3, rel=1e-3)
 
 
-def test_the_angular_velocity_of_the_pose_is_in_the_world_frame():
-    run = Run(make_config({"chain": {"modules": 1}}, start={"yaw_rad": 1.0}))
-    run.sim.data.qvel[3:6] = [1.0, 0.0, 0.0]  # rolls about its own axis
-    pose = run.sensed(Pose)
-    assert pose.angular_velocity_w == pytest.approx([np.cos(1.0), np.sin(1.0), 0.0], abs=1e-5)
-
-
 def test_noise_has_the_deviations_of_the_robot_file():
     sensors = {
         "joints": {"angle_noise_rad": 0.01, "velocity_noise_rad_s": 0.2, "torque_noise_nm": 0.5},
