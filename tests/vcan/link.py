@@ -3,16 +3,17 @@
 import shutil
 import struct
 import subprocess
+from functools import partial
 
 FRAME = struct.Struct("=IB3x8s")  # can_id, length, data: linux/can.h
 
 
-def ip(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return _run("ip", arguments)
+def _run(tool: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [shutil.which(tool) or f"/usr/sbin/{tool}", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
-def tc(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return _run("tc", arguments)
+ip, tc = partial(_run, "ip"), partial(_run, "tc")
 
 
 def must(done: subprocess.CompletedProcess[str]) -> None:
@@ -21,8 +22,3 @@ def must(done: subprocess.CompletedProcess[str]) -> None:
 
 def frame(can_id: int, data: bytes = b"") -> bytes:
     return FRAME.pack(can_id, len(data), data)
-
-
-def _run(tool: str, arguments: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
-    command = [shutil.which(tool) or f"/usr/sbin/{tool}", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -21,7 +21,7 @@ from snakesim_can_backend.twin.server import TwinServer
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.physics.plant import Plant
-from tests.unit.can_backend.loop import Loop, config
+from tests.unit.can_backend.loop import Loop, armed, config
 
 ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before
 
@@ -89,7 +89,7 @@ class SharedBus(Loop):
 
 @contextmanager
 def shared_bus(channel: str) -> Iterator[SharedBus]:
-    """Open, and close at the end."""
+    """Open, all joints armed and swinging, and close at the end."""
     run = config(pace="realtime")
     settings = CanSettings(channels=[channel], plant="inertia")
     modules_end = SocketCanWire(channel, FROM_HOST)
@@ -104,7 +104,7 @@ def shared_bus(channel: str) -> Iterator[SharedBus]:
         try:
             backend = CanBackend(run, settings)
             try:
-                yield SharedBus(backend, run)
+                yield armed(SharedBus(backend, run))
             finally:
                 backend.close()
         finally:

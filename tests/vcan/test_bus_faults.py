@@ -8,9 +8,8 @@ import socket
 import pytest
 
 from snakesim_can_backend.driver.module_monitor import IN_A_ROW
-from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode, frame_id, opcode_of
-from tests.unit.can_backend.loop import armed, cleared_and_armed_again
+from tests.unit.can_backend.loop import cleared_and_armed_again
 from tests.vcan.link import frame, ip, must, tc
 from tests.vcan.shared_bus import SharedBus, shared_bus
 
@@ -20,8 +19,10 @@ CAN_ERR_FLAG, CAN_EFF_FLAG, CAN_RTR_FLAG = 0x20000000, 0x80000000, 0x40000000
 ACK, BUSOFF = 0x20, 0x40  # classes of linux/can/error.h
 
 
-def moved_again(run: SharedBus) -> bool:
-    return max(run.true_speed_rad_s[-10:]) > 0.1
+def moves_again(run: SharedBus) -> None:
+    """Once a person has cleared the fault and armed."""
+    cleared_and_armed_again(run)
+    assert max(run.true_speed_rad_s[-10:]) > 0.1
 
 
 def set_points_out(run: SharedBus) -> int:
@@ -33,7 +34,6 @@ def set_points_out(run: SharedBus) -> int:
 
 def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_channel: str) -> None:
     with shared_bus(spare_channel) as run:
-        armed(run)
         must(ip("link", "set", spare_channel, "down"))
         start = run.tick
         run.run(WATCHDOG_MS // PERIOD_MS + 3, run.waving)
@@ -50,13 +50,11 @@ def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_chann
         assert run.states() == [ModuleState.FAULT] * 4 and run.watch_seen("interface_up") == 1
         reported = {f.what for f in run.faults[1:]}
         assert reported and reported <= {"module_watchdog", "module_fault"}, "now they can tell"
-        cleared_and_armed_again(run)
-        assert moved_again(run)
+        moves_again(run)
 
 
 def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_channel: str) -> None:
     with shared_bus(spare_channel) as run:
-        armed(run)
         must(ip("link", "delete", spare_channel))
         run.run(20, run.waving)
         (fault,) = run.faults
@@ -66,8 +64,7 @@ def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_
         run.wire.server.wires[0].errors()  # the modules were never unplugged; only on this bus do they need this
         run.run(10)
         assert run.watch_seen("interface_up") == 1
-        cleared_and_armed_again(run)
-        assert moved_again(run)
+        moves_again(run)
 
 
 # --- a transmit queue that stays full ------------------------------------------------------------------------
@@ -94,7 +91,6 @@ def unclog(channel: str) -> None:
 
 def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_sent_late(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
-        armed(run)
         clog(slow_channel)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
         (fault,) = run.faults
@@ -106,13 +102,11 @@ def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_s
         before = set_points_out(run)
         run.run(5)
         assert set_points_out(run) == before, "no set-point of before goes out"
-        cleared_and_armed_again(run)
-        assert moved_again(run)
+        moves_again(run)
 
 
 def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_goes_on(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
-        armed(run)
         clog(slow_channel)
         run.run(IN_A_ROW - 1, run.waving)
         unclog(slow_channel)
@@ -126,7 +120,6 @@ def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_g
 def test_a_long_queue_that_fills_this_sockets_share_of_it_is_a_full_queue_too(slow_channel: str) -> None:
     must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
     with shared_bus(slow_channel) as run:
-        armed(run)
         run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the kernel makes it its minimum
         clog(slow_channel, frames=1000)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
@@ -143,7 +136,6 @@ def error_frame(kind: int) -> bytes:
 def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_socket: socket.socket) -> None:
     """All kinds are told apart in tests/unit/can_backend/bus/test_wire.py."""
     with shared_bus(channel) as run:
-        armed(run)
         raw_socket.send(error_frame(ACK))
         run.run(5, run.waving)
         assert run.watch_seen("not_acknowledged") == 1 and not run.faults
@@ -156,7 +148,7 @@ def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_
         run.run(30, run.waving)
         assert run.lifecycle == "fault" and set_points_out(run) == out, "not one set-point more"
         assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest() and len(run.faults) == 1
-        cleared_and_armed_again(run)
+        moves_again(run)
 
 
 # --- a reader that is too slow -------------------------------------------------------------------------------
@@ -164,7 +156,6 @@ def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_
 
 def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: socket.socket) -> None:
     with shared_bus(channel) as run:
-        armed(run)
         ours = run.wire._socket
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel makes it its minimum
         for _ in range(50):
@@ -176,40 +167,26 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
         dropped = int(fault.cause.partition("dropped ")[2].partition(" ")[0])
         kept = run.backend.modules.reading.malformed
         assert dropped > 0 and dropped + kept == 50
-        cleared_and_armed_again(run)
+        moves_again(run)
 
 
-# --- who else is there: quickly in tests/unit/can_backend/driver/test_watch_bus.py ----------------------------
-
-
-@pytest.mark.slow
-def test_a_second_host_is_named(channel: str, raw_socket: socket.socket) -> None:
-    with shared_bus(channel) as run:
-        armed(run)
-        foreign = commands.sync(run.backend.modules.reading.sync + 7, 0)
-        raw_socket.send(frame(*foreign))
-        run.run(3, run.waving)
-        assert [fault.what for fault in run.faults] == ["second_host"]
-        run.run(20)
-        assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest()
+# --- what others say -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket: socket.socket) -> None:
     with shared_bus(channel) as run:
-        armed(run)
         raw_socket.send(frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"))
         run.run(1, run.waving)
         assert run.true_states() == [ModuleState.EMERGENCY] * 4, "one frame"
         run.run(20)
         assert run.faults[0].what == "emergency" and run.lifecycle == "fault" and run.at_rest()
         assert run.true_states() == [ModuleState.EMERGENCY] * 4
-        cleared_and_armed_again(run)
+        moves_again(run)
 
 
 def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket: socket.socket) -> None:
     with shared_bus(channel) as run:
-        armed(run)
         for number in (frame_id(Opcode.HEARTBEAT, 40), frame_id(Opcode.SYNC, 0), frame_id(Opcode.JOINT_STATE, 1)):
             for _ in range(5):
                 raw_socket.send(frame(CAN_EFF_FLAG | number, bytes(8)))

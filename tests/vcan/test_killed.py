@@ -5,14 +5,13 @@ of every frame. `pytest -rP tests/vcan/test_killed.py` prints a row for each.
 """
 
 import os
-import signal
 import socket
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,14 +22,12 @@ from snakesim_can_backend.can_command import COLUMNS
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Action, Frame, LastStop, ModuleState, Opcode, node_of, opcode_of
 from snakesim_hal.model.scenario import Override, RunConfig, load, write
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
-from tests.e2e.command import environment, snakesim
+from tests.e2e.command import Ended, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import write_files
 from tests.vcan.link import FRAME
+from tests.whole.command import snakesim
 
 # Several processes in real time are more than a busy emulated machine is sure to keep up with: ARGS="-m slow".
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -130,40 +127,32 @@ class Bench:
     listener: Listener
     running: ExitStack
 
-    def start(self, name: str, *module_and_arguments: str) -> subprocess.Popen[str]:
+    def start(self, name: str, *module_and_arguments: str) -> subprocess.Popen[bytes]:
         log = self.running.enter_context((self.folder / f"{name}.log").open("a"))
         process = subprocess.Popen(
             [sys.executable, "-m", *module_and_arguments, "--parent", str(os.getpid())],
             env=environment(self.folder),
             stdout=log,
             stderr=subprocess.STDOUT,
-            text=True,
         )
-        self.running.callback(_end, process)
+        self.running.enter_context(process)
+        self.running.callback(process.kill)
         return process
 
-    def modules(self) -> subprocess.Popen[str]:
-        started = self.start("modules", "snakesim_can_backend.twin.command", self._saved, "--pose", "none")
+    def modules(self) -> None:
+        self.start("modules", "snakesim_can_backend.twin.command", self._saved, "--pose", "none")
         self.until(lambda: "modules ready" in self.said("modules"), "modules ready")
-        return started
 
-    def host(self) -> subprocess.Popen[str]:
-        return self.start("host", "snakesim_hal.host_process", *self.host_arguments)
-
-    def control(self) -> subprocess.Popen[str]:
-        return self.start("control", "snakesim_hal.serve", "control", *self._network)
+    def control(self) -> subprocess.Popen[bytes]:
+        return self.start("control", "snakesim_hal.serve", "control", self._saved, "--endpoint", self.endpoint)
 
     @property
     def host_arguments(self) -> Sequence[str]:
-        return (*self._network, "--out", str(self.folder))
+        return (self._saved, "--endpoint", self.endpoint, "--out", str(self.folder))
 
     @property
     def _saved(self) -> str:
         return str(self.folder / "config.json")
-
-    @property
-    def _network(self) -> Sequence[str]:
-        return (self._saved, "--endpoint", self.endpoint)
 
     def said(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()
@@ -175,14 +164,29 @@ class Bench:
             logs = "\n".join(f"{log.name}: {log.read_text()}" for log in self.folder.glob("*.log"))
             raise AssertionError(f"{error}\n{logs}") from None
 
-    def joined(self) -> Session:
-        link = Link(self.endpoint, self.config.robot.name)
-        return self.running.enter_context(open_session(link, connect_timeout_s=START_LIMIT_S))
+    def tell(self, *arguments: str) -> Ended:
+        """One of the operator's tools, told where the robot is."""
+        return snakesim(*arguments, "--endpoint", self.endpoint, cwd=self.folder)
 
+    def _is_armed(self) -> bool:
+        """Once what there is has been cleared."""
+        if self.tell("arm", self.config.robot.name, self.config.backend).code == 0:
+            return True
+        print(self.tell("clear").said)
+        return False
 
-def _end(process: subprocess.Popen[str]) -> None:
-    process.kill()
-    process.wait()
+    def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+        """Start modules, host and control, and wait until every module is armed. Returns the latter two processes."""
+        self.modules()
+        host = self.start("host", "snakesim_hal.host_process", *self.host_arguments)
+        self.until(lambda: len(self.listener.of(Opcode.SYNC)) > 20, "the driver's Syncs")
+        control = self.control()
+        self.until(self._is_armed, "ready to arm")
+        self.listener.forget()
+        armed = [ModuleState.ARMED] * JOINTS
+        self.until(lambda: self.listener.states() == armed, "every module armed")
+        self.until(lambda: len(self.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "set-points")
+        return host, control
 
 
 @contextmanager
@@ -190,55 +194,20 @@ def bench(folder: Path, channel: str) -> Iterator[Bench]:
     scenario = write_files(folder, scenario=SCENARIO.replace("CHANNEL", channel))
     config = load(scenario, [Override("robot.chain.modules", JOINTS, "test")]).config
     write(config, folder / "config.json")
-    with ExitStack() as running:
-        listener = Listener(channel)
-        running.callback(listener.close)
+    with ExitStack() as running, closing(Listener(channel)) as listener:
         yield Bench(folder, config, free_endpoint(), listener, running)
 
 
-class Operator:
-    """A person at the keyboard: arms and clears."""
-
-    def __init__(self, bench: Bench) -> None:
-        self._bench, self._session = bench, bench.joined()
-        self._statuses = self._session.latched_reader(keys.STATUS, Status)
-        self._descriptions = self._session.latched_reader(keys.DESCRIPTION, Description)
-        self._robot: Description | None = None
-        self._status: Status | None = None
-
-    def status(self) -> Status | None:
-        self._status = (self._statuses.drain() or [self._status])[-1]
-        return self._status
-
-    def _ready(self) -> bool:
-        status = self.status()
-        if status is not None and status.lifecycle == "fault":
-            self._session.ask(keys.LIFECYCLE, LifecycleRequest(action="clear"), timeout_s=10.0)
-            print(f"cleared: {status.why}")
-            self._status = None
-        self._robot = (self._descriptions.drain() or [self._robot])[-1]
-        return status is not None and status.ready_to_arm and self._robot is not None
-
-    def arm(self) -> None:
-        """Clear what there is, arm, and wait until every module is armed."""
-        bench = self._bench
-        bench.until(self._ready, "ready to arm")
-        robot = self._robot
-        assert robot is not None
-        request = LifecycleRequest(
-            action="arm", robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
-        )
-        bench.listener.forget()
-        self._session.ask(keys.LIFECYCLE, request, timeout_s=10.0)
-        armed = [ModuleState.ARMED] * JOINTS
-        bench.until(lambda: bench.listener.states() == armed, "every module armed")
-        bench.until(lambda: len(bench.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "set-points")
+@pytest.fixture
+def robot(tmp_path: Path, channel: str) -> Iterator[Bench]:
+    with bench(tmp_path, channel) as made:
+        yield made
 
 
-def killed(process: subprocess.Popen[str]) -> int:
+def killed(process: subprocess.Popen[bytes]) -> int:
     """SIGKILL; when, by the clock of the listener."""
     now_ns = time.time_ns()
-    os.kill(process.pid, signal.SIGKILL)
+    process.kill()
     process.wait()
     return now_ns
 
@@ -269,83 +238,69 @@ def passed_for_module_ms(heard: Sequence[Heard], node: int, from_ns: int, to_ns:
     return float(to_ms - from_ms)
 
 
-def all_armed(robot: Bench) -> tuple[subprocess.Popen[str], subprocess.Popen[str], Operator]:
-    """Modules, host and control; returns the latter two, and who armed them."""
-    robot.modules()
-    host = robot.host()
-    robot.until(lambda: len(robot.listener.of(Opcode.SYNC)) > 20, "the driver's Syncs")
-    control = robot.control()
-    operator = Operator(robot)
-    operator.arm()
-    return host, control, operator
+def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: Bench) -> None:
+    _, control = robot.arm()
+    killed_ns = killed(control)
+    passive = {ModuleState.DISARMED}
+    robot.until(lambda: len(first_in(robot.listener.listen(), passive, killed_ns)) == JOINTS, "modules stopped")
+    robot.until(lambda: "lease of control expired" in robot.tell("status").said, "the fault in the status")
+    heard = list(robot.listener.listen())
+    last_ms = (max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT) - killed_ns) / 1e6
+    stop = next(h for h in stop_commands(heard) if h.at_ns > killed_ns)
+    stop_ms = (stop.at_ns - killed_ns) / 1e6
+    rest_ms = max((h.at_ns - stop.at_ns) / 1e6 for h in first_in(heard, passive, killed_ns).values())
+    lease_ms, period_ms = robot.config.lease_ns / 1e6, robot.config.period_ns / 1e6
+    assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
+    assert rest_ms <= 100 + period_ms + LATE_MS
+    print(
+        f"| control, SIGKILL | last set-point {last_ms:.0f} ms after it, Stop {stop_ms:.0f} ms "
+        f"(lease {lease_ms:.0f} ms, {RATE_HZ:g} Hz) | all modules DISARMED {rest_ms:.0f} ms after Stop "
+        f"| kernel's clock{', emulated machine' if IN_GUEST else ''} |"
+    )
 
 
-def test_a_killed_controller_makes_the_driver_stop_the_modules(tmp_path: Path, channel: str) -> None:
-    with bench(tmp_path, channel) as robot:
-        _, control, operator = all_armed(robot)
-        killed_ns = killed(control)
-        passive = {ModuleState.DISARMED}
-        robot.until(lambda: len(first_in(robot.listener.listen(), passive, killed_ns)) == JOINTS, "modules stopped")
-        robot.until(lambda: (s := operator.status()) is not None and s.lifecycle == "fault", "status")
-        heard = list(robot.listener.listen())
-        last_ms = (max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT) - killed_ns) / 1e6
-        stop = next(h for h in stop_commands(heard) if h.at_ns > killed_ns)
-        stop_ms = (stop.at_ns - killed_ns) / 1e6
-        rest_ms = max((h.at_ns - stop.at_ns) / 1e6 for h in first_in(heard, passive, killed_ns).values())
-        lease_ms, period_ms = robot.config.lease_ns / 1e6, robot.config.period_ns / 1e6
-        assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
-        assert rest_ms <= 100 + period_ms + LATE_MS
-        assert "lease of control expired" in str(operator.status())
-        print(
-            f"| control, SIGKILL | last set-point {last_ms:.0f} ms after it, Stop {stop_ms:.0f} ms "
-            f"(lease {lease_ms:.0f} ms, {RATE_HZ:g} Hz) | all modules DISARMED {rest_ms:.0f} ms after Stop "
-            f"| kernel's clock{', emulated machine' if IN_GUEST else ''} |"
-        )
+def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, channel: str) -> None:
+    host, _ = robot.arm()
+    armed = [ModuleState.ARMED] * JOINTS
+    assert robot.listener.states() == armed, robot.said("host")
+    killed_ns = killed(host)
+    period_ms = robot.config.period_ns / 1e6
+    fault = {ModuleState.FAULT}
+    robot.until(lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS, "modules in fault")
+    beats = {node: len(uptimes_ms(robot.listener.listen(), node)) for node in NODES}
+    robot.until(
+        lambda: all(len(uptimes_ms(robot.listener.listen(), node)) > beats[node] + 1 for node in NODES),
+        "heartbeats",
+    )
+    heard = robot.listener.heard
+    stopped = first_in(heard, fault, killed_ns)
+    assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), "told at once, without a Sync"
+    assert {h.says()["last_stop"] for h in stopped.values()} == {LastStop.WATCHDOG}
+    assert all(h.says()["fault_watchdog"] and h.says()["mode"] == 0 for h in stopped.values())
+    last = {
+        node: max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and node_of(h.frame.id) == node)
+        for node in NODES
+    }
+    from_host = [h.at_ns for h in heard if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)]
+    last_ms = (max(from_host) - killed_ns) / 1e6
+    took_ms = [(stopped[node].at_ns - last[node]) / 1e6 for node in NODES]
+    own_ms = [passed_for_module_ms(heard, node, last[node], stopped[node].at_ns) for node in NODES]
+    assert last_ms < LATE_MS
+    assert max(took_ms) <= 100 + period_ms + LATE_MS
+    assert max(own_ms) <= 100 + period_ms and min(own_ms) > 100 - period_ms
+    assert robot.listener.states() == [ModuleState.FAULT] * JOINTS
+    print(
+        f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
+        f"motor off, {max(took_ms):.0f} ms after their last set-point by the kernel's clock, "
+        f"{min(own_ms):.0f} to {max(own_ms):.0f} ms by their own | watchdog 100 ms |"
+    )
 
-
-def test_a_killed_host_leaves_every_module_to_its_own_watchdog(tmp_path: Path, channel: str) -> None:
-    with bench(tmp_path, channel) as robot:
-        host, _, operator = all_armed(robot)
-        armed = [ModuleState.ARMED] * JOINTS
-        assert robot.listener.states() == armed, f"{operator.status()}, {robot.said('host')}"
-        killed_ns = killed(host)
-        period_ms = robot.config.period_ns / 1e6
-        fault = {ModuleState.FAULT}
-        robot.until(lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS, "modules in fault")
-        beats = {node: len(uptimes_ms(robot.listener.listen(), node)) for node in NODES}
-        robot.until(
-            lambda: all(len(uptimes_ms(robot.listener.listen(), node)) > beats[node] + 1 for node in NODES),
-            "heartbeats",
-        )
-        heard = robot.listener.heard
-        stopped = first_in(heard, fault, killed_ns)
-        assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), "told at once, without a Sync"
-        assert {h.says()["last_stop"] for h in stopped.values()} == {LastStop.WATCHDOG}
-        assert all(h.says()["fault_watchdog"] and h.says()["mode"] == 0 for h in stopped.values())
-        last = {
-            node: max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and node_of(h.frame.id) == node)
-            for node in NODES
-        }
-        from_host = [h.at_ns for h in heard if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)]
-        last_ms = (max(from_host) - killed_ns) / 1e6
-        took_ms = [(stopped[node].at_ns - last[node]) / 1e6 for node in NODES]
-        own_ms = [passed_for_module_ms(heard, node, last[node], stopped[node].at_ns) for node in NODES]
-        assert last_ms < LATE_MS
-        assert max(took_ms) <= 100 + period_ms + LATE_MS
-        assert max(own_ms) <= 100 + period_ms and min(own_ms) > 100 - period_ms
-        assert robot.listener.states() == [ModuleState.FAULT] * JOINTS
-        print(
-            f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
-            f"motor off, {max(took_ms):.0f} ms after their last set-point by the kernel's clock, "
-            f"{min(own_ms):.0f} to {max(own_ms):.0f} ms by their own | watchdog 100 ms |"
-        )
-
-        # Whoever looks afterwards sees it.
-        scanned = snakesim("can", "scan", channel, "--seconds", "3", cwd=tmp_path, limit_s=START_LIMIT_S)
-        lines = scanned.out.splitlines()
-        assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
-        rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]
-        assert [r["node"] for r in rows] == [str(node) for node in NODES]
-        assert all((r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows)
-        assert len({r["serial"] for r in rows}) == JOINTS
-        print(f"| `snakesim can scan {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")
+    # Whoever looks afterwards sees it.
+    scanned = snakesim("can", "scan", channel, "--seconds", "3", cwd=robot.folder)
+    lines = scanned.out.splitlines()
+    assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
+    rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]
+    assert [r["node"] for r in rows] == [str(node) for node in NODES]
+    assert all((r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows)
+    assert len({r["serial"] for r in rows}) == JOINTS
+    print(f"| `snakesim can scan {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")
