@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 
 from deploy.vm import cpio
 from deploy.vm.kernel import (
@@ -153,7 +153,7 @@ def qemu_arguments(request: Request, kernel: Kernel, kvm: bool, initramfs: str, 
 
 
 class Guest:
-    """One running guest; leaving the context ends it."""
+    """One running guest, until it is closed."""
 
     def __init__(self, request: Request, kernel: Kernel, kvm: bool) -> None:
         self._request = request
@@ -187,12 +187,8 @@ class Guest:
                 preexec_fn=_dying_with(os.getpid()),
             )
 
-    def __enter__(self) -> "Guest":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """End it."""
         self._process.kill()
         self._process.wait()
         self._held.close()

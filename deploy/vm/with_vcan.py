@@ -20,6 +20,7 @@ import shlex
 import socket
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -97,7 +98,7 @@ def run_in_guest(arguments: argparse.Namespace) -> int:
     )
     kvm = kvm_works(kernel)
     for attempt in range(1, ATTEMPTS + 1):
-        with Guest(request, kernel, kvm) as guest:
+        with closing(Guest(request, kernel, kvm)) as guest:
             try:
                 guest.wait_until_ready(BOOT_LIMIT_S[kvm])
             except GuestError as error:
@@ -119,7 +120,8 @@ def kvm_works(kernel: Kernel) -> bool:
     known = json.loads(answers.read_text()) if answers.exists() else {}
     if this_start not in known:
         try:
-            with Guest(Request(command=["true"], folder=Path("/"), channels=[]), kernel, kvm=True) as guest:
+            nothing = Request(command=["true"], folder=Path("/"), channels=[])
+            with closing(Guest(nothing, kernel, kvm=True)) as guest:
                 guest.wait_until_ready(PROBE_LIMIT_S)
             works = True
         except GuestError:

@@ -35,7 +35,8 @@ class Port:
 
     def scan(self) -> list[Packet]:
         """All servos that answer a ping of everybody."""
-        return self._ask(encoded(EVERYBODY, Instruction.PING), LAST_ID + 1, self._gap_s + LAST_ID * SCAN_S)
+        gap_s = self._gap_s + LAST_ID * SCAN_S
+        return self._packets(Decoder(), encoded(EVERYBODY, Instruction.PING), LAST_ID + 1, gap_s)
 
     def read(self, id_: int, address: int, size: int) -> Packet | None:
         """Registers of a servo."""
@@ -70,10 +71,8 @@ class Port:
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _one(self, id_: int, request: bytes) -> Packet | None:
-        return next((packet for packet in self._ask(request, 1, self._gap_s) if packet.id == id_), None)
-
-    def _ask(self, request: bytes, answers: int, gap_s: float) -> list[Packet]:
-        return self._packets(Decoder(), request, answers, gap_s)
+        answers = self._packets(Decoder(), request, 1, self._gap_s)
+        return next((packet for packet in answers if packet.id == id_), None)
 
     def _packets(self, decoder: Decoder, request: bytes, answers: int, gap_s: float) -> list[Packet]:
         wire, found = self.wire, list[Packet]()

@@ -1,9 +1,9 @@
 """The backend that docs/backends.md shows, taken from there, and one like it that behaves as a robot on a bus does."""
 
-import importlib.util
 import re
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -22,20 +22,11 @@ def text_of_the_example() -> str:
     return found[1]
 
 
-def load_example() -> Any:
-    """The example as a module."""
-    name = "workbench_of_the_docs"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_loader(name, loader=None)
-        assert spec is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        exec(compile(text_of_the_example(), str(DOCS), "exec"), module.__dict__)
-    return sys.modules[name]
-
-
-Workbench: Any = load_example().Workbench
-mute: Any = load_example().mute
+example: Any = ModuleType("workbench_of_the_docs")
+sys.modules[example.__name__] = example  # where its annotations are looked up
+exec(compile(text_of_the_example(), str(DOCS), "exec"), example.__dict__)
+Workbench: Any = example.Workbench
+mute: Any = example.mute
 
 
 class BusWorkbench(Workbench):

@@ -25,17 +25,6 @@ def torque(run):
     return float(run.sim.true_state().torques_nm[0])
 
 
-def test_position_mode_goes_to_its_target_and_stays():
-    run = fast_run()
-    run.command(Mode.POSITION, 0.3)
-    run.go(0.5)
-    angles = []
-    for _ in range(100):
-        run.go()
-        angles.append(run.sim.true_state().angles_rad[0])
-    assert angles == pytest.approx([0.3] * 100, abs=1e-3)
-
-
 def test_velocity_mode_reaches_its_speed_and_holds_it_against_friction():
     run = fast_run({**TWO_LINKS, "motor": {"response_time_s": RESPONSE_S, "viscous_nm_s_per_rad": 0.1}})
     run.command(Mode.VELOCITY, 2.0)

@@ -46,15 +46,6 @@ def test_a_robot_too_quick_for_the_step_is_found_out():
         run.go(5.0)
 
 
-def test_nothing_moves_after_closing():
-    run = Run(make_config())
-    run.sim.close()
-    run.sim.close()
-    with pytest.raises(BackendError, match="closed"):
-        run.go()
-    assert run.sim.faults() == []
-
-
 def test_what_mujoco_cannot_do_is_an_error_of_the_backend():
     run = Run(make_config({"motor": {"friction_nm": 0.1}}))
     run.go(0.1)
