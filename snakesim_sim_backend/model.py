@@ -165,9 +165,8 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, har
     _add_foot(body, f"foot_{len(lengths)}", lengths[-1], robot)
     for i in range(len(lengths)):
         for j in range(i + 2, len(lengths)):
-            if (
-                math.fsum(lengths[i + 1 : j]) < 2.05 * robot.module.radius_m
-            ):  # they would touch when the snake is straight
+            apart_m = math.fsum(lengths[i + 1 : j])
+            if apart_m < 2.05 * robot.module.radius_m:  # they would touch when the snake is straight
                 spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")
 
 

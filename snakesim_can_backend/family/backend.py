@@ -95,12 +95,6 @@ class CanDriveBackend(FamilyBackend):
         """Bit rates, in words."""
         return mbit(settings.bit_rate) + (f" with data at {mbit(settings.fd_rate)}" if settings.fd_rate else "")
 
-    @staticmethod
-    def open(settings: Any) -> list[Wire]:
-        """Every bus. Raises ConfigError and BackendError."""
-        rates = settings.bit_rate, settings.fd_rate
-        return [open_wire(channel, None, *rates) for channel in settings.channels]
-
     @classmethod
     def twin_on(
         cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: Clock, pose: str | None

@@ -209,16 +209,12 @@ class ModuleChain:
             if sample is not None:
                 self._send_pose(self._encode(sample))
         first = sum(self.counts[:channel])
-        slots = self.slots[first : first + self.counts[channel]]
-        imu_due = [slot.module.imu_is_due() for slot in slots]
+        slots = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
+        imu_due = [slot.module.imu_is_due() for slot in slots[: self.counts[channel]]]
         readings = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
-        for slot, reading in zip(slots, readings, strict=True):
-            slot.module.sync(count, reading)
+        for slot in slots:
+            slot.module.sync(count, readings[slot.joint - first])
             self._follow_up(slot)
-        for slot in self.slots[self.count :]:
-            if slot.channel == channel:
-                slot.module.sync(count, readings[slot.joint - first])
-                self._follow_up(slot)
         out = self._out[channel]
         out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # in the order of arbitration
 

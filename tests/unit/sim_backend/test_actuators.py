@@ -25,16 +25,6 @@ def torque(run):
     return float(run.sim.true_state().torques_nm[0])
 
 
-def test_velocity_mode_reaches_its_speed_and_holds_it_against_friction():
-    run = fast_run({**TWO_LINKS, "motor": {"response_time_s": RESPONSE_S, "viscous_nm_s_per_rad": 0.1}})
-    run.command(Mode.VELOCITY, 2.0)
-    run.go(0.4)
-    gain, viscous = run.config.robot.motor.velocity_gain_nm_s_per_rad, 0.1
-    speed = run.sim.true_state().velocities_rad_s[0]
-    assert speed == pytest.approx(2.0 * gain / (gain + viscous), rel=0.01)
-    assert torque(run) == pytest.approx(viscous * speed, rel=0.01)
-
-
 def test_a_motor_without_response_time_answers_at_once():
     run = fast_run({**TWO_LINKS, "motor": {"response_time_s": 0.0}})
     run.command(Mode.TORQUE, 0.02)
