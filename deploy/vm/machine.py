@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -229,7 +229,9 @@ class Guest:
         for key, _ in self._selector.select(timeout_s):
             port = key.fileobj
             assert isinstance(port, socket.socket)
-            content = _received(port)
+            content = b""
+            with suppress(ConnectionResetError):
+                content = port.recv(65536)
             if content:
                 handlers.get(key.data, lambda text, name=key.data: self._print(name, text))(content)
             elif key.data == "control":
@@ -260,13 +262,6 @@ class Guest:
     def _last_words(self) -> str:
         said = self._console.replace(b"\r", b"").decode(errors="replace").strip()
         return f". It said:\n{said}" if said else "; it said nothing"
-
-
-def _received(port: socket.socket) -> bytes:
-    try:
-        return port.recv(65536)
-    except ConnectionResetError:
-        return b""
 
 
 def _write(descriptor: int, content: bytes) -> None:

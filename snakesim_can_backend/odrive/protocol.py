@@ -108,7 +108,7 @@ FROM_HOST = frozenset(message for message in Message if message.name.startswith(
 }
 
 
-def write(node: int, message: Message, *values: float) -> Frame:
+def write(node: int, message: Message, *values: float | bytes) -> Frame:
     """A message of, or to, an axis."""
     return Frame(node << NODE_BITS | message, PAYLOADS[message].pack(*values))
 

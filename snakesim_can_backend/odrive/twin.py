@@ -9,7 +9,7 @@ from typing import Any
 
 from snakesim_can_backend.family.twin import CanTwin
 from snakesim_can_backend.odrive.axes import TURN, TWIN_CONSTANT
-from snakesim_can_backend.odrive.protocol import PAYLOADS, Control, Error, Message, State, parted, write
+from snakesim_can_backend.odrive.protocol import PAYLOADS, Control, Error, Message, State, ask, parted, write
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.drivers.twin_body import TwinBody
 from snakesim_hal.wire.messages import Mode
@@ -96,15 +96,12 @@ class OdriveTwin(CanTwin):
 
     def _message(self, i: int, axis: Axis, message: Message) -> Frame:
         angle, velocity, torque = self.body.shaft(i)
-        values: tuple[float, ...]
+        values: tuple[Any, ...]
         match message:
             case Message.VERSION:
                 values = VERSION
             case Message.ADDRESS:
-                serial = FIRST_SERIAL + i
-                return Frame(
-                    axis.node << 5 | message, PAYLOADS[message].pack(axis.node, serial.to_bytes(6, "little"), 0)
-                )
+                values = axis.node, (FIRST_SERIAL + i).to_bytes(6, "little"), 0
             case Message.HEARTBEAT:
                 values = axis.errors, axis.state, 0, 0
             case Message.ERROR:
@@ -119,7 +116,7 @@ class OdriveTwin(CanTwin):
             case Message.SUPPLY:
                 values = self.body.supply(i)
             case _:
-                return Frame(axis.node << 5 | message, b"")
+                return ask(axis.node, message)
         return write(axis.node, message, *values)
 
     def _drive(self, i: int, axis: Axis) -> None:

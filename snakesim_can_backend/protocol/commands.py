@@ -24,7 +24,7 @@ from snakesim_can_backend.protocol.definitions import (
     Parameter,
 )
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import LifecycleState
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
 MAX_RAW = 32767
@@ -38,13 +38,8 @@ class SetPointWriter:
         layout = codec()[Opcode.SET_POINT]
         self._write = layout.writer("mode", "count", "position", "torque_limit")  # the targets share their bits
         self._count = [0] * joints
-        scale = {
-            Mode.PASSIVE: math.inf,  # its bits are 0
-            Mode.POSITION: layout.signals["position"].scale,
-            Mode.VELOCITY: layout.signals["velocity"].scale,
-            Mode.TORQUE: layout.signals["torque"].scale,
-        }
-        self._steps_per_unit = np.array([1.0 / scale[mode] for mode in Mode])
+        scales = [layout.signals[name].scale for name in ("position", "velocity", "torque")]
+        self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; the bits of a passive one are 0
         self._limit_steps = 1.0 / layout.signals["torque_limit"].scale
 
     def frames(self, set_points: SetPoints) -> list[Frame]:

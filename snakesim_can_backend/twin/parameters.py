@@ -23,18 +23,13 @@ def from_factory(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[Param
     """The flash of a new module. Gains are 0: a module that has not been configured holds nothing."""
     torque = min(rated_torque_nm, PARAMETERS[Parameter.RATED_TORQUE].high)
     speed = min(rated_speed_rad_s, PARAMETERS[Parameter.RATED_SPEED].high)
-    return {
-        Parameter.STIFFNESS: 0.0,
-        Parameter.DAMPING: 0.0,
-        Parameter.VELOCITY_GAIN: 0.0,
+    return dict.fromkeys(Parameter, 0.0) | {
         Parameter.TORQUE_LIMIT: torque,
         Parameter.SPEED_LIMIT: speed,
         Parameter.ANGLE_LIMIT: PARAMETERS[Parameter.ANGLE_LIMIT].high,
         Parameter.WATCHDOG: 0.1,
         Parameter.SAFE_ACTION: float(SafeMotion.DAMP),
         Parameter.CONTACT_EVERY: 1.0,
-        Parameter.IMU_EVERY: 0.0,
-        Parameter.TAIL: 0.0,
         Parameter.RATED_TORQUE: torque,
         Parameter.RATED_SPEED: speed,
     }

@@ -146,20 +146,6 @@ def test_a_free_joint_speeds_up_as_its_links_and_rotor_allow_and_the_gauge_feels
     assert plant.shaft_torque_nm()[0] == pytest.approx(torque - rotor * expected, rel=1e-3)
 
 
-def test_torques_accelerate_as_the_equations_of_motion_say():
-    plant = make_plant(make_config(FOUR, {**ICE, **CURVE}, start={"on_route": True}))
-    model, data = plant.sim.model, mujoco.MjData(plant.sim.model)
-    data.qpos[:] = plant.data.qpos
-    torques = np.array([0.0, 0.2, 0.0, -0.1])
-    data.qfrc_applied[6:] = torques
-    mujoco.mj_forward(model, data)
-    before = plant.velocity_rad_s.copy()
-    plant.advance(torques)
-    gained = (plant.velocity_rad_s - before) / plant.step_s
-    assert gained == pytest.approx(data.qacc[6:], rel=1e-9)
-    assert plant.shaft_torque_nm() == pytest.approx(torques - 0.005 * data.qacc[6:], rel=1e-9)
-
-
 def test_a_joint_stops_at_its_limit_and_the_gauge_feels_the_motor_push_there():
     plant = make_plant(make_config({**FOUR, "limits": {"angle_rad": 0.3}}, ICE))
     pass_time(plant, [0.0, 0.4, 0.0, 0.0], seconds=2.0)

@@ -8,7 +8,7 @@ from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
 from snakesim_sim_backend.sensors.timing import SamplingSchedule
-from tests.unit.sim_backend.rig import G, Run, make_config
+from tests.unit.sim_backend.rig import Run, make_config
 
 CORNER = {
     "ground": {"friction": 0.0},
@@ -75,15 +75,6 @@ def test_weak_touches_go_unfelt():
     run.go(0.5)
     assert run.sim.true_state().contacts
     assert run.sensed(Contacts).contacts == []
-
-
-def test_an_imu_at_rest_feels_gravity_alone():
-    run = Run(make_config(base_robot="mamba"))
-    run.go(0.5)
-    imu = run.sensed(Imu)
-    assert imu.link == list(range(19))
-    assert np.array(imu.acceleration_m_s2) == pytest.approx(np.tile([0, 0, G], (19, 1)), abs=0.02)
-    assert np.array(imu.angular_velocity_rad_s) == pytest.approx(0.0, abs=0.01)
 
 
 def test_an_imu_on_a_spinning_snake_feels_the_pull_to_the_centre():
