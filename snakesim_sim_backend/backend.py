@@ -108,7 +108,11 @@ class SimBackend:
         self._motors.before_steps()
         self._tick += 1
         try:
-            self._step()
+            if self._unread_steps:  # IMUs cost time, and only their values in the last step are read
+                self._option.disableflags = self._without_sensors
+                self._physics.step(self._unread_steps)
+                self._option.disableflags = self._with_sensors
+            self._physics.step(self._read_steps)
             self._watch.check(self._tick)
         except mujoco.FatalError as error:
             raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
@@ -116,14 +120,6 @@ class SimBackend:
             self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
             if (share_left := self._windings.share_left()) is not None:
                 self._motors.derate(share_left)
-
-    def _step(self) -> None:
-        option = self._option
-        if self._unread_steps:  # IMUs cost time, and only their values in the last step are read
-            option.disableflags = self._without_sensors
-            self._physics.step(self._unread_steps)
-            option.disableflags = self._with_sensors
-        self._physics.step(self._read_steps)
 
     def faults(self) -> list[Fault]:
         """Samples that came too late in real time; they stop nothing. A divergence is raised by `advance`."""

@@ -87,7 +87,13 @@ class MujocoPlant:
         self._unchecked += 1
         # Divergence shows here first; it is detected in the same step, or firmware would read NaN.
         if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MAX_SQUARED:
-            self._check()
+            self._diverged = True
+            try:
+                self._watch.check(self._steps)
+            except BackendError:
+                self._speeds_before[:] = self._speeds  # those of the last good state, to which the watch has gone back
+                raise
+            self._diverged, self._unchecked = False, 0
 
     @property
     def angle_rad(self) -> Floats:
@@ -140,15 +146,6 @@ class MujocoPlant:
     def pose(self) -> Pose:
         """Pose and velocity of the base, without noise. Its stamp is the time since the start."""
         return self._pose.read(0, self._stamp_ns())
-
-    def _check(self) -> None:
-        self._diverged = True
-        try:
-            self._watch.check(self._steps)
-        except BackendError:
-            self._speeds_before[:] = self._speeds  # those of the last good state, to which the watch has gone back
-            raise
-        self._diverged, self._unchecked = False, 0
 
     def _stamp_ns(self) -> int:
         return round(self._data.time * 1e9)

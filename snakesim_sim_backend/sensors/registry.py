@@ -46,34 +46,28 @@ def own_noise(key: str, seed: int) -> np.random.Generator:
 def check_models(robot: RobotFile) -> None:
     """Whether all sensors at places on links can be made. Runs no file of a plugin. Raises ConfigError."""
     for key, sensor in robot.sensors.mounted():
-        model, settings = _model(key, sensor, find_installed)
-        if model is not None:
-            _settings_of(model, settings, key, sensor)
+        _model(key, sensor, find_installed)
 
 
 def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
     """The reader of a sensor at a place on a link. Raises ConfigError."""
     model, settings = _model(key, sensor, find_plugin)
-    return model(sensor, scope, _settings_of(model, settings, key, sensor))
+    return model(sensor, scope, settings)
 
 
-def _model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, dict[str, Any]]:
-    """Its class, and its settings as the file has them."""
+def _model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
+    """Its class, and its settings, which are checked; None where `find` finds none."""
     message = keys.message_at(key)
     if message is ColourImage:
-        return RenderedColour, {}
+        return RenderedColour, RenderedColour.Settings()
     assert message is not None
-    own = THREADED.get((message, sensor.model))
-    return own or find(SENSORS, sensor.model), sensor.settings
-
-
-def _settings_of(model: Any, settings: dict[str, Any], key: str, sensor: AnyMounted) -> Any:
-    message = keys.message_at(key)
-    made = getattr(model, "message", None)
-    if message is not OwnSample and made is not message:  # of a sensor with a message of its own the schema is checked
-        wanted = "message" if message is None else message.__name__
+    model = THREADED.get((message, sensor.model)) or find(SENSORS, sensor.model)
+    if model is None:
+        return None, None
+    # Of a sensor with a message of its own the schema is checked.
+    if message is not OwnSample and getattr(model, "message", None) is not message:
         raise ConfigError(
-            f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {wanted}, which is what {key} carries; "
-            f"its class says in `message` what it makes"
+            f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
+            f"carries; its class says in `message` what it makes"
         )
-    return plugin_settings(model, settings, f"sensor {sensor.name!r} of the robot file", "settings")
+    return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
