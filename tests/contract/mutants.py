@@ -162,7 +162,7 @@ class OldReadingsAsNew(Workbench):
         return Samples(replace(self.held.joints, tick=tick, stamp_ns=stamp_ns))
 
 
-class WithPose(Workbench):
+class WithPose(Liar):
     """Sends a pose every tick."""
 
     ahead_ns = 0
@@ -181,19 +181,17 @@ class Unlisted(WithPose):
 class FromTheFuture(WithPose):
     ahead_ns = 5_000_000
 
-    def __init__(self, config, settings):
-        super().__init__(config, settings)
-        self.description = listing(self.description, keys.POSE)
+    def describes(self, robot):
+        return listing(robot, keys.POSE)
 
 
-class WithSonar(Workbench):
+class WithSonar(Liar):
     """Sends a range every tick."""
 
     link, found_m = 0, 1.0
 
-    def __init__(self, config, settings):
-        super().__init__(config, settings)
-        self.description = listing(self.description, keys.ranges("sonar"))
+    def describes(self, robot):
+        return listing(robot, keys.ranges("sonar"))
 
     def sample(self, tick, stamp_ns):
         sonar = Ranges(

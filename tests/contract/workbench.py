@@ -53,11 +53,7 @@ class BusWorkbench(Workbench):
             self.mode = np.where(asleep, int(Mode.PASSIVE), self.mode)
             self.limit = np.round(self.limit, 2)
         fresh = super().sample(tick, stamp_ns).joints
-        now = (
-            np.round(fresh.angle_rad, 4),
-            np.round(fresh.velocity_rad_s, 3),
-            np.round(fresh.torque_nm, 3),
-        )
+        now = np.round(fresh.angle_rad, 4), np.round(fresh.velocity_rad_s, 3), np.round(fresh.torque_nm, 3)
         late = np.arange(len(self.angle)) % 2 == 1
         if self.samples == 0 and self.KNOWN_AT_ONCE:
             self.old = now

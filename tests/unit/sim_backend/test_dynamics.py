@@ -71,17 +71,6 @@ def test_motors_give_the_energy_that_the_snake_has():
     assert kinetic_energy(run) == pytest.approx(work, rel=0.01)
 
 
-def test_a_sliding_snake_slows_at_friction_times_g():
-    run = Run(make_config(scene={"ground": {"friction": 0.2}}))
-    run.sim.data.qvel[0] = 1.0
-    run.command(Mode.POSITION)
-    run.go(0.05)
-    early = run.sim.true_state().base_velocity_w[0]
-    run.go(0.3)
-    late = run.sim.true_state().base_velocity_w[0]
-    assert (early - late) / 0.3 == pytest.approx(0.2 * G, rel=0.03)
-
-
 CURLED = [0.5] * 8  # a straight, round body would roll
 
 
