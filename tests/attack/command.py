@@ -10,10 +10,8 @@ from tests.harness.command import Running as Run
 
 LIMIT_S = 60.0
 # 50 Hz has the longest lease, 100 ms: a busy machine may well forget a process for 50 ms.
-STANDING = (
-    *("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50"),
-    *("--duration", "3600", "--stay"),
-)
+HOLDING = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50")
+STANDING = (*HOLDING, "--duration", "3600", "--stay")
 
 
 def _machine(home: Path) -> dict[str, str]:

@@ -4,9 +4,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -15,27 +14,16 @@ REPOSITORY = Path(__file__).parents[2]
 KEEPER = "ip link set lo up && echo up && exec cat"  # keeps the namespace until its standard input closes
 
 
-@dataclass(frozen=True)
-class Machine:
-    """Where commands are run with `prefix`."""
-
-    prefix: tuple[str, ...]
-
-    def lifecycles(self, endpoint: str) -> list[str]:
-        """Of every robot that shows a status at an endpoint."""
-        looked = subprocess.run(
-            [*self.prefix, sys.executable, "-m", "tests.attack.means.look", endpoint],
-            cwd=REPOSITORY,
-            capture_output=True,
-            timeout=30,
-            check=False,
-        )
-        return json.loads(looked.stdout or "[]")
+def lifecycles(inside: Sequence[str], endpoint: str) -> list[str]:
+    """On a machine: of the robot that shows a status at an endpoint, if one does."""
+    look = [*inside, sys.executable, "-m", "tests.attack.means.look", endpoint]
+    looked = subprocess.run(look, cwd=REPOSITORY, capture_output=True, timeout=30, check=False)
+    return json.loads(looked.stdout or "[]")
 
 
 @contextmanager
-def machine_of_its_own() -> Iterator[Machine]:
-    """Skips the test where the system allows no namespaces."""
+def machine_of_its_own() -> Iterator[Sequence[str]]:
+    """The prefix with which commands are run there. Skips the test where the system allows no namespaces."""
     user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     with subprocess.Popen(
         ["sh", "-c", 'exec unshare "$@"', "sh", *user, "--net", "sh", "-c", KEEPER],
@@ -49,4 +37,4 @@ def machine_of_its_own() -> Iterator[Machine]:
         if said != "up":
             pytest.skip(f"no network namespace here: {said}")
         into = ["--preserve-credentials", "--user"] if user else []
-        yield Machine(("nsenter", "--target", str(keeper.pid), *into, "--net"))
+        yield "nsenter", "--target", str(keeper.pid), *into, "--net"

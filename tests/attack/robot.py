@@ -11,7 +11,7 @@ import zenoh
 
 from tests.attack.command import STANDING, Run, running
 from tests.attack.stranger import Stranger
-from tests.harness.wait import LIMIT_S, wait_until
+from tests.harness.wait import wait_until
 
 BACK_S = 20.0  # until a robot that was attacked is replaced
 
@@ -68,19 +68,18 @@ class Robot:
         assert seen == {lifecycle}, f"{seen}: {self.operator.status()['why']}"
 
 
-def joined(run: Run, limit_s: float = LIMIT_S) -> Stranger:
+def joined(run: Run) -> Stranger:
     """Somebody on a run's network, as soon as there is one."""
-    found: list[Stranger] = []
 
-    def join() -> bool:
+    def join() -> Stranger | bool:
         with contextlib.suppress(zenoh.ZError):
-            found.append(Stranger(run.endpoint, timeout_s=0.5))
-        return bool(found) or run.process.poll() is not None
+            return Stranger(run.endpoint, timeout_s=0.5)
+        return run.process.poll() is not None
 
-    wait_until(join, f"a network at {run.endpoint}", limit_s)
-    assert found, f"the run ended with {run.process.returncode}: {run.said()[-2000:]}"
-    found[0].receive("hal/status", "hal/clock", "hal/applied", "hal/description")
-    return found[0]
+    found = wait_until(join, f"a network at {run.endpoint}")
+    assert isinstance(found, Stranger), run.how_it_ended()
+    found.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
+    return found
 
 
 @contextmanager

@@ -4,7 +4,6 @@ import contextlib
 import json
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,8 +122,7 @@ class Stranger:
     def newest(self, key: str, limit_s: float = LIMIT_S) -> Any:
         """The newest message at a key; waits for the first one."""
         self.receive(key)
-        self.until(lambda: self._heard[key], f"something on {key}", limit_s)
-        return self._heard[key][-1].message
+        return self.until(lambda: self._heard[key], f"something on {key}", limit_s)[-1].message
 
     def next(self, key: str, limit_s: float = LIMIT_S) -> Any:
         """A message at a key that comes from now on."""
@@ -133,9 +131,7 @@ class Stranger:
         self.until(lambda: self._heard[key] and self._heard[key][-1].at_s > now, f"something new on {key}", limit_s)
         return self._heard[key][-1].message
 
-    def until(self, condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> None:
-        """Poll a condition until a deadline."""
-        wait_until(condition, what, limit_s)
+    until = staticmethod(wait_until)
 
     # --- speaking ---------------------------------------------------------------------------------------------
 
@@ -278,19 +274,16 @@ class Stranger:
 
     def stopped_at(self, since_s: float, limit_s: float) -> float:
         """When an emergency stop was first seen: in the status, in the clock, or in what the motors get."""
-        seen: list[float] = []
 
-        def look() -> bool:
-            for key in ("hal/status", "hal/clock"):
-                seen.extend(
-                    heard.at_s
-                    for heard in self.heard(key)
-                    if heard.at_s >= since_s and heard.message.get("lifecycle") == "estop"
-                )
-            return bool(seen)
+        def seen() -> list[float]:
+            return [
+                heard.at_s
+                for key in ("hal/status", "hal/clock")
+                for heard in self.heard(key)
+                if heard.at_s >= since_s and heard.message.get("lifecycle") == "estop"
+            ]
 
-        wait_until(look, "an emergency stop", limit_s)
-        return min(seen)
+        return min(self.until(seen, "an emergency stop", limit_s))
 
 
 class HostTime:

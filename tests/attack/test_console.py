@@ -13,7 +13,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from tests.attack.command import address
-from tests.attack.effort import effort
+from tests.attack.effort import Record, effort
 from tests.attack.means.page import CAMERA, STOP, Page, ask, flood
 from tests.attack.robot import Robot, Victim
 from tests.harness.processes import processes_of
@@ -150,9 +150,7 @@ def test_c4_who_says_too_much_is_hung_up_on(robot: Robot, at: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["camera", "unknown", "stop"])
-def test_c5_a_flood_costs_nobody_the_stop(
-    robot: Robot, at: str, kind: str, record_property: Callable[[str, object], None]
-) -> None:
+def test_c5_a_flood_costs_nobody_the_stop(robot: Robot, at: str, kind: str, record_property: Record) -> None:
     health = robot.health()
     with Page(at) as other, ExitStack() as stack:
         button = other.find(STOP)
@@ -201,9 +199,7 @@ def test_c6_pages_of_other_origins_are_refused(robot: Robot, at: str) -> None:
     robot.stays("armed", 0.3)
 
 
-def test_c7_the_second_stop_needs_nothing_of_the_page(
-    robot: Robot, at: str, record_property: Callable[[str, object], None]
-) -> None:
+def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, record_property: Record) -> None:
     health = robot.health()
     with ExitStack() as stack:
         for said in (b"", b"POST /stop HTTP/1.1\r\nHost: ", b"GET / HTTP/1.1\r\n") * effort(40, 100):

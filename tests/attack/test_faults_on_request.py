@@ -2,9 +2,8 @@
 
 import os
 import signal
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 
 from tests.attack.command import STANDING, running
 from tests.attack.means import wire
-from tests.attack.means.meanwhile import meanwhile
+from tests.attack.means.repeating import repeating
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger
 
@@ -46,17 +45,14 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, Stra
             yield Robot(run, operator), stranger
 
 
-@contextmanager
-def forging(stranger: Stranger, about: dict[str, Any]) -> Iterator[None]:
+def forging(stranger: Stranger, about: dict[str, Any]) -> AbstractContextManager[None]:
     publisher = stranger.latch("hal/description", about)
 
-    def repeat(over: threading.Event) -> None:
-        while not over.wait(EVERY_S):
-            stranger.put("hal/description", about)
-            publisher.put(wire.encode(about))
+    def forge() -> None:
+        stranger.put("hal/description", about)
+        publisher.put(wire.encode(about))
 
-    with meanwhile(repeat):
-        yield
+    return repeating(forge, EVERY_S)
 
 
 def test_a3_a_forged_description_lets_nothing_go_wrong_on_a_real_robot(real: tuple[Robot, Stranger]) -> None:

@@ -1,10 +1,8 @@
 """A8, A9: what services hear from a stranger. It may lead the robot astray, but not beyond its limits."""
 
 import math
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +10,15 @@ import pytest
 
 from tests.attack.effort import FULL, effort
 from tests.attack.limits import beyond_limits
-from tests.attack.means.meanwhile import meanwhile
+from tests.attack.means.repeating import repeating
 from tests.attack.robot import Robot, standing
 from tests.attack.stranger import Stranger
 
 FORGED_S = effort(3, 100) / 10
+EVERY_S = 0.005  # faster than who should say it
 NS = 10**9
 ABSURD_M_S = 77.0
+SERVICES = ("control", "guidance", "navigation")
 
 
 @pytest.fixture(scope="module")
@@ -29,22 +29,6 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     with standing(home, *arguments) as robot:
         robot.operator.receive("sensor/joints", "guidance/world", "navigation/trajectory", "actuator/joints")
         yield robot
-
-
-@contextmanager
-def repeating(
-    stranger: Stranger,
-    messages: Callable[[], list[tuple[str, Any]]],
-) -> Iterator[None]:
-    """Say something again and again, faster than who should say it."""
-
-    def repeat(over: threading.Event) -> None:
-        while not over.wait(0.005):
-            for key, message in messages():
-                stranger.put(key, message)
-
-    with meanwhile(repeat):
-        yield
 
 
 def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S) -> None:
@@ -58,16 +42,12 @@ def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: f
     with Stranger(robot.endpoint) as stranger:
         for name, changes in variants.items():
             operator.forget()
-            clock = operator.next("hal/clock")
-            offset = {"tick": 0, "stamp_ns": 0} if key != "hal/clock" else {}
 
-            def forged(
-                clock: dict[str, Any] = clock, changes: dict[str, Any] = changes, offset: dict[str, int] = offset
-            ) -> dict[str, Any]:
-                now = operator.newest("hal/clock") if offset else clock
-                return {**honest, **{field: now[field] for field in offset}, **changes}
+            def forge(changes: dict[str, Any] = changes) -> None:
+                now = honest if key == "hal/clock" else operator.newest("hal/clock")
+                stranger.put(key, {**honest, "tick": now["tick"], "stamp_ns": now["stamp_ns"], **changes})
 
-            with repeating(stranger, lambda forged=forged: [(key, forged())]):
+            with repeating(forge, EVERY_S):
                 time.sleep(each_s)
             rows = [heard.message for heard in operator.heard("hal/applied")]
             assert beyond_limits(about, rows) == [], name
@@ -190,7 +170,7 @@ def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
     operator.stand_by()
     armings = operator.next("hal/clock")["arming"]
     forged = {**operator.status(), "lifecycle": lifecycle, "ready_to_arm": True, "why": "forged"}
-    with Stranger(robot.endpoint) as stranger, repeating(stranger, lambda: [("hal/status", forged)]):
+    with Stranger(robot.endpoint) as stranger, repeating(lambda: stranger.put("hal/status", forged), EVERY_S):
         time.sleep(FORGED_S)
         assert operator.next("hal/clock")["arming"] == armings
         stopped = robot.run.tell("estop")
@@ -203,14 +183,16 @@ def test_a8_forged_answers_of_services_stop_a_lockstep_run_at_most(tmp_path: Pat
     with standing(tmp_path, *arguments) as robot:
         before, operator = robot.health(), robot.operator
 
-        def messages() -> list[tuple[str, Any]]:
-            tick = operator.newest("hal/clock")["tick"] + 2
-            return [(f"hal/done/{name}", {"tick": tick}) for name in ("control", "guidance", "navigation")]
-
         with Stranger(robot.endpoint) as stranger:
-            for name in ("control", "guidance", "navigation", "nobody"):
+            for name in (*SERVICES, "nobody"):
                 stranger.put(f"hal/done/{name}", {"tick": 2**62})
-            with repeating(stranger, messages):
+
+            def answer() -> None:
+                tick = operator.newest("hal/clock")["tick"] + 2
+                for name in SERVICES:
+                    stranger.put(f"hal/done/{name}", {"tick": tick})
+
+            with repeating(answer, EVERY_S):
                 time.sleep(FORGED_S)
         operator.recover()
         robot.unharmed(before)

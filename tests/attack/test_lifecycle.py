@@ -5,11 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.attack.command import STANDING, running
+from tests.attack.command import HOLDING, STANDING, running
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger
-
-ONCE = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50")
 
 
 def test_a12_who_disarms_clears_and_arms_is_told(robot: Robot) -> None:
@@ -26,7 +24,7 @@ def test_a12_who_disarms_clears_and_arms_is_told(robot: Robot) -> None:
 
 
 def test_a12_a_run_that_a_stranger_finishes_is_not_complete(tmp_path: Path) -> None:
-    with running(tmp_path, *ONCE, "--duration", "20") as run, joined(run) as operator:
+    with running(tmp_path, *HOLDING, "--duration", "20") as run, joined(run) as operator:
         operator.until(lambda: operator.lifecycle() == "armed", "armed")
         with Stranger(run.endpoint) as stranger:
             answer = stranger.request("finish", who="mallory")

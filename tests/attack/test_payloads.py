@@ -4,15 +4,13 @@ import itertools
 import json
 import random
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
 
-from tests.attack.command import running, steering
-from tests.attack.effort import effort
+from tests.attack.command import HOLDING, running, steering
+from tests.attack.effort import Record, effort
 from tests.attack.means import wire
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import NAMESPACE, Stranger
@@ -165,7 +163,7 @@ def test_a_token_of_a_service_that_comes_and_goes_stops_nothing(robot: Robot) ->
 
 
 def test_many_robots_that_are_none_do_not_keep_a_stop_from_the_one_that_is(
-    robot: Robot, record_property: Callable[[str, object], None]
+    robot: Robot, record_property: Record
 ) -> None:
     operator = robot.operator
     with Stranger(robot.endpoint) as stranger:
@@ -201,10 +199,9 @@ def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: Robot) -> Non
     """A Zenoh router has an administration space; nobody may write there."""
     bait = free_endpoint()
     with Stranger(robot.endpoint) as stranger:
-        answers: list[Any] = []
-        for reply in stranger.session.get("@/**", timeout=1.0):
-            if reply.ok is not None:
-                answers.append(str(reply.ok.key_expr))
+        answers = [
+            str(reply.ok.key_expr) for reply in stranger.session.get("@/**", timeout=1.0) if reply.ok is not None
+        ]
         for zid in stranger.session.info.routers_zid():
             for what, value in (
                 ("listen/endpoints", f'["{bait}"]'),
@@ -236,8 +233,7 @@ def test_hosts_that_are_none_neither_stop_the_robot_nor_hide_a_stop(robot: Robot
 
 
 def test_a_host_that_is_none_does_not_end_a_run(tmp_path: Path) -> None:
-    arguments = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "4")
-    with running(tmp_path, *arguments) as run, joined(run) as operator:
+    with running(tmp_path, *HOLDING, "--duration", "4") as run, joined(run) as operator:
         operator.until(lambda: operator.lifecycle() == "armed", "armed")
         with Stranger(run.endpoint) as stranger:
             stranger.seem_alive("hal/host/another")

@@ -3,13 +3,12 @@
 import itertools
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.attack.command import running
-from tests.attack.effort import FULL, effort
+from tests.attack.effort import FULL, Record, effort
 from tests.attack.means.floods import flood
 from tests.attack.robot import joined
 
@@ -20,7 +19,7 @@ WATCHED_S = effort(3, 40)
 @pytest.mark.parametrize("readers", [1, 4] if FULL else [2])
 @pytest.mark.parametrize("_time", range(effort(1, 5)))
 def test_a5_frozen_readers_do_not_stop_the_robot(
-    tmp_path: Path, readers: int, _time: int, record_property: Callable[[str, object], None]
+    tmp_path: Path, readers: int, _time: int, record_property: Record
 ) -> None:
     with running(tmp_path, *FAST) as run, joined(run) as operator:
         operator.recover()

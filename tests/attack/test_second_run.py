@@ -2,20 +2,21 @@
 
 import os
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import zenoh
 
-from tests.attack.command import STANDING, Run, running, snakesim
+from tests.attack.command import HOLDING, STANDING, Run, running, snakesim
 from tests.attack.effort import effort
-from tests.attack.machine import Machine, machine_of_its_own
+from tests.attack.machine import lifecycles, machine_of_its_own
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger, settings
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
-SHORT = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "1")
+SHORT = (*HOLDING, "--duration", "1")
 TIMES = range(effort(1, 4))
 
 
@@ -78,8 +79,8 @@ def test_a1_a_robot_that_only_seems_to_be_there_keeps_a_run_from_starting_and_no
 def test_a1_two_runs_that_start_at_once_have_a_network_each(tmp_path: Path, _time: int) -> None:
     with (
         machine_of_its_own() as machine,
-        running(tmp_path, *SHORT, name="one", endpoint=None, inside=machine.prefix) as one,
-        running(tmp_path, *SHORT, name="two", endpoint=None, inside=machine.prefix) as two,
+        running(tmp_path, *SHORT, name="one", endpoint=None, inside=machine) as one,
+        running(tmp_path, *SHORT, name="two", endpoint=None, inside=machine) as two,
     ):
         codes = one.end(), two.end()
         assert codes == (0, 0), one.said() + two.said()
@@ -90,22 +91,22 @@ def test_a1_two_runs_that_start_at_once_have_a_network_each(tmp_path: Path, _tim
 def test_a14_a_stop_without_arguments_names_every_robot_of_the_machine_stopped_or_not_reached(tmp_path: Path) -> None:
     with (
         machine_of_its_own() as machine,
-        running(tmp_path, *STANDING, name="one", endpoint=None, inside=machine.prefix) as one,
-        running(tmp_path, *STANDING, name="two", endpoint=None, inside=machine.prefix) as two,
+        running(tmp_path, *STANDING, name="one", endpoint=None, inside=machine) as one,
+        running(tmp_path, *STANDING, name="two", endpoint=None, inside=machine) as two,
     ):
         is_armed(machine, one)
         is_armed(machine, two)
         frozen = two.part("host")
         os.kill(frozen, signal.SIGSTOP)
-        stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
-        assert machine.lifecycles(one.endpoint) == ["estop"], stopped.said
+        stopped = snakesim(tmp_path, "estop", inside=machine)
+        assert lifecycles(machine, one.endpoint) == ["estop"], stopped.said
         assert stopped.code == 1 and named(one, stopped.said) and named(two, stopped.said), stopped.said
         os.kill(frozen, signal.SIGCONT)
-        stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
-        assert [machine.lifecycles(run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.said
+        stopped = snakesim(tmp_path, "estop", inside=machine)
+        assert [lifecycles(machine, run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.said
         assert stopped.code == 0 and stopped.said.count("stopped") == 2, stopped.said
         assert named(one, stopped.said) and named(two, stopped.said), stopped.said
-        status = snakesim(tmp_path, "status", inside=machine.prefix)
+        status = snakesim(tmp_path, "status", inside=machine)
         assert status.said.count("planar13: estop") == 2, status.said
 
 
@@ -114,5 +115,5 @@ def named(run: Run, said: str) -> bool:
     return run.endpoint.rpartition(":")[2] in said or str(run.out) in said
 
 
-def is_armed(machine: Machine, run: Run) -> None:
-    wait_until(lambda: machine.lifecycles(run.endpoint) == ["armed"], f"{run.out.name} armed")
+def is_armed(inside: Sequence[str], run: Run) -> None:
+    wait_until(lambda: lifecycles(inside, run.endpoint) == ["armed"], f"{run.out.name} armed")

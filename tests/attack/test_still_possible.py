@@ -3,17 +3,16 @@
 docs/safety.md lists it line by line; more of it stands in test_forged.py, test_commands.py and test_second_run.py.
 """
 
+import itertools
 import os
 import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any
 
 from tests.attack.limits import beyond_limits
 from tests.attack.means import wire
-from tests.attack.means.meanwhile import meanwhile
+from tests.attack.means.repeating import repeating
 from tests.attack.robot import Robot
 from tests.attack.stranger import Stranger
 
@@ -38,22 +37,18 @@ def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "disarmed", "disarmed")
 
 
-@contextmanager
-def commanding(stranger: Stranger, epoch: int, target: float) -> Iterator[None]:
+def commanding(stranger: Stranger, epoch: int, target: float) -> AbstractContextManager[None]:
     """A controller of his own: it answers every tick, as schemas/ tells."""
+    sequences = itertools.count(1)
 
-    def stream(over: threading.Event) -> None:
-        sequence = 0
-        while not over.is_set():
-            clock = stranger.next("hal/clock")
-            now = stranger.newest("sensor/joints")["angle_rad"]
-            wanted = now if clock["lifecycle"] != "armed" else [target] * len(now)
-            sequence += 1
-            forged = stranger.command(clock, sequence=sequence, lease_epoch=epoch, target=wanted)
-            stranger.put("actuator/joints", forged)
+    def answer() -> None:
+        clock = stranger.next("hal/clock")
+        now = stranger.newest("sensor/joints")["angle_rad"]
+        wanted = now if clock["lifecycle"] != "armed" else [target] * len(now)
+        forged = stranger.command(clock, sequence=next(sequences), lease_epoch=epoch, target=wanted)
+        stranger.put("actuator/joints", forged)
 
-    with meanwhile(stream):
-        yield
+    return repeating(answer)
 
 
 def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_limits(robot: Robot) -> None:
@@ -88,12 +83,7 @@ def test_a_forged_description_misleads_neither_host_nor_services(robot: Robot) -
     with Stranger(robot.endpoint) as stranger:
         publisher = stranger.latch("hal/description", forged)
         os.kill(robot.run.part("control"), signal.SIGKILL)  # so that a controller learns the robot again
-
-        def repeat(over: threading.Event) -> None:
-            while not over.wait(0.02):
-                publisher.put(wire.encode(forged))
-
-        with meanwhile(repeat):
+        with repeating(lambda: publisher.put(wire.encode(forged)), 0.02):
             operator.until(lambda: operator.lifecycle() == "fault", "a stop")
             operator.recover(30.0)
             time.sleep(0.5)

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 import pytest
 
 from tests.attack.command import snakesim, steering
-from tests.attack.effort import FULL, effort
+from tests.attack.effort import FULL, Record, effort
 from tests.attack.means import datagrams
 from tests.attack.means.floods import flood, half_open
 from tests.attack.robot import Robot
@@ -50,9 +50,7 @@ def _both(one: AbstractContextManager[object], two: AbstractContextManager[objec
 
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("name", FLOODS if FULL else ("half_open", "lease_queries"))
-def test_a4_the_command_stops_the_robot_under(
-    robot: Robot, name: str, _time: int, record_property: Callable[[str, object], None]
-) -> None:
+def test_a4_the_command_stops_the_robot_under(robot: Robot, name: str, _time: int, record_property: Record) -> None:
     operator = robot.operator
     with FLOODS[name](robot):
         time.sleep(FLOODED_S)
@@ -72,7 +70,7 @@ def test_a4_the_command_stops_the_robot_under(
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("by", ["query", pytest.param("datagram", marks=pytest.mark.slow)])
 def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
-    robot: Robot, by: str, _time: int, record_property: Callable[[str, object], None]
+    robot: Robot, by: str, _time: int, record_property: Record
 ) -> None:
     """Zenoh holds up the whole network meanwhile, so the host's own ticks tell when the joints were made safe."""
     operator = robot.operator
@@ -103,9 +101,7 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
 # --- by UDP, beside the endpoint ------------------------------------------------------------------------------------
 
 
-def test_a4_a_datagram_stops_the_robot_and_says_who_it_was(
-    robot: Robot, record_property: Callable[[str, object], None]
-) -> None:
+def test_a4_a_datagram_stops_the_robot_and_says_who_it_was(robot: Robot, record_property: Record) -> None:
     asked_s = time.monotonic()
     answer = datagrams.ask(robot.endpoint, datagrams.stop("the bench's red button"), 2.0)
     assert answer is not None, "no answer at the endpoint's UDP port"
@@ -117,9 +113,7 @@ def test_a4_a_datagram_stops_the_robot_and_says_who_it_was(
 
 
 @pytest.mark.parametrize("name", FLOODS if FULL else ("lease_queries",))
-def test_a4_a_datagram_stops_the_robot_under(
-    robot: Robot, name: str, record_property: Callable[[str, object], None]
-) -> None:
+def test_a4_a_datagram_stops_the_robot_under(robot: Robot, name: str, record_property: Record) -> None:
     with FLOODS[name](robot):
         time.sleep(FLOODED_S)
         asked_s = time.monotonic()
@@ -130,7 +124,7 @@ def test_a4_a_datagram_stops_the_robot_under(
 
 
 def test_a4_a_flood_of_wrong_datagrams_does_nothing_and_keeps_no_right_one_out(
-    robot: Robot, record_property: Callable[[str, object], None]
+    robot: Robot, record_property: Record
 ) -> None:
     before = robot.health()
     with datagrams.flood(robot.endpoint) as sent:

@@ -107,17 +107,15 @@ class Running:
         return self._told(r"console: (http\S+)")
 
     def _told(self, pattern: str) -> str:
-        found: list[str] = []
+        wait_until(
+            lambda: re.search(pattern, self.said()) or self.process.poll() is not None, f"{pattern!r} from the run"
+        )
+        found = re.search(pattern, self.said())
+        assert found is not None, self.how_it_ended()
+        return found[1]
 
-        def told() -> bool:
-            found.extend(re.findall(pattern, self.said()))
-            return bool(found) or self.process.poll() is not None
-
-        wait_until(told, f"{pattern!r} from the run")
-        assert found, self._how_it_ended()
-        return found[0]
-
-    def _how_it_ended(self) -> str:
+    def how_it_ended(self) -> str:
+        """For the words of a failure."""
         return f"the run ended with {self.process.returncode}: {self.said()[-2000:]}"
 
     def said(self) -> str:
@@ -127,7 +125,7 @@ class Running:
     def wait_for(self, text: str, limit_s: float = LIMIT_S) -> None:
         """Wait until it has said something."""
         wait_until(lambda: text in self.said() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
-        assert text in self.said(), self._how_it_ended()
+        assert text in self.said(), self.how_it_ended()
 
     def tell(self, *arguments: str, limit_s: float = LIMIT_S) -> Ended:
         """A tool of the same machine, told where this run is."""

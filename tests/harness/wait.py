@@ -2,14 +2,16 @@
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 LIMIT_S = 90.0  # long enough for a process to start on a busy machine; whoever states a time gives its own
+FoundT = TypeVar("FoundT")
 
 
-def wait_until(condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> None:
-    """Poll a condition; fails with its name when it does not hold in time."""
+def wait_until(condition: Callable[[], FoundT | None], what: str, limit_s: float = LIMIT_S) -> FoundT:
+    """Poll a condition; what it found. Fails with its name when it does not hold in time."""
     deadline = time.monotonic() + limit_s
-    while not condition():
+    while not (found := condition()):
         assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}"
         time.sleep(0.01)
+    return found

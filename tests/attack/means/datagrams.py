@@ -4,13 +4,12 @@ import contextlib
 import os
 import random
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tests.attack.command import address
-from tests.attack.means.meanwhile import meanwhile
+from tests.attack.means.repeating import repeating
 
 ASK, DONE = b"SNAKSTOP", b"SNAKDONE"
 AGAIN_S = 0.05
@@ -45,14 +44,13 @@ def false_port(endpoint: str, *, knows_nonce: bool = True) -> Iterator[None]:
     wire.bind(address(endpoint))
     wire.settimeout(0.1)
 
-    def answer(over: threading.Event) -> None:
-        while not over.is_set():
-            with contextlib.suppress(TimeoutError):
-                asked, sender = wire.recvfrom(2048)
-                nonce = asked[8:24] if knows_nonce else bytes(16)
-                wire.sendto(DONE + nonce + b"planar13\nstopped", sender)
+    def answer() -> None:
+        with contextlib.suppress(TimeoutError):
+            asked, sender = wire.recvfrom(2048)
+            nonce = asked[8:24] if knows_nonce else bytes(16)
+            wire.sendto(DONE + nonce + b"planar13\nstopped", sender)
 
-    with wire, meanwhile(answer):
+    with wire, repeating(answer):
         yield
 
 
@@ -70,11 +68,10 @@ def flood(endpoint: str) -> Iterator[list[int]]:
     ]
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def send(over: threading.Event) -> None:
-        while not over.is_set():
-            with contextlib.suppress(OSError):
-                wire.sendto(dice.choice(shots), address(endpoint))
-                sent[0] += 1
+    def send() -> None:
+        with contextlib.suppress(OSError):
+            wire.sendto(dice.choice(shots), address(endpoint))
+            sent[0] += 1
 
-    with wire, meanwhile(send):
+    with wire, repeating(send):
         yield sent

@@ -1,37 +1,26 @@
-"""`python -m tests.attack.means.look ENDPOINT`: the lifecycle of every robot that shows a status, as a JSON list."""
+"""`python -m tests.attack.means.look ENDPOINT`: the lifecycle of the robot that shows itself there, as a JSON list."""
 
 import json
 import sys
 import time
 
 import zenoh
-from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
-from tests.attack.means import wire
-from tests.attack.stranger import settings
+from tests.attack.stranger import Stranger
 
 LOOK_S = 0.6  # a status comes a few times a second
 
 
 def main() -> None:
-    """Look once."""
-    zenoh.init_log_from_env_or("off")
-    found: dict[str, str] = {}
-
-    def take(sample: zenoh.Sample) -> None:
-        found[str(sample.key_expr)] = wire.decode(sample.payload.to_bytes())["lifecycle"]
-
+    """Look once; an empty list where nobody shows one."""
     try:
-        session = zenoh.open(settings(sys.argv[1], timeout_s=1.0))
+        with Stranger(sys.argv[1], timeout_s=1.0) as looking:
+            looking.receive("hal/status")
+            time.sleep(LOOK_S)
+            newest = looking.heard("hal/status")[-1:]
     except zenoh.ZError:
-        print("[]")
-        return
-    history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-    reader = ext.declare_advanced_subscriber(session, "**/hal/status", take, history=history)
-    time.sleep(LOOK_S)
-    print(json.dumps(list(found.values())), flush=True)
-    reader.undeclare()
-    session.close()
+        newest = []
+    print(json.dumps([heard.message["lifecycle"] for heard in newest]), flush=True)
 
 
 if __name__ == "__main__":

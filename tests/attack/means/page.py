@@ -63,10 +63,7 @@ class Page:
 
     def find(self, label: str) -> str:
         """The id of the control with a label, once it is there."""
-        wait_until(lambda: self._found(label) is not None, f"{label!r} on the page", 60.0)
-        found = self._found(label)
-        assert found is not None
-        return found
+        return wait_until(lambda: self._found(label), f"{label!r} on the page", 60.0)
 
     def change(self, control: str, updates: Any) -> None:
         """Say that a control, by its id, has other values."""
