@@ -27,6 +27,7 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_hal.errors import BackendError
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from tests.fuzz.texts import flipped
 from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
 
 PER_TICK = 40
@@ -48,10 +49,7 @@ class FrameMaker:
         kind, (identifier, data) = rng.choice(KINDS), rng.choice(self.heard)
         match kind:
             case "bit-flipped" if data:
-                corrupted = bytearray(data)
-                for _ in range(rng.choice((1, 1, 2, 16))):
-                    corrupted[rng.randrange(len(corrupted))] ^= 1 << rng.randrange(8)
-                data = bytes(corrupted)
+                data = flipped(rng, data)
             case "other node":
                 identifier = identifier & ~((1 << NODE_BITS) - 1) | rng.randrange(JOINTS + 2)
             case "other message":
@@ -73,14 +71,14 @@ class Stranger:
     """A third end of the bus."""
 
     def __init__(self, channel: str, maker: FrameMaker, words: Counter[str]) -> None:
-        self._bus, self._maker, self._words = VirtualBus(channel=channel), maker, words
+        self.bus, self._maker, self._words = VirtualBus(channel=channel), maker, words
 
     def speak(self, frames: int, *, as_modules: bool = False) -> None:
         """Send so many; what was overheard meanwhile is what later ones are made of.
 
         as_modules: none that a driver takes for another host's or for a node that should not be there.
         """
-        while (message := self._bus.recv(0)) is not None:
+        while (message := self.bus.recv(0)) is not None:
             if len(self._maker.heard) < 2000:
                 self._maker.heard.append(Frame(message.arbitration_id, bytes(message.data)))
         for _ in range(frames):
@@ -88,11 +86,7 @@ class Stranger:
             while as_modules and not is_from_module(identifier):
                 kind, (identifier, data) = self._maker.make()
             self._words[kind] += 1
-            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF))
-
-    def close(self) -> None:
-        """Leave."""
-        self._bus.shutdown()
+            self.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF))
 
 
 def is_from_module(identifier: int) -> bool:
@@ -140,7 +134,7 @@ def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[Loop, Stra
                 yield run, strangers[0]
     finally:
         for stranger in strangers:
-            stranger.close()
+            stranger.bus.shutdown()
 
 
 def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,33 +31,25 @@ class Outcome:
     peak_mb: float
 
 
-class Forked:
-    """The process that forks."""
-
-    def __init__(self, process: "subprocess.Popen[str]") -> None:
-        self._process = process
-
-    def snakesim(self, *arguments: str, cwd: Path) -> Outcome:
-        """Run a command to its end."""
-        asked, answers = self._process.stdin, self._process.stdout
-        assert asked is not None and answers is not None
-        print(json.dumps([str(cwd), *arguments]), file=asked, flush=True)
-        return Outcome(**json.loads(answers.readline()))
+Forked = Callable[..., Outcome]
 
 
 @contextmanager
 def forked(home: Path) -> Iterator[Forked]:
-    """A process that forks, as long as the context lives."""
+    """What runs a command in a folder to its end; the process that forks lives as long as the context."""
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "XDG_STATE_HOME": str(home)}
     command = [sys.executable, "-m", "tests.fuzz.forked"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as process:
-        try:
-            yield Forked(process)
-        finally:
-            assert process.stdin is not None
-            process.stdin.close()
+        asked, answers = process.stdin, process.stdout
+        assert asked is not None and answers is not None
+
+        def snakesim(cwd: Path, *arguments: str) -> Outcome:
+            print(json.dumps([str(cwd), *arguments]), file=asked, flush=True)
+            return Outcome(**json.loads(answers.readline()))
+
+        yield snakesim
 
 
 def main() -> None:

@@ -30,11 +30,12 @@ from snakesim_hal.network.router import router_settings
 from snakesim_hal.network.stop_port import REQUEST, ask_to_stop, open_stop_port, serve_stops
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import EstopRequest, Pose
-from snakesim_operator.results import last_run as lastrun
+from snakesim_operator.results.last_run import recall
 from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import snakesim
 from tests.fuzz.texts import LARGEST, TextMaker
 
+LAST_RUN = "snakesim/last-run.json"
 STOP_EVERY = 20  # payloads
 LONGEST_S = 10.0  # for one payload, on a machine that does something else as well
 LONGEST_REASON = 1500  # characters of a refusal, whatever it quotes
@@ -104,8 +105,10 @@ def all_inputs(folder: Path) -> Iterator[list[Input]]:
     record = folder / "record"
     done = snakesim("run", "triplet", "--duration", "0.3", "--out", str(record), cwd=folder)
     assert done.code == 0, done.out + done.err
-    with mocap() as poses, stop_port() as stops:
-        yield [poses, stops, *texts(), *written(folder), *(recorded(record, path) for path in _kept(record))]
+    read_again = [path for path in sorted(record.iterdir()) if path.suffix not in (".log", ".html") and path.is_file()]
+    with mocap() as poses, stop_port() as stops, pytest.MonkeyPatch.context() as patched:
+        patched.setenv("XDG_STATE_HOME", str(folder))  # where what outlives a run is kept
+        yield [poses, stops, *texts(), *written(folder), *(recorded(record, path) for path in read_again)]
 
 
 @contextmanager
@@ -226,12 +229,8 @@ def written(folder: Path) -> list[Input]:
         assert found.found is not None, "a stop that cannot be read counts as one"
         return True
 
-    def last_run(_path: Path) -> object:
-        with state_home(folder):
-            return lastrun.recall()
-
     def live(path: Path) -> object:
-        with path.open("rb") as held, state_home(folder):
+        with path.open("rb") as held:
             fcntl.flock(held, fcntl.LOCK_EX)  # as by a run that lives
             return local_robots() or None
 
@@ -257,22 +256,9 @@ def written(folder: Path) -> list[Input]:
         Input("config.json", [config], file("x.json", lambda p: scenario.load(str(p)))),
         Input("router.json5", [files.ROUTER.read_bytes()], file("router.json5", router_settings)),
         Input(ESTOP, [b'{"who":"a person","tick":7}'], file(ESTOP, latch)),
-        Input("last-run.json", [b'{"folder":"/tmp/x","ended":"complete"}'], file("snakesim/last-run.json", last_run)),
+        Input(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: recall())),
         Input("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),
     ]
-
-
-@contextmanager
-def state_home(folder: Path) -> Iterator[None]:
-    """Meanwhile what outlives a run is kept there."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("XDG_STATE_HOME", str(folder))
-        yield
-
-
-def _kept(record: Path) -> list[Path]:
-    """Files of a run's folder that are read again."""
-    return [path for path in sorted(record.iterdir()) if path.suffix not in (".log", ".html") and path.is_file()]
 
 
 def recorded(record: Path, path: Path) -> Input:

@@ -173,17 +173,14 @@ def fuzz(out: Path, request: Request) -> Verdict:
 def running_and_joined(out: Path, robot: str, *arguments: str) -> Iterator[tuple[Running, Session]]:
     """A run, and a session on its network; what the run said when it does not come up."""
     with running(out, *arguments) as run:
-        wait_until(lambda: "network:" in run.said() or run.process.poll() is not None, "a network")
-        assert run.process.poll() is None, run.said()
+        run.wait_for("network:")
         with open_session(Link(run.endpoint, robot)) as session:
             yield run, session
 
 
 @contextmanager
 def _stranger(endpoint: str, request: Request) -> Iterator[subprocess.Popen[bytes]]:
-    what = {"payloads": request.payloads, "rate": request.rate, "seed": request.seed}
-    arguments = {"endpoint": endpoint, "namespace": ROBOT, **what}
-    given = [word for name, value in arguments.items() for word in (f"--{name}", str(value))]
+    given = [endpoint, ROBOT, *map(str, (request.payloads, request.rate, request.seed))]
     process = subprocess.Popen([sys.executable, "-m", "tests.fuzz.writer", *given], stdout=subprocess.PIPE)
     try:
         yield process

@@ -21,14 +21,14 @@ from tests.harness.endpoint import free_endpoint
 from tests.whole.damaged import Span, chunks, flipped, packed, recorded, spans
 
 SPOILT, WHOLE, OUT = "spoilt.mcap", "whole.mcap", "made"
+FORMATS = ("csv", "npz", "mcap", "parquet", "lerobot")
 COMMANDS: dict[str, list[str]] = {
     "info": ["info", SPOILT],
     "info --json": ["info", SPOILT, "--json"],
     "report": ["report", SPOILT],
     "compare with it": ["compare", WHOLE, SPOILT],
     "compare it": ["compare", SPOILT, WHOLE, "--json"],
-    **{f"export {form}": ["export", SPOILT, "--format", form, "--out", OUT] for form in ("csv", "npz", "mcap")},
-    **{f"export {form}": ["export", SPOILT, "--format", form, "--out", OUT] for form in ("parquet", "lerobot")},
+    **{f"export {form}": ["export", SPOILT, "--format", form, "--out", OUT] for form in FORMATS},
     "replay": ["replay", SPOILT, "--rate", "1000000"],
     "replay --control": ["replay", SPOILT, "--control"],
     "video": ["video", SPOILT, "--out", "film.gif", "--width", "32", "--height", "32", "--fps", "5"],
@@ -150,18 +150,18 @@ def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> V
     recorded(folder / "run", 0.6, 40_000)
     content, verdict = (folder / "run" / RECORDING).read_bytes(), Verdict()
     names = [name for name in COMMANDS if name != TRUTH]
-    with forked(folder) as runner:
+    with forked(folder) as snakesim:
         for number in range(copies):
             damage, chance = DAMAGES[number % len(DAMAGES)], random.Random(seed * 100_000 + number)
             spoilt = damage(chance, content)
             first = number * (commands or 0) % len(names)
             chosen = names if commands is None else [*names, *names][first : first + commands]
-            _try(folder / f"{number}", runner, spoilt, content, chosen, f"{damage.__name__} {number}", verdict)
+            _try(folder / f"{number}", snakesim, spoilt, content, chosen, f"{damage.__name__} {number}", verdict)
     return verdict
 
 
 def _try(
-    folder: Path, runner: Forked, spoilt: bytes, content: bytes, names: Sequence[str], what: str, verdict: Verdict
+    folder: Path, snakesim: Forked, spoilt: bytes, content: bytes, names: Sequence[str], what: str, verdict: Verdict
 ) -> None:
     incomplete = False
     for name in (TRUTH, *names):
@@ -170,7 +170,7 @@ def _try(
         (folder / SPOILT).write_bytes(spoilt)
         (folder / WHOLE).write_bytes(content)
         more = ["--endpoint", free_endpoint()] if name == "replay" else []
-        outcome = runner.snakesim(*COMMANDS[name], *more, cwd=folder)
+        outcome = snakesim(folder, *COMMANDS[name], *more)
         verdict.codes.setdefault(name, Counter())[outcome.code] += 1
         verdict.longest_cpu_s = max(verdict.longest_cpu_s, outcome.cpu_s)
         verdict.peak_mb = max(verdict.peak_mb, outcome.peak_mb)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_hal.errors import WireError
-from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import (
     VERSIONS,
@@ -20,9 +19,10 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     Message,
 )
-from tests.fuzz.payloads import ROBOT, Maker
+from tests.fuzz.payloads import Maker
 from tests.fuzz.vitals import vitals
-from tests.unit.hal.rig import PERIOD_NS, command, state
+from tests.unit.hal.rig import PERIOD_NS
+from tests.unit.hal.safety.authority_rig import armed
 
 LONGEST_REASON = 400  # characters of an error's text, whatever a sender wrote
 PER_ROBOT = 1000  # payloads until a fresh robot is armed
@@ -50,35 +50,26 @@ class Robot:
 
     def __init__(self) -> None:
         """Armed and commanded."""
-        self._authority = Authority(ROBOT)
-        self._now_ns = 0
-        self._tick = 0
+        self._rig = armed()
+        self._authority = self._rig.authority
         self._decoder = Decoder(Answer)
-        self._authority.observe(state(ROBOT, 0.1))
-        for request in (
-            LeaseRequest(action="acquire", holder="control"),
-            command(ROBOT, 0.1),
-            LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=ROBOT.config_hash),
-        ):
-            word = self.take(request)
-            assert word in ("yes", "accepted"), word
 
     def take(self, message: Message) -> str:
         """What became of it, in a word."""
+        rig = self._rig
         answer: Answer
         match message:
             case JointCommand():
-                refusal = self._authority.offer(message, now_ns=self._now_ns, tick=self._tick, age_ns=0)
-                return refusal or "accepted"
+                return self._authority.offer(message, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) or "accepted"
             case JointState():
                 self._authority.observe(message)
                 return "observed"
             case LeaseRequest():
-                answer = self._authority.on_lease(message, self._now_ns)
+                answer = self._authority.on_lease(message, rig.now_ns)
             case LifecycleRequest():
-                answer = self._authority.on_lifecycle(message, self._now_ns)
+                answer = self._authority.on_lifecycle(message, rig.now_ns)
             case EstopRequest():
-                answer = self._authority.on_estop(message, self._tick)
+                answer = self._authority.on_estop(message, rig.tick)
             case _:
                 return "not for a HAL"
         assert self._decoder.decode(encode(answer), encoding_of(Answer)) == answer
@@ -86,9 +77,9 @@ class Robot:
 
     def pass_tick(self) -> None:
         """The end of a tick."""
-        self._now_ns += PERIOD_NS // 4
-        self._tick += 1
-        self._authority.expire(self._now_ns, self._tick)
+        self._rig.now_ns += PERIOD_NS // 4
+        self._rig.tick += 1
+        self._authority.expire(self._rig.now_ns, self._rig.tick)
         points = self._authority.decide().set_points
         assert all(abs(target) <= 5.0 for target in points.target)
 

@@ -13,7 +13,6 @@ COMPLAINTS = re.compile(r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Er
 class Vitals:
     """One process at one moment."""
 
-    pid: int
     resident_mb: float
     threads: int
     files: int
@@ -23,7 +22,7 @@ def vitals(pid: int) -> Vitals | None:
     """None when the process is gone."""
     try:
         process = psutil.Process(pid)
-        return Vitals(pid, process.memory_info().rss / 2**20, process.num_threads(), process.num_fds())
+        return Vitals(process.memory_info().rss / 2**20, process.num_threads(), process.num_fds())
     except psutil.Error:
         return None
 

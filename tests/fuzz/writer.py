@@ -1,9 +1,9 @@
-"""`python -m tests.fuzz.writer`: a stranger on a robot's network, who sends what nobody should send, at a steady rate.
+"""`python -m tests.fuzz.writer ENDPOINT NAMESPACE PAYLOADS RATE SEED`: a stranger on a robot's network.
 
-It listens for a moment first, so that what it sends resembles what this robot says: its layout, its live lease.
+He sends what nobody should send, so many payloads a second. He listens for a moment first, so that it resembles what
+this robot says: its layout, its live lease.
 """
 
-import argparse
 import random
 import sys
 import time
@@ -189,17 +189,11 @@ def overhear(link: Link) -> tuple[list[Seed], Live]:
 
 def main() -> int:
     """Prints what was sent as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--endpoint", required=True)
-    parser.add_argument("--namespace", required=True)
-    parser.add_argument("--payloads", type=int, required=True)
-    parser.add_argument("--rate", type=float, required=True)
-    parser.add_argument("--seed", type=int, required=True)
-    asked = parser.parse_args()
-    link = Link(asked.endpoint, asked.namespace)
+    endpoint, namespace, payloads, rate, seed = sys.argv[1:]
+    link = Link(endpoint, namespace)
     heard, live = overhear(link)
     with open_session(link) as session:
-        sent = Stranger(session, random.Random(asked.seed), heard, live).send(asked.payloads, asked.rate)
+        sent = Stranger(session, random.Random(int(seed)), heard, live).send(int(payloads), float(rate))
     sys.stdout.buffer.write(msgspec.json.encode(sent))
     return 0
 
