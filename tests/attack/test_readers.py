@@ -1,7 +1,6 @@
 """A5: a reader that is frozen, and still subscribes to everything, does not stop the robot."""
 
 import itertools
-import os
 import signal
 from pathlib import Path
 
@@ -26,7 +25,7 @@ def test_a5_frozen_readers_do_not_stop_the_robot(
         with flood(tmp_path, "everything", run.endpoint, 0, readers) as frozen:
             operator.recover()
             for reader in frozen:
-                os.kill(reader.process.pid, signal.SIGSTOP)
+                reader.send_signal(signal.SIGSTOP)
             operator.forget()
             first = operator.next("hal/clock")
             try:

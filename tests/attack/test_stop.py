@@ -11,7 +11,7 @@ import pytest
 from tests.attack.command import snakesim, steering
 from tests.attack.effort import FULL, Record, effort
 from tests.attack.means import datagrams
-from tests.attack.means.floods import flood, half_open
+from tests.attack.means.floods import end, flood, half_open
 from tests.attack.robot import Robot
 from tests.attack.stranger import HostTime
 from tests.harness.endpoint import free_endpoint
@@ -79,7 +79,7 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
         operator.forget()
         time.sleep(0.5)
         host, known = HostTime(operator), {fault["tick"] for fault in operator.status()["faults"]}
-        readers.kill()
+        end(readers)
         asked_s = time.monotonic()
         if by == "query":
             operator.ask("hal/estop", {"who": "operator"}, 10.0)

@@ -16,47 +16,34 @@ READY_S = 30.0
 
 
 @contextmanager
-def flood(folder: Path, kind: str, endpoint: str, amount: int, processes: int = 1) -> Iterator[list["Flooder"]]:
-    """So many processes of one kind of `tests.attack.means.flooder`, ready; killed at the end."""
-    started = [Flooder(folder / f"{kind}-{i}.said", kind, endpoint, amount) for i in range(processes)]
-    try:
-        for flooder in started:
-            flooder.is_ready()
-        yield started
-    finally:
-        for flooder in started:
-            flooder.kill()
-
-
-class Flooder:
-    """One process."""
-
-    def __init__(self, said: Path, kind: str, endpoint: str, amount: int) -> None:
-        self._said = said
-        with said.open("wb") as output:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "tests.attack.means.flooder", kind, endpoint, str(amount)],
-                cwd=REPOSITORY,
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
+def flood(
+    folder: Path, kind: str, endpoint: str, amount: int, processes: int = 1
+) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """So many processes of one kind of `tests.attack.means.flooder`, at work; killed at the end."""
+    command = [sys.executable, "-m", "tests.attack.means.flooder", kind, endpoint, str(amount)]
+    logs = [folder / f"{kind}-{i}.said" for i in range(processes)]
+    with contextlib.ExitStack() as stack:
+        started: list[subprocess.Popen[bytes]] = []
+        for log in logs:
+            output = stack.enter_context(log.open("wb"))
+            process = subprocess.Popen(
+                command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
             )
+            started.append(stack.enter_context(process))
+            stack.callback(process.kill)
 
-    def is_ready(self) -> None:
-        """Wait until it is at work."""
-        wait_until(
-            lambda: "ready" in self._said.read_text(errors="replace") or self.process.poll() is not None,
-            f"{self._said.stem} at work",
-            READY_S,
-        )
-        assert self.process.poll() is None, self._said.read_text()
+        def at_work() -> bool:
+            assert all(process.poll() is None for process in started), [log.read_text() for log in logs]
+            return all("ready" in log.read_text(errors="replace") for log in logs)
 
-    def kill(self) -> None:
-        """At once; what it had on the network goes with it."""
-        self.process.kill()
-        self.process.wait()
-        if self.process.stdin is not None:
-            self.process.stdin.close()
+        wait_until(at_work, f"{kind} at work", READY_S)
+        yield started
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """At once; what it had on the network goes with it."""
+    process.kill()
+    process.wait()
 
 
 @contextmanager

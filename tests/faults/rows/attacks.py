@@ -6,14 +6,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from functools import partial
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Mode
 from tests.attack.means import datagrams
-from tests.attack.means.floods import flood, half_open
+from tests.attack.means.floods import end, flood, half_open
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import Robot, recovered, robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
 
 HALF_OPEN, IDLE, READERS, QUERIES, SAMPLES = 300, 1000, 300, 10_000, 10_000
 ANSWER_S = 10.0
@@ -36,16 +37,12 @@ FLOODS: dict[str, Flood] = {
 }
 
 
-def stopped_under(name: str) -> Measure:
+def stopped_under(name: str, request: Request) -> Iterator[Trial]:
     """The value: from the stop that is asked for to the set-points of the stop, by the host's private channel."""
-
-    def measure(request: Request) -> Iterator[Trial]:
-        with robot(request, **STANDING) as (made, observer), FLOODS[name](made):
-            for number in range(request.trials):
-                yield _stopped(request, made, observer, by_datagram=number % 2 == 1)
-        _explain(request)
-
-    return measure
+    with robot(request, **STANDING) as (made, observer), FLOODS[name](made):
+        for number in range(request.trials):
+            yield _stopped(request, made, observer, by_datagram=number % 2 == 1)
+    _explain(request)
 
 
 def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
@@ -53,7 +50,7 @@ def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
     with robot(request, **STANDING) as (made, observer):
         for number in range(request.trials):
             with flood(made.folder, "readers", made.endpoint, READERS) as (readers,):
-                yield _stopped(request, made, observer, by_datagram=number % 2 == 1, before=readers.kill)
+                yield _stopped(request, made, observer, by_datagram=number % 2 == 1, before=partial(end, readers))
     _explain(request)
 
 
@@ -65,7 +62,7 @@ def _explain(request: Request) -> None:
 
 
 def _stopped(
-    request: Request, made: Robot, observer: Observer, *, by_datagram: bool, before: Callable[[], None] | None = None
+    request: Request, made: Robot, observer: Observer, *, by_datagram: bool, before: Callable[[], object] | None = None
 ) -> Trial:
     for _ in range(TRIES):
         if observer.state() != "armed":

@@ -6,44 +6,44 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import msgspec
 
 from tests.attack.means.floods import flood
 from tests.faults.consumer import STUCK
-from tests.faults.observer import Observer, TrialError
+from tests.faults.observer import Observer
 from tests.faults.robot import robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
+from tests.harness.wait import wait_until
 
 WINDOW_S = 0.5
-DISK_BYTES = 64 * 1024
 FROZEN, FROZEN_WINDOW_S = 4, 1.0  # 20 such windows outlast Zenoh's lease of a link
 FROZEN_HZ = {"sim": 200.0, "can": 100.0}  # what one bus carries
 
 
-def cannot_keep_up(kind: str) -> Measure:
+def cannot_keep_up(kind: str, request: Request) -> Iterator[Trial]:
     """kind: `sleep` in the callback, or `disk` that is full.
 
     A cycle is missed when the set-points of a tick are those of the tick before: no command had come for it. The value:
     how many more are missed in half a second than in the worst such window before the consumer came.
     """
+    with robot(request) as (made, observer):
+        before, with_it = [_missed(observer) for _ in range(request.trials)], list[int]()
+        with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
+            for _ in range(request.trials):
+                with_it.append(_missed(observer))
+                trial = _beside_it(observer, with_it[-1] - max(before))
+                ended = process.poll() is not None and not trial.failure
+                yield msgspec.structs.replace(trial, failure="the consumer has ended") if ended else trial
+        request.note(
+            f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
+            f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
+        )
 
-    def measure(request: Request) -> Iterator[Trial]:
-        with robot(request) as (made, observer):
-            before, with_it = [_missed(observer) for _ in range(request.trials)], list[int]()
-            with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
-                for _ in range(request.trials):
-                    with_it.append(_missed(observer))
-                    trial = _beside_it(observer, with_it[-1] - max(before))
-                    ended = process.poll() is not None and not trial.failure
-                    yield msgspec.structs.replace(trial, failure="the consumer has ended") if ended else trial
-            request.note(
-                f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
-                f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
-            )
 
-    return measure
+sleeps, disk_full = (partial(cannot_keep_up, kind) for kind in ("sleep", "disk"))
 
 
 def frozen_readers(request: Request) -> Iterator[Trial]:
@@ -55,8 +55,8 @@ def frozen_readers(request: Request) -> Iterator[Trial]:
     with robot(request, rate_hz=rate_hz, controller="hold") as (made, observer), ExitStack() as stack:
         before, with_them = [_missed(observer, FROZEN_WINDOW_S) for _ in range(5)], list[int]()
         for reader in stack.enter_context(flood(request.folder, "everything", made.endpoint, 0, FROZEN)):
-            stack.callback(reader.process.send_signal, signal.SIGCONT)
-            reader.process.send_signal(signal.SIGSTOP)
+            stack.callback(reader.send_signal, signal.SIGCONT)
+            reader.send_signal(signal.SIGSTOP)
         if observer.state() != "armed":
             observer.arm()
         for _ in range(request.trials):
@@ -87,25 +87,14 @@ def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:
 
 @contextmanager
 def _consumer(kind: str, endpoint: str, namespace: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """In a mount namespace of its own, with a small disk; once it is stuck."""
-    disk = folder / "disk"
-    disk.mkdir()
-    mount = f'mount -t tmpfs -o size={DISK_BYTES} none {disk} && exec "$@"'
-    command = [sys.executable, "-m", "tests.faults.consumer", kind, endpoint, namespace, str(disk)]
+    """As soon as it is stuck."""
+    command = [sys.executable, "-m", "tests.faults.consumer", kind, endpoint, namespace]
     log = folder / "consumer.log"
     with log.open("w") as said:
-        process = subprocess.Popen(
-            ["unshare", "--mount", "sh", "-c", mount, "sh", *command], stdout=said, stderr=subprocess.STDOUT, text=True
-        )
+        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, text=True)
     try:
-        waited = 0
-        while STUCK not in log.read_text():
-            try:
-                process.wait(0.1)
-            except subprocess.TimeoutExpired:
-                waited += 1
-            if process.returncode is not None or waited > 200:
-                raise TrialError(f"the consumer did not get stuck: {log.read_text()[-500:]}")
+        wait_until(lambda: STUCK in log.read_text() or process.poll() is not None, "the consumer is stuck", 20.0)
+        assert process.poll() is None, f"the consumer did not get stuck: {log.read_text()[-500:]}"
         yield process
     finally:
         process.kill()
