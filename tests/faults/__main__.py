@@ -117,8 +117,7 @@ def _reported(row: Row, backend: str, store: Store) -> list[str]:
     outcome = "met" if verdict.met else f"NOT MET: {verdict.why}"
     retried = f", {result.retried} retried" if result.retried else ""
     trials = f"{len(result.trials)} trials{retried} in {result.took_s:.0f} s"
-    print(f"    {row.name} on {backend}: {figures}{trials}: {outcome}")
-    sys.stdout.flush()
+    print(f"    {row.name} on {backend}: {figures}{trials}: {outcome}", flush=True)
     return [] if verdict.met else [f"{row.name} on {backend}"]
 
 

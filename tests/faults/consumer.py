@@ -1,6 +1,7 @@
-"""A consumer of a robot's streams that cannot keep up. `python -m tests.faults.consumer KIND ENDPOINT NAMESPACE DISK`.
+"""A consumer of a robot's streams that cannot keep up. `python -m tests.faults.consumer KIND ENDPOINT NAMESPACE`.
 
-sleep: its callback sleeps for half a second at every sample. disk: it writes what it gets to a disk that is full.
+sleep: its callback sleeps for half a second at every sample. disk: it writes what it gets to /dev/full, which answers
+as a disk that is full.
 """
 
 import sys
@@ -13,13 +14,12 @@ from snakesim_hal.wire import keys
 
 SLEEP_S = 0.5
 KEYS = (keys.JOINTS, keys.CLOCK, keys.APPLIED, keys.JOINT_COMMAND, keys.CONTACTS, keys.POSE)
-READY = "subscribed"
 STUCK = "stuck"
 
 
 def main() -> None:
     """Until killed."""
-    kind, endpoint, namespace, disk = sys.argv[1:5]
+    kind, endpoint, namespace = sys.argv[1:]
     die_with_parent()
     said: list[bool] = []
 
@@ -31,7 +31,7 @@ def main() -> None:
 
     def writes(arrival: Arrival) -> None:
         try:
-            with Path(disk, "recording").open("ab") as file:
+            with Path("/dev/full").open("wb") as file:
                 file.write(arrival.payload)
         except OSError as error:
             if not said:
@@ -42,7 +42,6 @@ def main() -> None:
     with open_session(Link(endpoint, namespace)) as session:
         for key in KEYS:
             session.on_arrival(key, sleeps if kind == "sleep" else writes)
-        print(READY, flush=True)
         while True:
             time.sleep(1.0)
 

@@ -29,6 +29,7 @@ from snakesim_hal.wire.messages import (
 LIMIT_S = 30.0
 LOOK_S = 0.002
 ASKED = 5  # times, before nobody seems to be there
+FoundT = TypeVar("FoundT")
 MessageT = TypeVar("MessageT", bound=Message)
 
 
@@ -42,14 +43,6 @@ class Heard(Generic[MessageT]):
 
     at_ns: int
     message: MessageT
-
-
-@dataclass(frozen=True)
-class Steps:
-    """How far applied angle targets jump."""
-
-    within_rad: float  # from one tick to the next, in position mode
-    first_rad: float  # from the measured angle, where a joint enters position mode
 
 
 class Observer:
@@ -121,13 +114,13 @@ class Observer:
         for kept in (self.statuses, self.applied, self.clocks, self.joints, self.commands):
             kept.clear()
 
-    def until(self, condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> None:
-        """Listen until a condition holds. Raises TrialError with its name when it does not in time."""
+    def until(self, condition: Callable[[], FoundT | None], what: str, limit_s: float = LIMIT_S) -> FoundT:
+        """Listen until a condition holds; what it found. Raises TrialError with its name when it does not in time."""
         deadline = time.monotonic() + limit_s
         while True:
             self.listen()
-            if condition():
-                return
+            if found := condition():
+                return found
             if time.monotonic() > deadline:
                 raise TrialError(f"not within {limit_s:g} s: {what}; {self.in_words()}")
             time.sleep(LOOK_S)
@@ -150,13 +143,11 @@ class Observer:
     def description(self) -> Description:
         """The robot."""
 
-        def found() -> bool:
+        def found() -> Description | None:
             self._description = (self._descriptions.drain() or [self._description])[-1]
-            return self._description is not None
+            return self._description
 
-        self.until(found, "a description")
-        assert self._description is not None
-        return self._description
+        return self.until(found, "a description")
 
     # --- what is looked for -----------------------------------------------------------------------------------
 
@@ -164,12 +155,9 @@ class Observer:
         """The first set-points after a time that are the host's own safe action."""
         return next((h for h in self.applied if h.at_ns >= since_ns and h.message.sequence is None), None)
 
-    def safe_after_ms(self, since_ns: int, limit_s: float = 3.0) -> float:
+    def safe_after_ms(self, since_ns: int) -> float:
         """How long until then."""
-        self.until(lambda: self.first_safe(since_ns), "the safe action", limit_s)
-        safe = self.first_safe(since_ns)
-        assert safe is not None
-        return (safe.at_ns - since_ns) / 1e6
+        return (self.until(lambda: self.first_safe(since_ns), "the safe action", 3.0).at_ns - since_ns) / 1e6
 
     def first_fault(self, since_ns: int) -> Status:
         """The first status after a time that tells a fault."""
@@ -177,8 +165,7 @@ class Observer:
         def found() -> list[Status]:
             return [h.message for h in self.statuses if h.at_ns >= since_ns and h.message.lifecycle == "fault"]
 
-        self.until(found, "a fault in the status", 3.0)
-        return found()[0]
+        return self.until(found, "a fault in the status", 3.0)[0]
 
     # --- the operator -----------------------------------------------------------------------------------------
 
@@ -235,7 +222,11 @@ class Observer:
         )
         if not self.ask(keys.LIFECYCLE, request).ok:
             return False
-        self.until(lambda: self._commanded() or self.state() == "fault", "commands applied after arming", 5.0)
+
+        def follows() -> bool:
+            return self.state() == "armed" and any(h.message.sequence is not None for h in self.applied)
+
+        self.until(lambda: follows() or self.state() == "fault", "commands applied after arming", 5.0)
         return self.state() != "fault"
 
     def _make_ready(self, limit_s: float) -> None:
@@ -250,11 +241,8 @@ class Observer:
                 left_s,
             )
 
-    def _commanded(self) -> bool:
-        return any(h.message.sequence is not None for h in self.applied)
-
-    def steps(self) -> Steps:
-        """Largest steps of applied angle targets since `forget`, which `arm` calls."""
+    def steps(self) -> dict[str, float]:
+        """Largest steps of applied angle targets since `forget`, which `arm` calls; as a trial tells them."""
         within = first = 0.0
         before: AppliedCommand | None = None
         for heard in self.applied:
@@ -268,4 +256,4 @@ class Observer:
                 elif measured is not None:
                     first = max(first, abs(now.target[i] - measured.angle_rad[i]))
             before = now
-        return Steps(within, first)
+        return {"step_rad": within, "first_rad": first}

@@ -1,7 +1,6 @@
 """docs/faults.md, made from the raw results."""
 
 from collections.abc import Iterator
-from datetime import datetime
 from pathlib import Path
 
 from tests.faults.results import ROOT, Store
@@ -139,5 +138,4 @@ def _when(known: list[Result]) -> Iterator[str]:
     for result in sorted(known, key=lambda r: (r.row, r.backend)):
         yield f"| `{result.row}` | {result.backend} | {result.when} | {result.took_s:.0f} s | {result.load:g} |"
     if known:
-        newest = max(datetime.strptime(result.when, "%Y-%m-%d %H:%M") for result in known)
-        yield f"\nNewest measurement: {newest:%Y-%m-%d %H:%M}."
+        yield f"\nNewest measurement: {max(result.when for result in known)}."

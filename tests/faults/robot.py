@@ -132,15 +132,15 @@ def robot(request: Request, **dotted: Any) -> Iterator[tuple[Robot, Observer]]:
         request.retry(observer.stumbles)
 
 
-def recovered(observer: Observer, value: float | None, failure: str = "", limit_s: float = START_LIMIT_S) -> Trial:
+def recovered(observer: Observer, value: float | None, failure: str = "") -> Trial:
     """Bring the robot back by an operator's commands, and look at how its targets step."""
     try:
-        observer.arm(limit_s)
+        observer.arm(START_LIMIT_S)
     except TrialError as error:
         return Trial(value=value, failure="; ".join(filter(None, (failure, str(error)))), recovered=False)
     observer.watch(SETTLED_S)
     steps = observer.steps()
     bound = observer.description().max_step_rad
-    if max(steps.within_rad, steps.first_rad) > bound + 1e-9:
+    if max(steps.values()) > bound + 1e-9:
         failure = "; ".join(filter(None, (failure, f"a target jumped by more than {bound} rad at recovery")))
-    return Trial(value=value, failure=failure, recovered=True, step_rad=steps.within_rad, first_rad=steps.first_rad)
+    return Trial(value=value, failure=failure, recovered=True, **steps)

@@ -2,7 +2,6 @@
 
 import contextlib
 import random
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -65,48 +64,28 @@ class Stranger:
 
     # --- out of time ------------------------------------------------------------------------------------------
 
-    def stale(self) -> None:
-        """An answer to a state of twenty periods ago, with a fresh sequence."""
+    def out_of_time(self, ticks: int) -> None:
+        """An answer to a state so many periods after the newest, or before it, with a fresh sequence."""
         forged = self.forged()
-        self.send(msgspec.structs.replace(forged, tick=max(forged.tick - 20, 0)))
-
-    def future(self) -> None:
-        """An answer to a state that has not been yet."""
-        forged = self.forged()
-        self.send(msgspec.structs.replace(forged, tick=forged.tick + 50))
+        self.send(msgspec.structs.replace(forged, tick=max(forged.tick + ticks, 0)))
 
     def without_arming(self) -> None:
         """An answer to the newest state that names no arming."""
         self.send(self.forged(arming=0))
 
-    def replayed(self) -> None:
-        """The bytes of a command of a while ago."""
-        self._resend(20)
-
-    def reordered(self) -> None:
-        """The bytes of the command before the newest one."""
-        self._resend(2)
-
-    def duplicated(self) -> None:
-        """The bytes of the newest command once more."""
-        self._resend(1)
-
-    def _resend(self, back: int) -> None:
+    def again(self, back: int) -> None:
+        """The bytes of the controller's newest command (1), or of an older one."""
         _, payload = self._of_controller(back)
         send_raw(self.observer.session, payload)
 
     # --- wrong in itself --------------------------------------------------------------------------------------
 
-    def number(self, value: float) -> Callable[[], None]:
+    def number(self, value: float) -> None:
         """One target is this number."""
-
-        def act() -> None:
-            forged = self.forged()
-            target = list(forged.target)
-            target[self.random.randrange(len(target))] = value
-            self.send(msgspec.structs.replace(forged, target=target))
-
-        return act
+        forged = self.forged()
+        target = list(forged.target)
+        target[self.random.randrange(len(target))] = value
+        self.send(msgspec.structs.replace(forged, target=target))
 
     def wrong_length(self) -> None:
         """One joint too few."""

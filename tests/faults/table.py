@@ -1,7 +1,7 @@
 """Every row of the fault table, in its order. The fault, what is expected, the deadline, and how it is measured."""
 
-import signal
 from dataclasses import dataclass
+from functools import partial
 
 from snakesim_hal.injection import KINDS
 from snakesim_hal.wire import keys
@@ -88,7 +88,7 @@ def joint_row(name: str, kind: str, what: str) -> Row:
         "50 ms from right after the module's last good answer to the safe action on the bus",
         50.0,
         "ms",
-        {"sim": NO_MODULES, "can": modules.at_host(kind, what)},
+        {"sim": NO_MODULES, "can": partial(modules.at_host, kind, what)},
     )
 
 
@@ -101,13 +101,13 @@ def asked_row(name: str, fault: str, expected: str, measure: Measure) -> Row:
 def sensor_row(name: str, fault: str, kind: str) -> Row:
     """What any backend's sensors can do."""
     expected = "fault names the joint, group to safe stop, latched"
-    return asked_row(name, fault, expected, modules.through_robot(kind))
+    return asked_row(name, fault, expected, partial(modules.through_robot, kind))
 
 
 def isolated_row(name: str, fault: str, kind: str) -> Row:
     """One joint fails, and the robot may lose one."""
     expected = "fault names the joint, it alone is let go; the others go on; a clear takes it back"
-    return asked_row(name, fault, expected, isolation.set_aside(kind))
+    return asked_row(name, fault, expected, partial(isolation.set_aside, kind))
 
 
 def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * PERIOD_MS) -> Row:
@@ -119,7 +119,7 @@ def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * P
         f"{limit_ms:.0f} ms to the safe action on the bus",
         limit_ms,
         "ms",
-        {"sim": NO_BUS, "can": modules.at_host(kind, what)},
+        {"sim": NO_BUS, "can": partial(modules.at_host, kind, what)},
     )
 
 
@@ -138,8 +138,13 @@ def stream_row(name: str, key: str, oldest_ms: float) -> Row:
         f"{oldest_ms:.0f} ms, which is how old it may be, and a tick (10 ms) of injector, control and host",
         oldest_ms + 3 * PERIOD_MS,
         "ms",
-        both(streams.withheld(key)),
+        both(partial(streams.withheld, key)),
     )
+
+
+def flood_row(name: str, fault: str, flood: str) -> Row:
+    """An emergency stop under a flood of `attacks.FLOODS`."""
+    return stop_row(name, fault, partial(attacks.stopped_under, flood))
 
 
 def stop_row(name: str, fault: str, measure: Measure) -> Row:
@@ -170,8 +175,8 @@ HEADINGS: tuple[Heading, ...] = (
         "100 ms",
         (
             watchdog_row("host_silent", "the host says nothing any more, at one module", guest.watchdog, 100.0),
-            watchdog_row("host_killed", "host: SIGKILL", guest.host_gone(signal.SIGKILL), IN_GUEST_MS, "guest"),
-            watchdog_row("host_frozen", "host: SIGSTOP", guest.host_gone(signal.SIGSTOP), IN_GUEST_MS, "guest"),
+            watchdog_row("host_killed", "host: SIGKILL", guest.host_killed, IN_GUEST_MS, "guest"),
+            watchdog_row("host_frozen", "host: SIGSTOP", guest.host_frozen, IN_GUEST_MS, "guest"),
         ),
     ),
     Heading(
@@ -367,14 +372,8 @@ HEADINGS: tuple[Heading, ...] = (
         "only that consumer suffers; zero missed control cycles",
         "-",
         (
-            consumer_row(
-                "consumer_sleeps",
-                "a consumer's callback sleeps for 0.5 s at every sample",
-                consumers.cannot_keep_up("sleep"),
-            ),
-            consumer_row(
-                "consumer_disk_full", "a consumer writes to a disk that is full", consumers.cannot_keep_up("disk")
-            ),
+            consumer_row("consumer_sleeps", "a consumer's callback sleeps for 0.5 s at every sample", consumers.sleeps),
+            consumer_row("consumer_disk_full", "a consumer writes to a disk that is full", consumers.disk_full),
             consumer_row(
                 "consumer_frozen", "four readers of everything are frozen (SIGSTOP)", consumers.frozen_readers
             ),
@@ -385,17 +384,11 @@ HEADINGS: tuple[Heading, ...] = (
         "stopped at once, whatever else goes on",
         f"{STOP_MS:.0f} ms",
         (
-            stop_row("stop_half_open", "300 half-open connections", attacks.stopped_under("half_open")),
-            stop_row("stop_idle", "1000 sessions that do nothing, or as many as get in", attacks.stopped_under("idle")),
-            stop_row("stop_lease_flood", "lease queries, as many as two processes can", attacks.stopped_under("lease")),
-            stop_row(
-                "stop_sample_flood", "10,000 samples of noise a second on every key", attacks.stopped_under("garbage")
-            ),
-            stop_row(
-                "stop_datagram_flood",
-                "wrong datagrams at the stop port, as many as a thread can",
-                attacks.stopped_under("datagrams"),
-            ),
+            flood_row("stop_half_open", "300 half-open connections", "half_open"),
+            flood_row("stop_idle", "1000 sessions that do nothing, or as many as get in", "idle"),
+            flood_row("stop_lease_flood", "lease queries, as many as two processes can", "lease"),
+            flood_row("stop_sample_flood", "10,000 samples of noise a second on every key", "garbage"),
+            flood_row("stop_datagram_flood", "wrong datagrams at the stop port, as many as a thread can", "datagrams"),
             stop_row(
                 "stop_readers_leave", "300 readers of everything leave at once", attacks.stopped_while_readers_leave
             ),

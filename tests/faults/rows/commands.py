@@ -5,17 +5,18 @@ import random
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 
 import msgspec
 
-from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import JointCommand, LeaseRequest, LifecycleRequest
+from snakesim_hal.wire.messages import JointCommand, LeaseRequest
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import robot
 from tests.faults.row import Request, Trial
 from tests.faults.stranger import FORGED, Stranger
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, state
+from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command
+from tests.unit.hal.safety.authority_rig import ROBOT, armed
 
 EACH = 3  # of every kind in a trial
 COUNTED_S = 1.5  # until the status must have counted them
@@ -30,11 +31,11 @@ def out_of_time(request: Request) -> Iterator[Trial]:
 
     def kinds(stranger: Stranger) -> Kinds:
         return {
-            "stale": (stranger.stale, "stale"),
-            "replayed": (stranger.replayed, "replayed"),
-            "reordered": (stranger.reordered, "replayed"),
-            "duplicated": (stranger.duplicated, "replayed"),
-            "future": (stranger.future, "from_the_future"),
+            "stale": (partial(stranger.out_of_time, -20), "stale"),
+            "replayed": (partial(stranger.again, 20), "replayed"),
+            "reordered": (partial(stranger.again, 2), "replayed"),
+            "duplicated": (partial(stranger.again, 1), "replayed"),
+            "future": (partial(stranger.out_of_time, 50), "from_the_future"),
             "without an arming": (stranger.without_arming, "before_arming"),
         }
 
@@ -46,9 +47,9 @@ def wrong_in_itself(request: Request) -> Iterator[Trial]:
 
     def kinds(stranger: Stranger) -> Kinds:
         return {
-            "NaN": (stranger.number(float("nan")), "malformed"),
-            "infinity": (stranger.number(float("inf")), "malformed"),
-            "out of range (1e9 rad)": (stranger.number(1e9), "malformed"),
+            "NaN": (partial(stranger.number, float("nan")), "malformed"),
+            "infinity": (partial(stranger.number, float("inf")), "malformed"),
+            "out of range (1e9 rad)": (partial(stranger.number, 1e9), "malformed"),
             "wrong length": (stranger.wrong_length, "wrong_length"),
             "wrong joint order": (stranger.wrong_order, "wrong_layout"),
             "malformed": (stranger.malformed, "malformed"),
@@ -160,7 +161,6 @@ def interleaved(request: Request) -> Iterator[Trial]:
     )
 
 
-ROBOT = description()
 OWN, THEIRS = command(ROBOT, 0.1), command(ROBOT, 0.3)
 
 
@@ -168,31 +168,26 @@ class TwoWriters:
     """A robot that the first writer has armed. The second asks for the lease, and commands with guessed epochs."""
 
     def __init__(self, rng: random.Random) -> None:
-        self.rng, self.authority = rng, Authority(ROBOT)
-        self.now_ns, self.tick, self.own, self.theirs = 0, 0, 0, FORGED
-        self.authority.observe(state(ROBOT, 0.1))
-        assert self.authority.on_lease(LeaseRequest(action="acquire", holder="first"), 0).ok
-        self.epoch = self.authority.lease.epoch
-        self.first()
-        arm = LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=ROBOT.config_hash)
-        assert self.authority.on_lifecycle(arm, 0).ok
+        self.rng, self.rig, self.theirs = rng, armed(), FORGED
+        self.authority = self.rig.authority
+        self.epoch, self.holder = self.authority.lease.epoch, self.authority.lease.holder
 
     def interleave(self) -> int:
         """Some moves of both within a lease term; how many set-points or rights the second one got by them."""
         got = 0
         moves = [self.first, self.second_commands, self.second_asks, self.rng.choice((self.second_commands, self.ends))]
         for move in self.rng.sample(moves, MOVES):
-            self.now_ns += self.rng.randrange(PERIOD_NS // 2)
+            self.rig.now_ns += self.rng.randrange(PERIOD_NS // 2)
             got += move()
         decision = self.authority.decide()
-        self.authority.expire(self.now_ns, self.tick)
-        armed = self.authority.state == "armed"
-        return got + (decision.sequence is not None and decision.sequence >= FORGED) + (not armed)
+        self.authority.expire(self.rig.now_ns, self.rig.tick)
+        stopped = self.authority.state != "armed"
+        return got + (decision.sequence is not None and decision.sequence >= FORGED) + stopped
 
     def first(self) -> bool:
         """The first commands, with its own epoch."""
-        self.own += 1
-        assert self._offer(OWN, self.own, self.epoch) is None
+        self.rig.sequence += 1
+        assert self._offer(OWN, self.rig.sequence, self.epoch) is None
         return False
 
     def second_commands(self) -> bool:
@@ -209,18 +204,16 @@ class TwoWriters:
             epoch=self.epoch,
             priority=self.rng.randrange(101),
         )
-        answer = self.authority.on_lease(asked, self.now_ns)
-        return answer.ok or self.authority.lease.holder != "first"
+        answer = self.authority.on_lease(asked, self.rig.now_ns)
+        return answer.ok or self.authority.lease.holder != self.holder
 
     def ends(self) -> bool:
         """A tick ends."""
-        self.tick += 1
-        self.authority.observe(state(ROBOT, 0.1))
+        self.rig.tick += 1
+        self.rig.observe(0.1)
         return False
 
     def _offer(self, given: JointCommand, sequence: int, epoch: int) -> str | None:
-        made = msgspec.structs.replace(
-            given, sequence=sequence, tick=self.tick, lease_epoch=epoch, arming=self.authority.arming
-        )
-        age_ns = self.rng.randrange(LEASE_NS)
-        return self.authority.offer(made, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
+        tick, now_ns, arming = self.rig.tick, self.rig.now_ns, self.authority.arming
+        made = msgspec.structs.replace(given, sequence=sequence, tick=tick, lease_epoch=epoch, arming=arming)
+        return self.authority.offer(made, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS))

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from signal import SIGCONT, SIGKILL, SIGSTOP
 
 from snakesim_hal.wire.messages import Mode
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, recovered, robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
 from tests.faults.stranger import send_raw
 
 HANG_S = 0.5
@@ -16,10 +17,11 @@ REFUSED_S = 1.5  # until the status must have counted them
 UNDER_WAY_S = 0.1  # until what a dead host has sent has come
 LATCHED_S = 0.15  # how long a fault must be seen to stay, with a controller that commands again
 
+Fail = Callable[[Robot, Observer], int]
+Mend = Callable[[Robot], object]
 
-def _trial(
-    made: Robot, observer: Observer, fail: Callable[[Robot, Observer], int], mend: Callable[[Robot], object]
-) -> Trial:
+
+def _trial(made: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
     made.set_in_motion(observer)
     failed_ns = fail(made, observer)
     value = observer.safe_after_ms(failed_ns)
@@ -38,15 +40,11 @@ def _trial(
     return recovered(observer, value, "; ".join(failures))
 
 
-def _failing(fail: Callable[[Robot, Observer], int], mend: Callable[[Robot], object]) -> Measure:
+def _failing(fail: Fail, mend: Mend, request: Request) -> Iterator[Trial]:
     """fail: when it began, by the monotonic clock; mend: before the operator clears."""
-
-    def measure(request: Request) -> Iterator[Trial]:
-        with robot(request) as (made, observer):
-            for _ in range(request.trials):
-                yield _trial(made, observer, fail, mend)
-
-    return measure
+    with robot(request) as (made, observer):
+        for _ in range(request.trials):
+            yield _trial(made, observer, fail, mend)
 
 
 def _hang(_made: Robot, observer: Observer) -> int:
@@ -56,9 +54,11 @@ def _hang(_made: Robot, observer: Observer) -> int:
     return now_ns
 
 
-killed = _failing(lambda made, _: made.signal("control", SIGKILL), lambda made: made.start("control"))
-frozen = _failing(lambda made, _: made.signal("control", SIGSTOP), lambda made: made.signal("control", SIGCONT))
-hung = _failing(_hang, lambda _: None)
+killed = partial(_failing, lambda made, _: made.signal("control", SIGKILL), lambda made: made.start("control"))
+frozen = partial(
+    _failing, lambda made, _: made.signal("control", SIGSTOP), lambda made: made.signal("control", SIGCONT)
+)
+hung = partial(_failing, _hang, lambda _: None)
 
 
 def host_restarts(request: Request) -> Iterator[Trial]:

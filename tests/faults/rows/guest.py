@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, node_of
@@ -20,7 +21,7 @@ from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.network.session import Link, open_session
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
 from tests.unit.can_backend.twin.rig import BOOTED, MS, QUIET, Module, armed, set_point
 from tests.unit.hal.rig import write_files
 from tests.vcan.test_killed import (
@@ -48,37 +49,36 @@ AFTER_STEP_S = 1.0
 ATTEMPTS = 3
 
 
-def host_gone(number: signal.Signals) -> Measure:
+def host_gone(number: signal.Signals, request: Request) -> Iterator[Trial]:
     """SIGKILL or SIGSTOP for the host. The value: from the last set-point to the fault, in the module's own time."""
+    rng, by_kernel_ms, done = random.Random(7), list[float](), 0
+    with bench(request.folder, CHANNEL) as robot:
+        robot.modules()
+        robot.control()
+        while done < request.trials:
+            trial: Trial | None = None
+            try:
+                with _armed_host(request, robot) as pid:
+                    robot.listener.forget()
+                    time.sleep(LIVE_S + rng.random() / RATE_HZ)
+                    trial = _left_alone(robot, pid, number, by_kernel_ms)
+            except TrialError as error:  # it could not be armed: with a new host, perhaps
+                print(f"    made again: {error}", flush=True)
+            if trial is not None:
+                done += 1
+                yield trial
+                continue
+            request.retry()
+            if request.retried > MAX_RETRIES * request.trials:
+                raise TrialError(f"this machine is too busy: the robot stopped by itself {request.retried} times")
+    request.note(
+        f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
+        f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
+        f"{max(by_kernel_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
+    )
 
-    def measure(request: Request) -> Iterator[Trial]:
-        rng, by_kernel_ms, done = random.Random(7), list[float](), 0
-        with bench(request.folder, CHANNEL) as robot:
-            robot.modules()
-            robot.control()
-            while done < request.trials:
-                trial: Trial | None = None
-                try:
-                    with _armed_host(request, robot) as pid:
-                        robot.listener.forget()
-                        time.sleep(LIVE_S + rng.random() / RATE_HZ)
-                        trial = _left_alone(robot, pid, number, by_kernel_ms)
-                except TrialError as error:  # it could not be armed: with a new host, perhaps
-                    print(f"    made again: {error}", flush=True)
-                if trial is not None:
-                    done += 1
-                    yield trial
-                    continue
-                request.retry()
-                if request.retried > MAX_RETRIES * request.trials:
-                    raise TrialError(f"this machine is too busy: the robot stopped by itself {request.retried} times")
-        request.note(
-            f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
-            f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
-            f"{max(by_kernel_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
-        )
 
-    return measure
+host_killed, host_frozen = (partial(host_gone, number) for number in (signal.SIGKILL, signal.SIGSTOP))
 
 
 def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: list[float]) -> Trial | None:

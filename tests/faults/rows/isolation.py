@@ -8,32 +8,28 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, LifecycleRequest, Mode
 from tests.faults.observer import Heard, Observer, TrialError
 from tests.faults.robot import recovered, robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
 
 ASKED_FOR_S = 0.3
 MORE_S = 0.1  # that the others are watched for, when the joint is sound again
 MAY_LOSE_ONE = {"robot__safety__may_lose_joints": 1}
 
 
-def set_aside(kind: str) -> Measure:
+def set_aside(kind: str, request: Request) -> Iterator[Trial]:
     """The value: from the request to the injector to the first set-points that leave the joint passive."""
-
-    def measure(request: Request) -> Iterator[Trial]:
-        rng = random.Random(7)
-        with robot(request, **MAY_LOSE_ONE) as (made, observer):
-            names = [joint.name for joint in observer.description().joints]
-            for _ in range(request.trials):
-                made.set_in_motion(observer)
-                joint = rng.randrange(len(names))
-                asked_ns = time.monotonic_ns()
-                observer.inject("hal", kind, names[joint], for_s=ASKED_FOR_S)
-                value = (_let_go(observer, joint, asked_ns).at_ns - asked_ns) / 1e6
-                observer.watch(ASKED_FOR_S + MORE_S)
-                failures = _objections(observer, names[joint], asked_ns)
-                _take_back(observer)
-                yield recovered(observer, value, "; ".join(failures))
-
-    return measure
+    rng = random.Random(7)
+    with robot(request, **MAY_LOSE_ONE) as (made, observer):
+        names = [joint.name for joint in observer.description().joints]
+        for _ in range(request.trials):
+            made.set_in_motion(observer)
+            joint = rng.randrange(len(names))
+            asked_ns = time.monotonic_ns()
+            observer.inject("hal", kind, names[joint], for_s=ASKED_FOR_S)
+            value = (_let_go(observer, joint, asked_ns).at_ns - asked_ns) / 1e6
+            observer.watch(ASKED_FOR_S + MORE_S)
+            failures = _objections(observer, names[joint], asked_ns)
+            _take_back(observer)
+            yield recovered(observer, value, "; ".join(failures))
 
 
 def _let_go(observer: Observer, joint: int, since_ns: int) -> Heard[AppliedCommand]:
@@ -43,8 +39,7 @@ def _let_go(observer: Observer, joint: int, since_ns: int) -> Heard[AppliedComma
         passive = (h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint] is Mode.PASSIVE)
         return [heard for heard in passive if heard.message.sequence is not None]
 
-    observer.until(found, "the joint is let go", 3.0)
-    return found()[0]
+    return observer.until(found, "the joint is let go", 3.0)[0]
 
 
 def _objections(observer: Observer, name: str, since_ns: int) -> list[str]:

@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import Answer, Status
 from tests.faults import bus_log
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
 
 PERIOD_MS = 10.0
 ASKED_FOR_S = 0.3
@@ -27,26 +27,22 @@ BUS_LOG = "bus.log"
 SAID_AT = re.compile(r"at ([0-9.]+) s of robot time")
 
 
-def at_host(kind: str, what: str) -> Measure:
+def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
     """A fault of joint_N or bus_1 on CAN, asked of the host. what: the name that the driver gives it.
 
     The value: from its beginning, which is just before a Sync, to the safe action, which goes out where the set-points
     of that period would have; for a module from its last good answer, a period earlier.
     """
-
-    def measure(request: Request) -> Iterator[Trial]:
-        rng, log = random.Random(5), request.folder / BUS_LOG
-        with robot(request, backend__log=str(log)) as (made, observer):
-            for _ in range(request.trials):
-                made.set_in_motion(observer)
-                number = rng.randrange(len(observer.description().joints)) + 1
-                yield _trial(observer, Injection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}"), what)
-        stops = bus_log.commands(bus_log.read(log), Action.STOP)
-        if kind not in CUT_OFF and stops < request.trials:
-            raise TrialError(f"{stops} Stops on the bus in {request.trials} trials")
-        request.note("the real host process, in real time; counted in its periods")
-
-    return measure
+    rng, log = random.Random(5), request.folder / BUS_LOG
+    with robot(request, backend__log=str(log)) as (made, observer):
+        for _ in range(request.trials):
+            made.set_in_motion(observer)
+            number = rng.randrange(len(observer.description().joints)) + 1
+            yield _trial(observer, Injection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}"), what)
+    stops = bus_log.commands(bus_log.read(log), Action.STOP)
+    if kind not in CUT_OFF and stops < request.trials:
+        raise TrialError(f"{stops} Stops on the bus in {request.trials} trials")
+    request.note("the real host process, in real time; counted in its periods")
 
 
 def _trial(observer: Observer, injection: Injection, what: str) -> Trial:
@@ -112,26 +108,22 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
     request.note("the real host process, which says why it refuses; enabled is what its bus log shows")
 
 
-def through_robot(kind: str) -> Measure:
+def through_robot(kind: str, request: Request) -> Iterator[Trial]:
     """A joint's sensor fails while the robot moves.
 
     The value: from the request to the injector to the first safe set-points that were heard of.
     """
-
-    def measure(request: Request) -> Iterator[Trial]:
-        rng = random.Random(6)
-        with robot(request) as (made, observer):
-            for _ in range(request.trials):
-                made.set_in_motion(observer)
-                joint = f"joint_{rng.randrange(len(observer.description().joints)) + 1}"
-                asked_ns = time.monotonic_ns()
-                observer.inject("hal", kind, joint, for_s=ASKED_FOR_S)
-                value = observer.safe_after_ms(asked_ns)
-                status = observer.first_fault(asked_ns)
-                failures: list[str] = []
-                if not any(joint in fault.cause or fault.joint == joint for fault in status.faults):
-                    failures.append(f"{joint} was not named: {[fault.cause for fault in status.faults]}")
-                observer.watch(ASKED_FOR_S)
-                yield recovered(observer, value, "; ".join(failures))
-
-    return measure
+    rng = random.Random(6)
+    with robot(request) as (made, observer):
+        for _ in range(request.trials):
+            made.set_in_motion(observer)
+            joint = f"joint_{rng.randrange(len(observer.description().joints)) + 1}"
+            asked_ns = time.monotonic_ns()
+            observer.inject("hal", kind, joint, for_s=ASKED_FOR_S)
+            value = observer.safe_after_ms(asked_ns)
+            status = observer.first_fault(asked_ns)
+            failures: list[str] = []
+            if not any(joint in fault.cause or fault.joint == joint for fault in status.faults):
+                failures.append(f"{joint} was not named: {[fault.cause for fault in status.faults]}")
+            observer.watch(ASKED_FOR_S)
+            yield recovered(observer, value, "; ".join(failures))

@@ -8,7 +8,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Mode
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import Robot, recovered, robot
-from tests.faults.row import Measure, Request, Trial
+from tests.faults.row import Request, Trial
 
 ALONG_PEGS = {"scene": "peg_row", "mission__speed_m_s": 0.2}  # where the snake pushes for as long as it takes
 PUSHES = 5  # ticks in a row with a joint in torque mode, before a stream is cut
@@ -34,31 +34,27 @@ def no_joints(request: Request) -> Iterator[Trial]:
             yield recovered(observer, value, "; ".join(failures))
 
 
-def withheld(key: str) -> Measure:
+def withheld(key: str, request: Request) -> Iterator[Trial]:
     """The value: from the request to the injector to the last set-points with which a joint pushed."""
-
-    def measure(request: Request) -> Iterator[Trial]:
-        with robot(request, **ALONG_PEGS) as (made, observer):
-            states = observer.session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
-            back_ms: list[float] = []
-            for _ in range(request.trials):
-                _pushing(made, observer)
-                states.drain()
-                asked_ns = _cut(observer, key)
-                observer.until(lambda: _named(states.drain(), key), f"{key} named in control/state", BACK_S)
-                observer.watch(AWAY_S)
-                value, failures = _held(observer, asked_ns)
-                yield _back(observer, key, value, failures, back_ms)
-            request.note(
-                "along `peg_row` at 0.2 m/s; until the first set-points with which no joint pushes, nor does again "
-                f"while the stream is away, for {AWAY_S:g} s more"
-            )
-            request.note(
-                f"goes on by itself: a joint pushes again {min(back_ms):.0f} to {max(back_ms):.0f} ms "
-                "after the stream is back"
-            )
-
-    return measure
+    with robot(request, **ALONG_PEGS) as (made, observer):
+        states = observer.session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
+        back_ms: list[float] = []
+        for _ in range(request.trials):
+            _pushing(made, observer)
+            states.drain()
+            asked_ns = _cut(observer, key)
+            observer.until(lambda: _named(states.drain(), key), f"{key} named in control/state", BACK_S)
+            observer.watch(AWAY_S)
+            value, failures = _held(observer, asked_ns)
+            yield _back(observer, key, value, failures, back_ms)
+        request.note(
+            "along `peg_row` at 0.2 m/s; until the first set-points with which no joint pushes, nor does again "
+            f"while the stream is away, for {AWAY_S:g} s more"
+        )
+        request.note(
+            f"goes on by itself: a joint pushes again {min(back_ms):.0f} to {max(back_ms):.0f} ms "
+            "after the stream is back"
+        )
 
 
 def _cut(observer: Observer, key: str) -> int:
@@ -113,11 +109,8 @@ def _back(observer: Observer, key: str, value: float | None, failures: list[str]
         return [h.at_ns for h in observer.applied if Mode.TORQUE in h.message.mode]
 
     try:
-        observer.until(pushing, "a joint pushes again", BACK_S)
+        back_ns = observer.until(pushing, "a joint pushes again", BACK_S)[0]
     except TrialError as error:
         return Trial(value=value, failure="; ".join([*failures, str(error)]), recovered=False)
-    back_ms.append((pushing()[0] - began_ns) / 1e6)
-    steps = observer.steps()
-    return Trial(
-        value=value, failure="; ".join(failures), recovered=True, step_rad=steps.within_rad, first_rad=steps.first_rad
-    )
+    back_ms.append((back_ns - began_ns) / 1e6)
+    return Trial(value=value, failure="; ".join(failures), recovered=True, **observer.steps())
