@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.R
 
 
 @contextmanager
-def recorded() -> "Iterator[list[dict[str, float]]]":
+def recorded() -> Iterator[list[dict[str, float]]]:
     """Forces of the obstacles that the body touches, one dict a physics step of the run within."""
     steps: list[dict[str, float]] = []
     feel = ContactReader._feel  # pyright: ignore[reportPrivateUsage] - called in every physics step
@@ -75,11 +76,8 @@ def recorded() -> "Iterator[list[dict[str, float]]]":
         steps.append(found)
         feel(self)
 
-    ContactReader._feel = felt  # pyright: ignore[reportPrivateUsage]
-    try:
+    with mock.patch.object(ContactReader, "_feel", felt):
         yield steps
-    finally:
-        ContactReader._feel = feel  # pyright: ignore[reportPrivateUsage]
 
 
 def case(scenario: str, label: str, controller: Any, **options: Any) -> tuple[float, str]:

@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.advance import Advance
 from snakesim_operator.run.in_process import Result, simulate
+from tests.whole_run import configure
 
 LOST_S = 3.0
 
 
 def over_can(*sets: str) -> Result:
     """The shipped scenario with nothing changed but the backend and these."""
-    config = load("surveyed_clutter", [parse_set(text) for text in ("backend=can", *sets)]).config
-    return simulate(config, until_goal=True)
+    return simulate(configure("surveyed_clutter", "backend=can", *sets), until_goal=True)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import csv
 import json
 import struct
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
@@ -33,14 +34,10 @@ def whole(run: Path) -> bytes:
     return content
 
 
-def lost(whole_path: Path, path: Path) -> dict[str, int]:
+def lost(whole_path: Path, path: Path) -> Counter[str]:
     """By key, by comparison with the file as it was."""
-    counts = [dict[str, int](), dict[str, int]()]
-    for count, reader in zip(counts, (RecordingReader(whole_path), RecordingReader(path)), strict=True):
-        for one in reader.messages():
-            count[one.key] = count.get(one.key, 0) + 1
-    missing = {key: number - counts[1].get(key, 0) for key, number in counts[0].items()}
-    return {key: number for key, number in missing.items() if number}
+    before, after = (Counter(one.key for one in RecordingReader(of).messages()) for of in (whole_path, path))
+    return before - after
 
 
 def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key(
@@ -105,7 +102,7 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
         assert json.loads(ended.out)["lacks"]["a"] and not json.loads(ended.out)["lacks"]["b"]
 
 
-def test_a_whole_recording_says_nothing_of_it(whole: bytes, tmp_path: Path) -> None:
+def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole: bytes, tmp_path: Path) -> None:
     for name in ("whole.mcap", "a.mcap"):
         written(tmp_path / name, whole)
     for command in COMMANDS:
@@ -113,6 +110,9 @@ def test_a_whole_recording_says_nothing_of_it(whole: bytes, tmp_path: Path) -> N
         assert ended.code == 0 and not ended.err, ended
     page = (tmp_path / "a.html").read_text()
     assert "The run ended early" not in page and "The record lacks" not in page
+    # What repeats the run names a file that can be.
+    assert "snakesim run config.json --backend sim" in page and "a.mcap/config.json" not in page
+    assert "Save the effective configuration below as <code>config.json</code>" in page
 
 
 def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: bytes, tmp_path: Path) -> None:
@@ -158,14 +158,6 @@ def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: byt
     compared = snakesim("compare", "whole.mcap", "a.mcap", cwd=tmp_path)
     assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
     assert "in what both records hold: " in compared.out and "for all of their" not in compared.out
-
-
-def test_the_command_that_repeats_a_run_names_a_file_that_can_be(run: Path, whole: bytes, tmp_path: Path) -> None:
-    written(tmp_path / "a.mcap", whole)
-    snakesim("report", "a.mcap", cwd=tmp_path)
-    page = (tmp_path / "a.html").read_text()
-    assert "snakesim run config.json --backend sim" in page and "a.mcap/config.json" not in page
-    assert "Save the effective configuration below as <code>config.json</code>" in page
 
 
 def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:

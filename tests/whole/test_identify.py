@@ -43,14 +43,8 @@ def test_hidden_parameters_are_found_and_written_down(tmp_path: Path) -> None:
 
 
 def test_a_robot_that_does_not_hang_is_not_identified(tmp_path: Path) -> None:
-    sets = (
-        "--set",
-        "backends.sim.hung=false",
-        "--set",
-        "robot.chain.modules=3",
-        "--set",
-        "robot.motor.friction_nm=0.1",
-    )
+    given = ("backends.sim.hung=false", "robot.chain.modules=3", "robot.motor.friction_nm=0.1")
+    sets = [word for text in given for word in ("--set", text)]
     run_to_summary(tmp_path / "run", "identify", "--duration", "12", *sets)
     (tmp_path / "snake.toml").write_text(ROBOT)
     ended = snakesim("identify", "run", "--write", "snake.toml", cwd=tmp_path)

@@ -77,14 +77,6 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
     assert result.code == 3 and "lacks: its end: it breaks off at " in result.out
 
 
-def test_a_page_is_made_of_a_recording_alone(run: Path, tmp_path: Path) -> None:
-    (tmp_path / "lone.mcap").write_bytes((run / RECORDING).read_bytes())
-    ended = snakesim("report", "lone.mcap", cwd=tmp_path)
-    assert ended.code == 0 and "clutter" in (tmp_path / "lone.html").read_text()
-    compared = snakesim("compare", str(run), "lone.mcap", "--within", "0", cwd=tmp_path)
-    assert compared.code == 0 and "The runs are the same, joint by joint" in compared.out, compared.out
-
-
 def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     record = RunRecord.load(run)
     for form in ("npz", "csv", "mcap"):
@@ -107,16 +99,10 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
     ended = snakesim("export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
     assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
-    assert (info["codebase_version"], info["fps"], info["total_frames"], info["total_episodes"]) == (
-        "v3.0",
-        100,
-        400,
-        2,
-    )
-    (episode, second), n = (
-        parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist(),
-        200,
-    )
+    wanted = {"codebase_version": "v3.0", "fps": 100, "total_frames": 400, "total_episodes": 2}
+    assert info.items() >= wanted.items(), info
+    n = 200
+    episode, second = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [episode[f"dataset_{end}_index"] for end in ("from", "to")] == [0, n] and second["dataset_from_index"] == n
     assert second["tasks"] == ["clutter"] and second["length"] == n and second["stats/index/min"] == [n]
     at = {"chunk_index": second["data/chunk_index"], "file_index": second["data/file_index"]}

@@ -1,6 +1,5 @@
 """A recorded run, looked at: as a film, and as the console shows it."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +8,15 @@ from PIL import Image
 
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.recorded import RecordedRun
-from tests.whole.command import snakesim
+from tests.whole.command import run_to_summary, snakesim
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("filmed")
-    ended = snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", str(folder / "run"), cwd=folder)
-    assert ended.code == 0, ended.out + ended.err
-    yield folder / "run"
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("filmed") / "run"
+    ended, _ = run_to_summary(out, "triplet", "--duration", "1")
+    assert ended.code == 0, ended.said
+    return out
 
 
 def film(run: Path, out: Path, *more: str) -> str:
