@@ -11,7 +11,6 @@ import pytest
 
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.lab.lab_file import EXAMPLE
-from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import SNAKESIM, summary_of
 from tests.machines import NET, connected
 
@@ -25,14 +24,20 @@ LIMIT_S = 120.0
 
 
 class Lab:
-    """The example lab, rendered, its machines running."""
+    """The example lab, rendered, its machines and programs running."""
 
     def __init__(self, folder: Path, backend: str, stack: ExitStack) -> None:
-        self.folder, self.backend = folder, backend
+        self.folder = folder
         self.machines = connected(["hub", "robot1", "ws1", "laptop"], stack)
         (folder / "lab.toml").write_text(example(folder, backend))
         for step in ("certs", "render"):
             self.at("hub", "deploy", step, "lab.toml", "--out", ".")
+        scenario = (*SCENARIO, "--backend", backend)
+        self.start("hub", "router", "router", str(folder / "hub" / "router.main.json5"))
+        out = ("--once", "--out", str(folder / "record"))
+        self.start("robot1", "host", "host", *scenario, *self.session("robot1", "robot.planar13"), *out)
+        for name in ("guidance", "navigation", "control"):
+            self.start("ws1", name, "service", name, *scenario, *self.session("ws1", "gnc.planar13"))
 
     def at(self, machine: str, *arguments: str, check: bool = True) -> str:
         """A `snakesim` command on one machine; what it says."""
@@ -47,14 +52,6 @@ class Lab:
     def session(self, machine: str, label: str) -> tuple[str, str]:
         return "--session", str(self.folder / machine / f"{label}.json5")
 
-    def start_all(self) -> None:
-        scenario = (*SCENARIO, "--backend", self.backend)
-        self.start("hub", "router", "router", str(self.folder / "hub" / "router.main.json5"))
-        out = ("--once", "--out", str(self.folder / "record"))
-        self.start("robot1", "host", "host", *scenario, *self.session("robot1", "robot.planar13"), *out)
-        for name in ("guidance", "navigation", "control"):
-            self.start("ws1", name, "service", name, *scenario, *self.session("ws1", "gnc.planar13"))
-
     def logs(self) -> str:
         return "\n".join(f"{path.name}: {path.read_text()[-800:]}" for path in self.folder.glob("*.log"))
 
@@ -66,13 +63,12 @@ def example(folder: Path, backend: str) -> str:
     return re.sub(r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text)
 
 
-def until(lab: Lab, words: str, *arguments: str) -> str:
+def until(lab: Lab, words: str, *arguments: str) -> None:
     """Repeat an operator's command until it says these words."""
     deadline = time.monotonic() + LIMIT_S
     while words not in (said := lab.at("laptop", *arguments, check=False)):
         assert time.monotonic() < deadline, f"{said}\n{lab.logs()}"
         time.sleep(0.2)
-    return said
 
 
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
@@ -83,7 +79,6 @@ def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_p
     """
     with ExitStack() as stack:
         lab = Lab(tmp_path, backend, stack)
-        lab.start_all()
         operator, viewer = lab.session("laptop", "operator.planar13"), lab.session("laptop", "viewer.planar13")
         until(lab, "next: `snakesim arm planar13", "status", *viewer)
         checked = lab.at("hub", "deploy", "check", "lab.toml", "--out", ".")
@@ -93,17 +88,11 @@ def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_p
         assert "exit code 1" in refused, refused
         until(lab, "planar13: armed", "arm", "planar13", backend, *operator)
         record = finished(lab)
-        alone = run_alone(lab)
-    assert record.command_digest == alone.command_digest, lab.logs()
+        more = ("--in-process",) if backend == "sim" else ()
+        lab.at("robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *more)  # by this machine alone
+    assert record.command_digest == summary_of(tmp_path / "alone").command_digest, lab.logs()
     did = (tmp_path / "intruder.log").read_text().splitlines()[-1]
     assert re.fullmatch(r"\{'repeated': \d{3,}, 'commanded': \d{2,}\}", did), did
-
-
-def run_alone(lab: Lab) -> RunSummary:
-    """The same run, on the robot's machine alone."""
-    more = ("--in-process",) if lab.backend == "sim" else ()
-    lab.at("robot1", "run", *SCENARIO, "--backend", lab.backend, "--out", "alone", *more)
-    return summary_of(lab.folder / "alone")
 
 
 def finished(lab: Lab) -> HostRecord:

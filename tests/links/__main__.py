@@ -134,10 +134,11 @@ HEAD = """\
 Written by `python -m tests.links --write --trials {trials}` (root) on {day}; {cpus} cores, Linux {kernel}, load {load}.
 
 Three machines as network namespaces: the host of `triplet` at 100 Hz in real time with the simulator, a router,
-and guidance, navigation and control. The link between router and controller is bad. {netem}: the link is a pair
-of TAP interfaces with a process between them (`tests/links/relay.py`) that drops and delays Ethernet frames,
-**each way**, so that a round trip takes twice the delay. TCP runs unchanged above. Frames keep their order. The
-host is armed and watched over a socket pair, so nothing that happens to the network hides what the host does.
+and guidance, navigation and control. The link between router and controller is bad. This kernel {netem}:
+the link is a pair of TAP interfaces with a process between them (`tests/links/relay.py`) that drops and delays
+Ethernet frames, **each way**, so that a round trip takes twice the delay. TCP runs unchanged above. Frames keep
+their order. The host is armed and watched over a socket pair, so nothing that happens to the network hides what
+the host does.
 All machines share the cores of one; host, controller, router and link run with real-time priority.
 
 ## A link that is bad all the time
@@ -167,18 +168,13 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     parser.add_argument("--trials", type=int, default=20)
     wanted = parser.parse_args()
-    netem = (
-        "This kernel has `netem`, but for the same link on every kernel"
-        if has_netem()
-        else "This kernel has no `netem`"
-    )
     head = HEAD.format(
         trials=wanted.trials,
         day=date.today(),
         cpus=os.cpu_count(),
         kernel=platform.release(),
         armed=ARMED_S,
-        netem=netem,
+        netem="has `netem`, but for the same link on every kernel" if has_netem() else "has no `netem`",
         load=f"{os.getloadavg()[1]:.1f}",
     )
     lines: list[str] = []
@@ -189,3 +185,7 @@ def main() -> None:
     print("\n".join(happened))
     if wanted.write:
         PAGE.write_text(head + "\n".join(lines) + "\n" + EVENTS + "\n".join(happened) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

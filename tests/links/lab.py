@@ -36,7 +36,8 @@ class Lab:
         self.start_router()
         self.host = self._start_host()
         for name in self.config.services:
-            self._start(self.workstation, "snakesim_hal.serve", name, "10.77.2.1", log=name)
+            arguments = ("snakesim_hal.serve", name, str(self._saved), "--router", "tcp/10.77.2.1:7447")
+            self.workstation.module(*arguments, log=folder / f"{name}.log")
 
     def start_router(self) -> None:
         """A new router."""
@@ -54,10 +55,6 @@ class Lab:
         """At once."""
         self._router.send_signal(signal.SIGKILL)
         self._router.wait()
-
-    def _start(self, machine: Machine, module: str, name: str, router: str, *, log: str) -> None:
-        arguments = (module, name, str(self._saved), "--router", f"tcp/{router}:7447")
-        machine.module(*arguments, log=self.folder / f"{log}.log")
 
     def _start_host(self) -> StarterEnd:
         ours, its = socket_pair()
