@@ -78,14 +78,10 @@ def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot
 
 def printed_safely(robot: Robot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
-    for tool in (["status"], ["estop"], ["clear"]):
-        ended = robot.run.tell(*tool)
-        assert not steering(ended.said), f"snakesim {tool[0]} prints {ended.said!r}"
-        lines = ended.said.splitlines()
-        assert not any(line.startswith("planar13: armed - all is well") for line in lines), ended.said
-    news = robot.run.said()[len(before) :]
-    assert not steering(news), f"the run prints {news!r}"
-    assert not any(line.startswith("planar13: armed - all is well") for line in news.splitlines()), news
+    told = {f"snakesim {tool}": robot.run.tell(tool).said for tool in ("status", "estop", "clear")}
+    for who, said in {**told, "the run": robot.run.said()[len(before) :]}.items():
+        assert not steering(said), f"{who} prints {said!r}"
+        assert not any(line.startswith("planar13: armed - all is well") for line in said.splitlines()), said
 
 
 def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robot) -> None:

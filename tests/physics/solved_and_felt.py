@@ -53,11 +53,8 @@ def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.R
     """A run of 8 s, and the forces of all obstacles in it."""
     with recorded() as steps:
         result = snakesim.run(scenario, controller=controller, duration=options.pop("duration", 8), set=options)
-    forces = {name: np.zeros(len(steps)) for names in steps for name in names}
-    for k, found in enumerate(steps):
-        for name, force_n in found.items():
-            forces[name][k] = force_n
-    return result, forces
+    names = dict.fromkeys(name for found in steps for name in found)
+    return result, {name: np.array([found.get(name, 0.0) for found in steps]) for name in names}
 
 
 @contextmanager
