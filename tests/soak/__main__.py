@@ -1,6 +1,8 @@
-"""The soak itself: a run, one fault after the other, and the operator who gets the robot going again."""
+"""`python -m tests.soak`: a run, one fault after the other, and the operator who gets the robot going again."""
 
+import argparse
 import statistics
+import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field
@@ -11,7 +13,7 @@ import msgspec
 
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, LifecycleRequest, Status
+from snakesim_hal.wire.messages import Answer, LifecycleRequest, Message
 from tests.faults.observer import TrialError
 from tests.fuzz.network import running_and_joined
 from tests.fuzz.vitals import complaints
@@ -73,7 +75,7 @@ class Operator:
             if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MAX_VIOLATIONS:
                 return
             self._spend(event.pause_s)
-            answer = self._ask_until_answered(event.part, event.request)
+            answer = self._ask(keys.fault(event.part), event.request)
             if not answer.ok:
                 if answer.refusal in ("cannot", "unknown_fault", "not_permitted"):
                     dice.rule_out(event)
@@ -102,32 +104,21 @@ class Operator:
 
     def _suffer(self, event: Event, line: Line) -> None:
         """Watch what follows, look at how it is explained, and recover."""
-        watch, began = self._watch, time.monotonic()
+        watch, began_ns = self._watch, time.monotonic_ns()
         watch.blind = {event.request.target}
         tick = watch.status.tick if watch.status is not None else 0
-        latched: Status | None = None
-        seen: dict[str, Status] = {}
-
-        def look() -> None:
-            nonlocal latched
-            status = watch.status
-            if status is None:
-                return
-            seen[status.lifecycle] = status
-            if status.lifecycle == "fault" and latched is None:
-                latched = status
-
-        self._spend(event.lasts_s, look)
+        self._spend(event.lasts_s)
         if event.end_request is not None:
-            answer = self._ask_until_answered(event.part, event.end_request)
+            answer = self._ask(keys.fault(event.part), event.end_request)
             if not answer.ok and answer.refusal not in ("wrong_state", "not_on", "unknown_fault"):
                 line.violations.append(f"its end was refused: {answer.reason}")
-        self._spend(SETTLE_S, look)
-        status = self._watch.status
-        restarted = status is not None and status.tick < tick
+        self._spend(SETTLE_S)
+        restarted = watch.status is not None and watch.status.tick < tick
         if restarted:
             watch.start_over()
-        line.detected = latched is not None or restarted or "disarmed" in seen
+        seen = [heard.message for heard in watch.statuses if heard.at_ns >= began_ns]
+        latched = next((status for status in seen if status.lifecycle == "fault"), None)
+        line.detected = latched is not None or restarted or any(status.lifecycle == "disarmed" for status in seen)
         if latched is not None:
             line.causes = [fault.cause for fault in latched.faults]
             words = " ".join((latched.why, *line.causes, *(f"{fault.joint}" for fault in latched.faults)))
@@ -135,12 +126,12 @@ class Operator:
                 line.violations.append(f"no cause names one of {', '.join(event.names)}: {words}")
         if event.follows == "stop" and not line.detected:
             line.violations.append(f"it had to stop, and went on: {watch.in_words()}")
-        self._recover(line)
+        self._recover()
         watch.blind = set()
         line.became = watch.in_words()
-        line.recovered_s = round(time.monotonic() - began - event.lasts_s - SETTLE_S, 3)
+        line.recovered_s = round((time.monotonic_ns() - began_ns) * 1e-9 - event.lasts_s - SETTLE_S, 3)
 
-    def _recover(self, line: Line) -> None:
+    def _recover(self) -> None:
         """As a person would: clear, wait until it is ready, arm, and see it move."""
         watch = self._watch
         give_up = time.monotonic() + RECOVERY_S
@@ -156,12 +147,11 @@ class Operator:
                 if self._moves():
                     return
             elif status.lifecycle in ("fault", "estop"):
-                last = self._try(LifecycleRequest(action="clear"))
+                last = self._ask(keys.LIFECYCLE, LifecycleRequest(action="clear")).reason
             elif status.ready_to_arm:
                 hash_ = watch.description().config_hash
-                last = self._try(
-                    LifecycleRequest(action="arm", robot=status.robot, backend=status.backend, config_hash=hash_)
-                )
+                arm = LifecycleRequest(action="arm", robot=status.robot, backend=status.backend, config_hash=hash_)
+                last = self._ask(keys.LIFECYCLE, arm).reason
 
     def _fresh(self) -> bool:
         """Whether the newest status is of now, and not what a host said that is gone."""
@@ -180,32 +170,22 @@ class Operator:
                 return True
         return False
 
-    def _try(self, request: LifecycleRequest) -> str:
-        try:
-            answer = self._watch.session.ask(keys.LIFECYCLE, request, timeout_s=5.0)
-        except NotConnectedError as error:
-            return str(error)
-        self._spend(0.1)
-        return answer.reason
-
-    def _ask_until_answered(self, part: str, request: Any) -> Answer:
-        """A part that was started a moment ago answers a little later."""
+    def _ask(self, key: str, request: Message) -> Answer:
+        """Until it is answered: who was started a moment ago answers a little later."""
         give_up = time.monotonic() + RECOVERY_S
         while True:
             try:
-                return self._watch.session.ask(keys.fault(part), request, timeout_s=5.0)
+                return self._watch.session.ask(key, request, timeout_s=5.0)
             except NotConnectedError as error:
                 if time.monotonic() > give_up:
                     return Answer(ok=False, reason=str(error), refusal="no_answer")
                 self._spend(0.2)
 
-    def _spend(self, seconds: float, look: Any = None) -> None:
+    def _spend(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
         while True:
             self._watch.listen()
             self._health.look()
-            if look is not None:
-                look()
             left = deadline - time.monotonic()
             if left <= 0:
                 return
@@ -271,3 +251,23 @@ def summary(found: Soak) -> str:
     lines += found.health
     lines += [f"VIOLATION {what}" for what in found.violations] or ["nothing unexplained, nothing grew, nothing left"]
     return "\n".join(lines)
+
+
+def main() -> int:
+    """0 when the robot came through it; 1 when anything was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--backend", default="sim", help="sim or can")
+    parser.add_argument("--out", type=Path, help="folder of the run, the events beside it (default: a temporary one)")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="snakesim-soak-") as temporary:
+        out = (asked.out or Path(temporary) / "run").resolve()
+        out.parent.mkdir(parents=True, exist_ok=True)
+        found = soak(out, asked.minutes, asked.seed, asked.backend)
+    print(summary(found))
+    return 1 if found.violations else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

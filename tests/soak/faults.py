@@ -1,5 +1,6 @@
 """Which faults a soak draws from, and what must follow from each. Pure, and repeatable by its seed."""
 
+import itertools
 import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -80,9 +81,7 @@ class Dice:
 
     def events(self) -> Iterator[Event]:
         """One after the other, without end."""
-        number = 0
-        while True:
-            number += 1
+        for number in itertools.count(1):
             yield self._draw(number)
 
     def _draw(self, number: int) -> Event:

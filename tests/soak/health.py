@@ -66,7 +66,8 @@ class Health:
             if grown_mb > GROWTH_MB:
                 found.append(f"{name} (process {pid}) grew by {grown_mb:.1f} MB in {lasted_s:.0f} s")
             if lasted_s > LONG_ENOUGH_S and grown_mb > GROWTH_MB / 4:
-                slope = self._slope_mb_min(rows)
+                at_min = [(row.at_s - rows[0].at_s) / 60 for row in rows]
+                slope = np.polyfit(at_min, [row.vitals.resident_mb for row in rows], 1)[0]
                 if slope > GROWTH_MB_MIN:
                     found.append(f"{name} (process {pid}) grows by {slope:.1f} MB a minute")
             for what, first, last, more in (
@@ -76,11 +77,6 @@ class Health:
                 if last > first + more:
                     found.append(f"{name} (process {pid}) has {last} {what}, at first {first}")
         return found
-
-    @staticmethod
-    def _slope_mb_min(rows: list[Row]) -> float:
-        at_min = np.array([row.at_s for row in rows]) / 60
-        return float(np.polyfit(at_min - at_min[0], [row.vitals.resident_mb for row in rows], 1)[0])
 
     def in_words(self) -> list[str]:
         """First and last of each part, over all its processes."""

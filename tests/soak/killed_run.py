@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 
@@ -21,12 +21,11 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM, environment
-from tests.harness.endpoint import free_endpoint
+from tests.harness.command import running
 from tests.harness.processes import parts_of, processes_with
 
 Moment = Literal["starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending"]
-MOMENTS: tuple[Moment, ...] = ("starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending")
+MOMENTS: tuple[Moment, ...] = get_args(Moment)
 SUPERVISOR = "supervisor"
 ROBOT = "planar13"
 RATE_HZ = 50  # the longest lease there is: this is about processes that end, not about a busy machine
@@ -69,17 +68,17 @@ class Trial:
     hits: tuple[Hit, ...]
 
     def __str__(self) -> str:
-        kind = [self.backend, self.pace, *(["--stay"] if self.stay else []), *(["--with-router"] * self.router)]
-        return f"#{self.number} {' '.join(kind)}, {self.moment}: {', '.join(map(str, self.hits))}"
+        kind = " ".join([self.backend, self.pace, *self._flags])
+        return f"#{self.number} {kind}, {self.moment}: {', '.join(map(str, self.hits))}"
+
+    @property
+    def _flags(self) -> list[str]:
+        return ["--stay"] * self.stay + ["--with-router"] * self.router
 
     def arguments(self) -> list[str]:
         """Of `snakesim run`."""
-        return [
-            *("triplet", "--controller", "hold", "--backend", self.backend, "--pace", self.pace),
-            *("--duration", str(self.asked_s), "--set", f"rate_hz={RATE_HZ}"),
-            *(["--stay"] if self.stay else []),
-            *(["--with-router"] if self.router else []),
-        ]
+        fixed = ["triplet", "--controller", "hold", "--set", f"rate_hz={RATE_HZ}"]
+        return [*fixed, "--backend", self.backend, "--pace", self.pace, "--duration", str(self.asked_s), *self._flags]
 
 
 @dataclass
@@ -108,7 +107,6 @@ class KilledRun:
 
     def __init__(self, trial: Trial, folder: Path) -> None:
         self._trial, self._folder, self._out = trial, folder, folder / "run"
-        self._endpoint = free_endpoint()
         self._outcome = Outcome(trial)
         self._mark = f"{os.getpid()}-{trial.number}-{time.monotonic_ns()}"
         self._status: Status | None = None
@@ -119,29 +117,21 @@ class KilledRun:
 
     def go(self) -> Outcome:
         """Carry it out, wait for the end, and gather what is left."""
-        said = self._folder / "said"
-        with said.open("wb") as output:
-            self._process = subprocess.Popen(
-                [*SNAKESIM, "run", *self._trial.arguments(), "--out", str(self._out), "--endpoint", self._endpoint],
-                cwd=self._folder,
-                env=environment(self._folder, **{MARK: self._mark}),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-            )
-        try:
-            with contextlib.ExitStack() as stack:
-                self._session: Session | None = None
-                self._outcome.reached = self._await_moment(stack)
-                self._hit()
-                self._await_end()
-                for asked in self._asked:
-                    asked.result()
-        finally:
-            self._outcome.code = self._process.poll()
-            self._asking.shutdown()
-            self._sweep()
-        self._outcome.said = said.read_text(encoding="utf-8", errors="replace")
+        with running(self._out, *self._trial.arguments(), more={MARK: self._mark}) as run:
+            self._process, self._endpoint = run.process, run.endpoint
+            try:
+                with contextlib.ExitStack() as stack:
+                    self._session: Session | None = None
+                    self._outcome.reached = self._await_moment(stack)
+                    self._hit()
+                    self._await_end()
+                    for asked in self._asked:
+                        asked.result()
+            finally:
+                self._outcome.code = self._process.poll()
+                self._asking.shutdown()
+                self._sweep()
+            self._outcome.said = run.said()
         self._gather()
         return self._outcome
 
@@ -199,8 +189,8 @@ class KilledRun:
             "clearing": self._clear,
             "interrupted": self._interrupt,
         }
-        if self._outcome.reached and (act := acts.get(self._trial.moment)) is not None:
-            act()
+        if self._outcome.reached and self._trial.moment in acts:
+            acts[self._trial.moment]()
         events: list[tuple[float, Callable[[], None]]] = []
         for hit in self._trial.hits:
             events.append((hit.after_s, lambda hit=hit: self._signal(hit.victim, hit.number)))
@@ -231,14 +221,11 @@ class KilledRun:
         self._signal(SUPERVISOR, signal.SIGINT)
 
     def _stop(self) -> None:
-        self._in_background(self._ask_to_stop)
+        self._asked.append(self._asking.submit(self._ask_to_stop))
 
     def _clear(self) -> None:
         self._outcome.clear_asked = True
-        self._in_background(self._ask_to_clear)
-
-    def _in_background(self, act: Callable[[], None]) -> None:
-        self._asked.append(self._asking.submit(act))
+        self._asked.append(self._asking.submit(self._ask_to_clear))
 
     def _ask_to_stop(self) -> None:
         with contextlib.suppress(NotConnectedError):

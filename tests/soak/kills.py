@@ -6,6 +6,7 @@ that was answered must be on the disk. Exit code 1 when anything was wrong.
 """
 
 import argparse
+import itertools
 import random
 import re
 import signal
@@ -34,8 +35,8 @@ THREW = re.compile(r"Traceback|panicked|Exception ignored|RuntimeWarning|Fatal P
 
 def draw(seed: int, *, backend: str | None = None) -> Iterator[Trial]:
     """Trials without end; the same ones for the same seed. Backends and moments take turns."""
-    dice, number = random.Random(seed), 0
-    while True:
+    dice = random.Random(seed)
+    for number in itertools.count():
         moment, router = MOMENTS[number % len(MOMENTS)], dice.random() < 0.25
         pace = dice.choice(("realtime", "realtime", "lockstep"))
         victims = (*VICTIMS, "router") if router else VICTIMS
@@ -55,7 +56,6 @@ def draw(seed: int, *, backend: str | None = None) -> Iterator[Trial]:
             by_datagram=dice.random() < 0.5,
             hits=tuple(hits),
         )
-        number += 1
 
 
 def judge(outcome: Outcome) -> list[str]:
@@ -99,12 +99,9 @@ def _lies(outcome: Outcome) -> list[str]:
     if code == 1:
         words = ("fault:", "snakesim:", "left no record")
         return [] if any(word in outcome.said for word in words) else ["exit code 1, and no word of a fault"]
-    by = {hit.number for hit in trial.hits if hit.victim == SUPERVISOR} | (
-        {signal.SIGINT} if outcome.interrupted else set()
-    )
-    if code is not None and -code in by:
-        return []
-    return [f"exit code {code}"]
+    by = {hit.number for hit in trial.hits if hit.victim == SUPERVISOR}
+    by |= {signal.SIGINT} if outcome.interrupted else set()
+    return [] if code is not None and -code in by else [f"exit code {code}"]
 
 
 def _around(text: str, at: int) -> str:
@@ -128,9 +125,8 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2, help="how many at the same time")
     parser.add_argument("--out", type=Path, help="where the folders of the runs stay (default: nowhere)")
     asked = parser.parse_args()
-    trials = [trial for trial, _ in zip(draw(asked.seed, backend=asked.backend), range(asked.trials), strict=False)]
-    if asked.only is not None:
-        trials = [trial for trial in trials if trial.number == asked.only]
+    drawn = itertools.islice(draw(asked.seed, backend=asked.backend), asked.trials)
+    trials = [trial for trial in drawn if asked.only in (None, trial.number)]
     began, wrong, codes, hits = time.monotonic(), Counter[str](), Counter[str](), 0
     with (
         tempfile.TemporaryDirectory(prefix="snakesim-kills-") as temporary,

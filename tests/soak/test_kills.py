@@ -1,6 +1,7 @@
 """A handful of `python -m tests.soak.kills`, and that its judge sees what it is for."""
 
 import signal
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -45,17 +46,7 @@ def test_one_seed_draws_the_same_trials_of_all_moments_on_both_backends() -> Non
     ],
 )
 def test_the_judge_sees_what_is_wrong(outcome: dict[str, object], word: str | None) -> None:
-    trial = Trial(
-        number=1,
-        backend="sim",
-        pace="realtime",
-        stay=False,
-        router=False,
-        asked_s=8.0,
-        moment="armed",
-        by_datagram=False,
-        hits=(Hit("host", signal.SIGKILL, 0.1),),
-    )
+    trial = replace(TRIALS[0], asked_s=8.0, moment="armed", hits=(Hit("host", signal.SIGKILL, 0.1),))
     wrong = judge(Outcome(trial, **outcome))  # pyright: ignore[reportArgumentType]
     assert any(word in what for what in wrong) if word else wrong == []
     assert SUPERVISOR not in str(trial)

@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import AppliedCommand, Clock, Description, Mode,
 from tests.faults.observer import Observer
 
 ROUNDING_RAD = 1e-6
-KEPT = 200  # joint states
+KEPT = 200  # joint states, and statuses
 
 
 class Watch(Observer):
@@ -41,7 +41,7 @@ class Watch(Observer):
         super().receive(at_ns, message)
         match message:
             case Status():
-                del self.statuses[:-21]
+                del self.statuses[:-KEPT]
                 self._explained(message)
             case AppliedCommand():
                 del self.applied[:-6]
@@ -89,13 +89,10 @@ class Watch(Observer):
             if mode is not Mode.POSITION:
                 continue
             edge = math.nan if measured is None else abs(target - measured.angle_rad[i])
-            if now.sequence is not None and edge > robot.max_step_rad + ROUNDING_RAD:
-                in_range = joint.angle_min_rad < target < joint.angle_max_rad
-                if in_range:
-                    self._violated(
-                        f"tick {now.tick}: {joint.name} is sent {edge:.3f} rad away from where it is, at most "
-                        f"{robot.max_step_rad:g}"
-                    )
+            in_range = joint.angle_min_rad < target < joint.angle_max_rad
+            if now.sequence is not None and in_range and edge > robot.max_step_rad + ROUNDING_RAD:
+                most = f"at most {robot.max_step_rad:g}"
+                self._violated(f"tick {now.tick}: {joint.name} is sent {edge:.3f} rad away from where it is, {most}")
             if not follows or before is None or before.mode[i] is not Mode.POSITION:
                 continue
             step, most = abs(target - before.target[i]), joint.speed_limit_rad_s * robot.period_ns * 1e-9
