@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -46,20 +47,13 @@ class Stretch:
     seen: dict[str, list[Vitals]] = field(default_factory=dict[str, list[Vitals]])
     failure: list[str] = field(default_factory=list[str])
 
-    @property
-    def ticks(self) -> int:
-        """How long it was."""
-        return self.last.tick - self.first.tick
+    def counted(self, what: Literal["tick", "overruns", "commands_accepted"]) -> int:
+        """By how much a number of the status has grown."""
+        return getattr(self.last, what) - getattr(self.first, what)
 
-    @property
-    def overruns(self) -> int:
-        """Ticks that ended late."""
-        return self.last.overruns - self.first.overruns
-
-    @property
-    def taken(self) -> int:
-        """Commands that were accepted."""
-        return self.last.commands_accepted - self.first.commands_accepted
+    def share(self, what: Literal["overruns", "commands_accepted"]) -> float:
+        """The same, of its ticks."""
+        return self.counted(what) / max(self.counted("tick"), 1)
 
     def growth_mb(self, part: str) -> float:
         """Memory gained since the warm-up, in the mean of the last tenth."""
@@ -223,16 +217,12 @@ def _differences(quiet: Stretch, fuzzed: Stretch, sent: Sent, payloads: int) -> 
         if more > GROWTH_MB:
             found.append(f"{part} grew by {more:.1f} MB more than in the quiet stretch, at most {GROWTH_MB:g} MB")
     for word, share, most in (
-        ("overruns", _share(fuzzed.overruns, fuzzed) - _share(quiet.overruns, quiet), OVERRUN_SHARE),
-        ("commands taken", _share(quiet.taken, quiet) - _share(fuzzed.taken, fuzzed), TAKEN_SHARE),
+        ("overruns", fuzzed.share("overruns") - quiet.share("overruns"), OVERRUN_SHARE),
+        ("commands taken", quiet.share("commands_accepted") - fuzzed.share("commands_accepted"), TAKEN_SHARE),
     ):
         if share > most:
             found.append(f"{word}: {100 * share:.2f} % of the ticks worse than quiet, at most {100 * most:g} %")
     return found
-
-
-def _share(count: int, stretch: Stretch) -> float:
-    return count / max(stretch.ticks, 1)
 
 
 def table(verdict: Verdict) -> str:
@@ -256,9 +246,9 @@ def table(verdict: Verdict) -> str:
         f"lifecycle {fuzzed.last.lifecycle}: {fuzzed.last.why}; lease of {fuzzed.last.lease_holder}, epoch "
         f"{fuzzed.last.lease_epoch} (before: {quiet.first.lease_holder}, {quiet.first.lease_epoch})",
         f"{'':10}{'quiet':>12}{'fuzzed':>12}",
-        f"{'ticks':10}{quiet.ticks:>12}{fuzzed.ticks:>12}",
-        f"{'taken':10}{quiet.taken:>12}{fuzzed.taken:>12}",
-        f"{'overruns':10}{quiet.overruns:>12}{fuzzed.overruns:>12}",
+        f"{'ticks':10}{quiet.counted('tick'):>12}{fuzzed.counted('tick'):>12}",
+        f"{'taken':10}{quiet.counted('commands_accepted'):>12}{fuzzed.counted('commands_accepted'):>12}",
+        f"{'overruns':10}{quiet.counted('overruns'):>12}{fuzzed.counted('overruns'):>12}",
     ]
     for part in sorted(fuzzed.seen):
         first, last = fuzzed.seen[part][0], fuzzed.seen[part][-1]

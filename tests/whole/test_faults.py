@@ -1,5 +1,6 @@
 """Faults on request in runs of one process, planned with a flag. Those that are refused are in refusals.toml."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from snakesim_operator.results.record import RunRecord
 from tests.whole.command import run_to_summary, snakesim
 
 MAY_LOSE_ONE = "robot.safety.may_lose_joints=1"
+slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
@@ -22,19 +24,19 @@ MAY_LOSE_ONE = "robot.safety.may_lose_joints=1"
         ("can", "leak:joint_3@1", "module_leak"),
         ("can", "cut:bus_1@1-1.3", "interface_down"),
         ("odrive", "mute:joint_3@1", "drive_silent"),
-        pytest.param("odrive", "reboot:joint_3@1", "drive_silent", marks=pytest.mark.slow),  # as dynamixel
+        slow("odrive", "reboot:joint_3@1", "drive_silent"),  # as dynamixel
         ("odrive", "overheat:joint_3@1", "drive_fault"),
-        pytest.param("odrive", "cut:bus_1@1-1.3", "interface_down", marks=pytest.mark.slow),  # as can
-        pytest.param(*("moteus", "mute:joint_3@1", "drive_silent"), marks=pytest.mark.slow),  # as odrive
-        pytest.param(*("moteus", "reboot:joint_3@1", "drive_silent"), marks=pytest.mark.slow),  # as odrive
-        pytest.param(*("moteus", "overheat:joint_3@1", "drive_fault"), marks=pytest.mark.slow),  # as odrive
-        pytest.param(*("moteus", "cut:bus_1@1-1.3", "interface_down"), marks=pytest.mark.slow),  # as odrive
-        pytest.param("dynamixel", "mute:joint_3@1", "drive_silent", marks=pytest.mark.slow),  # as odrive
+        slow("odrive", "cut:bus_1@1-1.3", "interface_down"),  # as can
+        slow("moteus", "mute:joint_3@1", "drive_silent"),  # as odrive
+        slow("moteus", "reboot:joint_3@1", "drive_silent"),  # as odrive
+        slow("moteus", "overheat:joint_3@1", "drive_fault"),  # as odrive
+        slow("moteus", "cut:bus_1@1-1.3", "interface_down"),  # as odrive
+        slow("dynamixel", "mute:joint_3@1", "drive_silent"),  # as odrive
         ("dynamixel", "reboot:joint_3@1", "drive_silent"),
-        pytest.param("dynamixel", "overheat:joint_3@1", "drive_fault", marks=pytest.mark.slow),  # as odrive
+        slow("dynamixel", "overheat:joint_3@1", "drive_fault"),  # as odrive
         ("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
         ("dynamixel", "cut:bus_1@1-1.3", "interface_down"),
-        pytest.param("mixed", "reboot:joint_12@1", "drive_silent", marks=pytest.mark.slow),  # as dynamixel
+        slow("mixed", "reboot:joint_12@1", "drive_silent"),  # as dynamixel
         ("mixed", "cut:bus_2@1-1.3", "interface_down"),
     ],
 )
@@ -50,16 +52,7 @@ def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
     assert record.lifecycle == "fault"
 
 
-@pytest.mark.parametrize(
-    "backend",
-    [
-        "sim",
-        "can",
-        pytest.param("odrive", marks=pytest.mark.slow),
-        pytest.param("moteus", marks=pytest.mark.slow),
-        "dynamixel",
-    ],
-)
+@pytest.mark.parametrize("backend", ["sim", "can", slow("odrive"), slow("moteus"), "dynamixel"])
 def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
     flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "1.5", "--set", MAY_LOSE_ONE]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
