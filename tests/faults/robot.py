@@ -122,9 +122,14 @@ class Robot:
 
 
 @contextlib.contextmanager
-def robot(request: Request, **dotted: Any) -> Iterator[tuple[Robot, Observer]]:
-    """A robot with all its processes, and who watches it."""
-    with Robot(request.folder, configuration(request.backend, **dotted)) as made:
+def robot(
+    request: Request, config: RunConfig | None = None, *, router: bool = False, **dotted: Any
+) -> Iterator[tuple[Robot, Observer]]:
+    """A robot with all its processes, and who watches it. config: other than `configuration` with these values."""
+    with Robot(request.folder, config or configuration(request.backend, **dotted), router=router) as made:
+        if router:
+            made.start("router")
+            made.observe().session.close()  # it is there
         made.start_all()
         observer = made.observe()
         observer.arm(START_LIMIT_S)

@@ -20,7 +20,7 @@ from snakesim_hal import host_process
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.network.session import Link, open_session
 from tests.faults.observer import Observer, TrialError
-from tests.faults.robot import START_LIMIT_S, Robot
+from tests.faults.robot import START_LIMIT_S, Robot, robot
 from tests.faults.row import Request, Trial
 from tests.unit.can_backend.twin.rig import BOOTED, MS, QUIET, Module, armed, set_point
 from tests.unit.hal.rig import write_files
@@ -177,10 +177,7 @@ def clock_step(request: Request) -> Iterator[Trial]:
     scenario = write_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
     settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
     config = load(scenario, [Override(key, value, "the fault table") for key, value in settings.items()]).config
-    with Robot(request.folder, config) as made:
-        made.start_all()
-        observer = made.observe()
-        observer.arm(START_LIMIT_S)
+    with robot(request, config) as (made, observer):
         for number in range(request.trials):
             trial = Trial(value=None)
             for _ in range(ATTEMPTS):

@@ -3,6 +3,7 @@
 import random
 import time
 from collections.abc import Iterator
+from typing import Any
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, LifecycleRequest, Mode
@@ -12,7 +13,7 @@ from tests.faults.row import Request, Trial
 
 ASKED_FOR_S = 0.3
 MORE_S = 0.1  # that the others are watched for, when the joint is sound again
-MAY_LOSE_ONE = {"robot__safety__may_lose_joints": 1}
+MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__may_lose_joints": 1}
 
 
 def set_aside(kind: str, request: Request) -> Iterator[Trial]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tests.faults.observer import Observer
-from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered
+from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot
 from tests.faults.row import Request, Trial
 from tests.machines import Machine
 
@@ -29,12 +29,7 @@ CUTS_S = (0.3, 0.5, 1.0, 3.0)  # the longest outlives Zenoh's own lease of a lin
 
 def router_restarts(request: Request) -> Iterator[Trial]:
     """The router is killed and started again. The value: from the kill to the stop."""
-    with Robot(request.folder, configuration(request.backend), router=True) as made:
-        made.start("router")
-        made.observe().session.close()  # it is there
-        made.start_all()
-        observer = made.observe()
-        observer.arm(START_LIMIT_S)
+    with robot(request, router=True) as (made, observer):
         slowest_s = 0.0
         for _ in range(request.trials):
             made.set_in_motion(observer)
@@ -51,7 +46,6 @@ def router_restarts(request: Request) -> Iterator[Trial]:
             slowest_s = max(slowest_s, took_s)
             late = [f"reconnected only after {took_s:.1f} s"] if took_s > RECONNECT_S else []
             yield _after(observer, (stop.at_ns - dead_ns) / 1e6, late)
-        request.retry(observer.stumbles)
         request.note(
             f"everything connected again at most {slowest_s:.1f} s after the router's process was started again "
             f"(deadline {RECONNECT_S:g} s); the stop is observed over the host's private channel, without the network"
@@ -82,37 +76,36 @@ def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
 
 def network_cut(request: Request) -> Iterator[Trial]:
     """Host and observer on one side of a veth pair, the services on the other; the link goes down, and up again."""
-    with _far_side() as far:
-        made = Robot(request.folder, configuration(request.backend), endpoint=f"tcp/{OURS}:{PORT}")
-        with made:
-            made.start("host")
-            observer = made.observe()
-            with _inside(far):
-                for service in made.config.services:
-                    made.start(service)
-            observer.arm(START_LIMIT_S)
-            slowest_s = 0.0
-            for number in range(request.trials):
-                made.set_in_motion(observer)
-                cut_ns = time.monotonic_ns()
-                _set_link("ours", up=False)
-                value = observer.safe_after_ms(cut_ns)
-                status = observer.first_fault(cut_ns)
-                failures = [] if status.lease_holder is None else [f"the lease is still {status.lease_holder}'s"]
-                observer.watch(CUTS_S[number % len(CUTS_S)])
-                observer.forget()
-                _set_link("ours", up=True)
-                started = time.monotonic()
-                observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
-                slowest_s = max(slowest_s, time.monotonic() - started)
-                if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
-                    failures.append(f"not latched: {observer.in_words()}")
-                yield recovered(observer, value, "; ".join(failures))
-            request.retry(observer.stumbles)
-            request.note(
-                f"two network namespaces with a veth pair, one end down for {CUTS_S[0]:g} to {CUTS_S[-1]:g} s; "
-                f"everything connected again at most {slowest_s:.1f} s after the link was up"
-            )
+    endpoint = f"tcp/{OURS}:{PORT}"
+    with _far_side() as far, Robot(request.folder, configuration(request.backend), endpoint=endpoint) as made:
+        made.start("host")
+        observer = made.observe()
+        with _inside(far):
+            for service in made.config.services:
+                made.start(service)
+        observer.arm(START_LIMIT_S)
+        slowest_s = 0.0
+        for number in range(request.trials):
+            made.set_in_motion(observer)
+            cut_ns = time.monotonic_ns()
+            _set_link("ours", up=False)
+            value = observer.safe_after_ms(cut_ns)
+            status = observer.first_fault(cut_ns)
+            failures = [] if status.lease_holder is None else [f"the lease is still {status.lease_holder}'s"]
+            observer.watch(CUTS_S[number % len(CUTS_S)])
+            observer.forget()
+            _set_link("ours", up=True)
+            started = time.monotonic()
+            observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
+            slowest_s = max(slowest_s, time.monotonic() - started)
+            if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
+                failures.append(f"not latched: {observer.in_words()}")
+            yield recovered(observer, value, "; ".join(failures))
+        request.retry(observer.stumbles)
+        request.note(
+            f"two network namespaces with a veth pair, one end down for {CUTS_S[0]:g} to {CUTS_S[-1]:g} s; "
+            f"everything connected again at most {slowest_s:.1f} s after the link was up"
+        )
 
 
 @contextlib.contextmanager

@@ -68,12 +68,7 @@ def diverges(request: Request) -> Iterator[Trial]:
             observer.forget()
             made.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
-            begun = _begun_tick(left)
+            told = next(text for text in left.injected if "diverge" in text)  # `tick 31: diverge:simulator@...`
+            begun = int(told.removeprefix("tick ").partition(":")[0])
             yield recovered(observer, float(fault.tick - begun + 1), "; ".join(failures))
         request.note("the host process ends after a divergence, with its record; a new one was started and armed")
-
-
-def _begun_tick(left: HostRecord) -> int:
-    """The tick of the injection, from the host's own record: `tick 31: diverge:simulator@...`."""
-    said = next(text for text in left.injected if "diverge" in text)
-    return int(said.removeprefix("tick ").partition(":")[0])
