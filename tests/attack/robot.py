@@ -36,11 +36,6 @@ class Robot:
         """Where its network meets."""
         return self.run.endpoint
 
-    @property
-    def folder(self) -> Path:
-        """For what the attack leaves."""
-        return self.run.home
-
     def health(self) -> Health:
         """Its processes, and how much they have written down."""
         return Health(self.run.parts(), {path: path.stat().st_size for path in self.run.out.glob("*.log")})

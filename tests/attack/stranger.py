@@ -183,11 +183,9 @@ class Stranger:
         publisher.put(wire.encode(message))
         return publisher
 
-    def seem_alive(self, key: str) -> Any:
+    def seem_alive(self, key: str) -> None:
         """Show a liveliness token."""
-        token = self.session.liveliness().declare_token(self.key(key))
-        self._declared.append(token)
-        return token
+        self._declared.append(self.session.liveliness().declare_token(self.key(key)))
 
     # --- what anybody may ask of the robot ----------------------------------------------------------------------
 

@@ -59,7 +59,7 @@ def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: f
 # --- intents ----------------------------------------------------------------------------------------------------------
 
 
-def intent(operator: Stranger, stamp_ns: int, speed_m_s: float, valid_s: float | None = None) -> dict[str, Any]:
+def intent(stamp_ns: int, speed_m_s: float, valid_s: float | None = None) -> dict[str, Any]:
     said: dict[str, Any] = {"stamp_ns": stamp_ns, "who": "stranger", "speed_m_s": speed_m_s, "go": True}
     return said if valid_s is None else {**said, "valid_for_ns": round(valid_s * NS)}
 
@@ -81,7 +81,7 @@ def test_a9_an_intent_of_another_time_is_not_followed(moving: Robot, age_s: floa
     operator.recover()
     while (now_ns := operator.next("hal/clock")["stamp_ns"]) < 3 * NS:  # what is as old as the robot must be old
         time.sleep(0.1)
-    operator.put("operator/intent", intent(operator, max(now_ns - round(age_s * NS), 0), 0.0123))
+    operator.put("operator/intent", intent(max(now_ns - round(age_s * NS), 0), 0.0123))
     assert 0.0123 not in speeds(operator, now_ns, now_ns + NS), f"an intent that is {age_s:g} s old is followed"
 
 
@@ -89,7 +89,7 @@ def test_a9_an_intent_ends_when_it_says(moving: Robot) -> None:
     operator = moving.operator
     operator.recover()
     now_ns = operator.next("hal/clock")["stamp_ns"]
-    operator.put("operator/intent", intent(operator, now_ns, 0.0321, valid_s=1.0))
+    operator.put("operator/intent", intent(now_ns, 0.0321, valid_s=1.0))
     assert 0.0321 in speeds(operator, now_ns, now_ns + NS)
     after = speeds(operator, now_ns + 3 * NS // 2, now_ns + 5 * NS // 2)
     assert after == {0.0}, "it does not go back to its mission by itself"

@@ -26,7 +26,7 @@ Flood = Callable[[Robot], AbstractContextManager[object]]
 
 
 def flooding(kind: str, amount: int, processes: int = 1) -> Flood:
-    return lambda robot: flood(robot.folder, kind, robot.endpoint, amount, processes)
+    return lambda robot: flood(robot.run.home, kind, robot.endpoint, amount, processes)
 
 
 FLOODS: dict[str, Flood] = {
@@ -74,7 +74,7 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
 ) -> None:
     """Zenoh holds up the whole network meanwhile, so the host's own ticks tell when the joints were made safe."""
     operator = robot.operator
-    with flood(robot.folder, "readers", robot.endpoint, 1000) as (readers,):
+    with flood(robot.run.home, "readers", robot.endpoint, 1000) as (readers,):
         operator.recover(40.0)
         operator.forget()
         time.sleep(0.5)
@@ -154,7 +154,7 @@ def test_a4_whoever_a_datagram_says_it_is_from_the_host_lives_and_prints_it_safe
 def test_a4_a_false_answer_by_datagram_is_not_taken_for_a_stop(robot: Robot, knows_nonce: bool) -> None:
     endpoint = free_endpoint()
     with datagrams.false_port(endpoint, knows_nonce=knows_nonce):
-        ended = snakesim(robot.folder, "estop", "--endpoint", endpoint)
+        ended = snakesim(robot.run.home, "estop", "--endpoint", endpoint)
     assert ended.code == 1, ended.said
     assert "planar13: stopped\n" not in ended.said, ended.said
 

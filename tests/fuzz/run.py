@@ -22,11 +22,12 @@ from snakesim_hal.wire.messages import (
 from tests.fuzz.payloads import Maker
 from tests.fuzz.vitals import vitals
 from tests.unit.hal.rig import PERIOD_NS
-from tests.unit.hal.safety.authority_rig import armed
+from tests.unit.hal.safety.authority_rig import Rig, armed
 
 LONGEST_REASON = 400  # characters of an error's text, whatever a sender wrote
 PER_ROBOT = 1000  # payloads until a fresh robot is armed
 PER_TICK = 10
+ANSWERS = Decoder(Answer)
 
 
 @dataclass
@@ -45,53 +46,44 @@ class Report:
         return self.resident_mb[-1] - self.resident_mb[0]
 
 
-class Robot:
-    """A HAL without a network: acts on messages as the host does."""
+def taken(hal: Rig, message: Message) -> str:
+    """What became of a message to a HAL without a network, in a word."""
+    authority = hal.authority
+    answer: Answer
+    match message:
+        case JointCommand():
+            return authority.offer(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
+        case JointState():
+            authority.observe(message)
+            return "observed"
+        case LeaseRequest():
+            answer = authority.on_lease(message, hal.now_ns)
+        case LifecycleRequest():
+            answer = authority.on_lifecycle(message, hal.now_ns)
+        case EstopRequest():
+            answer = authority.on_estop(message, hal.tick)
+        case _:
+            return "not for a HAL"
+    assert ANSWERS.decode(encode(answer), encoding_of(Answer)) == answer
+    return "yes" if answer.ok else "no"
 
-    def __init__(self) -> None:
-        """Armed and commanded."""
-        self._rig = armed()
-        self._authority = self._rig.authority
-        self._decoder = Decoder(Answer)
 
-    def take(self, message: Message) -> str:
-        """What became of it, in a word."""
-        rig = self._rig
-        answer: Answer
-        match message:
-            case JointCommand():
-                return self._authority.offer(message, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) or "accepted"
-            case JointState():
-                self._authority.observe(message)
-                return "observed"
-            case LeaseRequest():
-                answer = self._authority.on_lease(message, rig.now_ns)
-            case LifecycleRequest():
-                answer = self._authority.on_lifecycle(message, rig.now_ns)
-            case EstopRequest():
-                answer = self._authority.on_estop(message, rig.tick)
-            case _:
-                return "not for a HAL"
-        assert self._decoder.decode(encode(answer), encoding_of(Answer)) == answer
-        return "yes" if answer.ok else "no"
-
-    def pass_tick(self) -> None:
-        """The end of a tick."""
-        self._rig.now_ns += PERIOD_NS // 4
-        self._rig.tick += 1
-        self._authority.expire(self._rig.now_ns, self._rig.tick)
-        points = self._authority.decide().set_points
-        assert all(abs(target) <= 5.0 for target in points.target)
+def pass_tick(hal: Rig) -> None:
+    """The end of a tick."""
+    hal.now_ns += PERIOD_NS // 4
+    hal.tick += 1
+    hal.authority.expire(hal.now_ns, hal.tick)
+    assert all(abs(target) <= 5.0 for target in hal.authority.decide().set_points.target)
 
 
 def run(payloads: int, seed: int) -> Report:
     """Raises whatever a decoder or the authority raises that it must not."""
     maker, report = Maker(random.Random(seed)), Report()
     decoders: dict[type[Message], Decoder[Any]] = {message: Decoder(message) for message in VERSIONS}
-    robot = Robot()
+    hal = armed()
     for number in range(payloads):
         if number % PER_ROBOT == 0:
-            robot = Robot()
+            hal = armed()
         sample = maker.make()
         outcomes = report.outcomes.setdefault(sample.kind, Counter())
         try:
@@ -103,9 +95,9 @@ def run(payloads: int, seed: int) -> Report:
         else:
             assert type(message) is sample.message
             outcomes["taken"] += 1
-            report.answers[f"{sample.message.__name__}: {robot.take(message)}"] += 1
+            report.answers[f"{sample.message.__name__}: {taken(hal, message)}"] += 1
         if number % PER_TICK == 0:
-            robot.pass_tick()
+            pass_tick(hal)
         if (number + 1) % max(payloads // 10, 1) == 0:
             now = vitals(os.getpid())
             assert now is not None

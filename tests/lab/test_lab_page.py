@@ -33,23 +33,20 @@ def test_a_new_lab_step_by_step(tmp_path: Path) -> None:
         for number, (info, script) in enumerate(BLOCKS):
             where = info.rpartition(" on ")[2]
             if info == "sh by hand":
-                install(tmp_path)
+                for machine in machines:  # as rsync does
+                    shutil.copytree(tmp_path / "lab" / machine, tmp_path / "etc" / machine, dirs_exist_ok=True)
             elif info.startswith("sh background on"):
-                machines[where].start(
-                    "bash",
-                    "-c",
-                    f"cd {tmp_path}; exec env {here(script, tmp_path, where)}",
-                    log=tmp_path / f"{number}.log",
-                    env=environment(tmp_path, where),
-                )
+                line = f"cd {tmp_path}; exec env {here(script, tmp_path, where)}"
+                log, env = tmp_path / f"{number}.log", environment(tmp_path, where)
+                machines[where].start("bash", "-c", line, log=log, env=env)
             elif info.startswith("sh on"):
                 typed(machines[where], script, tmp_path)
 
 
 def typed(machine: Machine, script: str, folder: Path) -> None:
     """Type a block, line by line; each line as often as somebody who waits for the machines would."""
-    said = ""
     exported: list[str] = []
+    env = environment(folder, machine.name)
     for line in here(script, folder, machine.name).splitlines():
         if line.startswith("export "):
             exported.append(line)
@@ -57,14 +54,7 @@ def typed(machine: Machine, script: str, folder: Path) -> None:
         code = (re.search(r"# \(exit code (\d)\)$", line) or ["", "0"])[1]
         deadline = time.monotonic() + LIMIT_S
         while True:
-            said = machine.run(
-                "bash",
-                "-c",
-                "\n".join([*exported, line]),
-                check=False,
-                cwd=folder,
-                env=environment(folder, machine.name),
-            )
+            said = machine.run("bash", "-c", "\n".join([*exported, line]), check=False, cwd=folder, env=env)
             if said.endswith(f"(exit code {code})") and "host: not running" not in said and "control: not" not in said:
                 break
             assert time.monotonic() < deadline, f"{line}: {said}\n{logs(folder)}"
@@ -85,12 +75,6 @@ def own_places(folder: Path) -> None:
     lab = folder / "lab.toml"
     text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/etc/\1"', lab.read_text(), flags=re.M)
     lab.write_text(text.replace("10.0.0.1", f"{NET}.1"))
-
-
-def install(folder: Path) -> None:
-    """As rsync does."""
-    for machine in ("hub", "robot1", "ws1", "laptop"):
-        shutil.copytree(folder / "lab" / machine, folder / "etc" / machine, dirs_exist_ok=True)
 
 
 def environment(folder: Path, machine: str) -> dict[str, str]:

@@ -16,22 +16,18 @@ def test_the_command_alone_lists_all_by_task(tmp_path: Path) -> None:
 
 
 def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
-    ended = snakesim("config", "triplet", "--seed", "5", "--set", "control.propulsion_n=20", cwd=tmp_path)
+    """Also from a file that extends another."""
+    (tmp_path / "eel.toml").write_text('extends = "planar13"\nname = "eel"\n[module]\nmass_kg = 0.2\n')
+    given = ("--seed", "5", "--set", "control.propulsion_n=20", "--set", "robot=./eel.toml")
+    ended = snakesim("config", "triplet", *given, cwd=tmp_path)
     assert ended.code == 0, ended.err
     line = {row.split()[0]: row for row in ended.out.splitlines()}
     assert line["seed"].endswith("--seed 5")
     assert line["controllers.obstacle_triplet.propulsion_n"].endswith("--set control.propulsion_n=20")
+    assert line["robot.module.mass_kg"].endswith("  eel.toml")
     assert line["robot.module.length_m"].endswith("robots/planar13.toml")
     assert line["scene.ground.friction"].endswith("scenes/triplet.toml")
     assert line["stall_limit_s"].endswith("default")
-
-
-def test_config_tells_the_file_of_a_value_that_extends_another(tmp_path: Path) -> None:
-    (tmp_path / "eel.toml").write_text('extends = "planar13"\nname = "eel"\n[module]\nmass_kg = 0.2\n')
-    ended = snakesim("config", "triplet", "--set", "robot=./eel.toml", cwd=tmp_path)
-    line = {row.split()[0]: row for row in ended.out.splitlines()}
-    assert line["robot.module.mass_kg"].endswith("  eel.toml")
-    assert line["robot.module.length_m"].endswith("robots/planar13.toml")
 
 
 def test_scenarios_lists_what_is_shipped(tmp_path: Path) -> None:

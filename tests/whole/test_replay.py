@@ -11,7 +11,7 @@ from snakesim_operator.playback.control import Replay
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
-from tests.whole.command import snakesim
+from tests.whole.command import run_to_summary, snakesim
 
 DURATION_S = 0.4
 PLANNED = ("clutter", "surveyed_clutter")  # their planner takes seconds to begin; mamba_hills has all of the rest
@@ -28,9 +28,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "scenario", [pytest.param(name, marks=pytest.mark.slow if name in PLANNED else ()) for name in shipped("scenarios")]
 )
 def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str) -> None:
-    run = ["run", scenario, "--in-process", "--duration", str(DURATION_S), "--pace", "lockstep", "--out", "run"]
-    ended = snakesim(*run, cwd=tmp_path)
-    assert ended.code == 0, ended.out + ended.err
+    ended, _ = run_to_summary(tmp_path / "run", scenario, "--duration", str(DURATION_S), "--pace", "lockstep")
+    assert ended.code == 0, ended.said
     replayed = snakesim("replay", "run", "--control", cwd=tmp_path)
     ticks = round(DURATION_S * load(scenario).config.rate_hz)
     assert replayed.code == 0 and replayed.out == f"{ticks} commands, the same to the bit\n"

@@ -1,1 +1,1 @@
-"""What a stranger has: the wire from schemas/ alone, datagrams, floods, and eyes on other machines."""
+"""What a stranger has: the wire from schemas/ alone, datagrams, floods, and a browser's page."""

@@ -73,9 +73,9 @@ class Page:
         """Press a button."""
         self.change(self.find(label), {"value": True})
 
-    def ended(self, limit_s: float = 10.0) -> int | None:
+    def ended(self) -> int | None:
         """The code with which the console hung up, if it has."""
-        self._reader.join(limit_s)
+        self._reader.join(10.0)
         return self.closed_by
 
     def _found(self, label: str) -> str | None:
