@@ -143,18 +143,15 @@ class Stranger:
     def ask(self, key: str, request: Any, timeout_s: float = 3.0, encoding: str | None = None) -> list[Any]:
         """Every answer to a query."""
         payload = request if isinstance(request, bytes) else wire.encode(request)
-        answers: list[Any] = []
-        for reply in self.session.get(
+        replies = self.session.get(
             self.key(key),
             payload=payload,
             encoding=encoding or wire.encoding_of(key),
             timeout=timeout_s,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-        ):
-            if reply.ok is not None:
-                answers.append(wire.decode(reply.ok.payload.to_bytes()))
-        return answers
+        )
+        return [wire.decode(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
     def pretend(self, key: str, answer: dict[str, Any]) -> list[bytes]:
         """Answer queries at a key as if one were the robot, and claim to know everything there. What was asked."""

@@ -9,7 +9,7 @@ import pytest
 
 HERE = Path(__file__).parent
 FILES = sorted([*HERE.glob("*.py"), *HERE.glob("means/*.py"), *(HERE.parent / "harness").rglob("*.py")])
-ALLOWED = {"zenoh", "msgspec.msgpack", "pytest", "websockets", "zstandard"}
+ALLOWED = {"zenoh", "msgspec.msgpack", "psutil", "pytest", "websockets", "zstandard"}
 
 
 def imports(path: Path) -> set[str]:

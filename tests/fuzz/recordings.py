@@ -102,11 +102,7 @@ def forged(chance: random.Random, content: bytes) -> bytes:
     """A chunk that is whole, with messages that are not: other bytes, times, numbers and channels."""
     span: Span = chance.choice(chunks(content))
     data = unpack(content[span.begin + HEAD.size : span.end])
-    at, places = 0, list[int]()
-    while at < len(data):
-        opcode, length = HEAD.unpack_from(data, at)
-        places += [at + HEAD.size] * (opcode == Opcode.MESSAGE)
-        at += HEAD.size + length
+    places = [one.begin + HEAD.size for one in spans(data, magic=0) if one.opcode == Opcode.MESSAGE]
     for at in chance.sample(places, min(len(places), chance.choice((1, 5, 50)))):
         what = chance.randrange(4)
         if what == 0:

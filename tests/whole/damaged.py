@@ -1,6 +1,5 @@
 """A recording of many chunks, and copies of it that are damaged in one known way."""
 
-import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,8 @@ from mcap.records import Chunk
 
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.recording import mcap_file, recording
+from snakesim_operator.recording.chunks import HEAD
 from snakesim_operator.run.in_process import simulate
-
-HEAD = struct.Struct("<BQ")
 
 
 @dataclass(frozen=True)
@@ -27,10 +25,10 @@ class Span:
     end: int
 
 
-def spans(content: bytes) -> list[Span]:
-    """All records of a whole file."""
-    found, at = list[Span](), 8
-    while at < len(content) - 8:
+def spans(content: bytes | bytearray, magic: int = 8) -> list[Span]:
+    """All records of a whole file; or of a chunk, which has no magic bytes around them."""
+    found, at = list[Span](), magic
+    while at < len(content) - magic:
         opcode, length = HEAD.unpack_from(content, at)
         found.append(Span(opcode, at, at + HEAD.size + length))
         at = found[-1].end

@@ -2,9 +2,8 @@
 
 import json
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec.msgpack
 
@@ -15,8 +14,7 @@ _ROW = re.compile(r"^\| `(?P<key>[^`]+)` \|(?P<rest>.*)\|$")
 _MESSAGE = re.compile(r"`snakesim\.(\w+)/\d+`")
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One line of schemas/keys.md."""
 
     key: str
