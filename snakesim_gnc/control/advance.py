@@ -14,22 +14,20 @@ class Advance:
     """Tracks the body's centre of mass, which hardly moves when the body only wriggles."""
 
     def __init__(self) -> None:
-        self._smooth: Vector | None = None
         self._recent: deque[tuple[float, Vector]] = deque()  # time, smoothed centre; a window long
 
     def put(self, time_s: float, centre_w: Vector) -> None:
         """The centre at a time; times must grow."""
-        smooth, recent = self._smooth, self._recent
+        recent = self._recent
         if recent and time_s <= recent[-1][0]:
             return
-        if smooth is None or not recent or time_s - recent[-1][0] > WINDOW_S:
+        smooth = centre_w
+        if not recent or time_s - recent[-1][0] > WINDOW_S:
             recent.clear()
-            smooth = centre_w
         else:
-            keep = math.exp(-(time_s - recent[-1][0]) / SMOOTHED_S)
-            (a, b, c), (x, y, z) = smooth, centre_w
+            last_s, (a, b, c) = recent[-1]
+            keep, (x, y, z) = math.exp(-(time_s - last_s) / SMOOTHED_S), centre_w
             smooth = (x + keep * (a - x), y + keep * (b - y), z + keep * (c - z))
-        self._smooth = smooth
         recent.append((time_s, smooth))
         while time_s - recent[0][0] > WINDOW_S:
             recent.popleft()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from snakesim_gnc.control.controller import Task
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose
 
@@ -14,8 +14,7 @@ class Progress:
     """The advance of one episode, as a run's summary counts it: towards the goal, or else along the first heading."""
 
     def __init__(self, robot: Description, task: Task) -> None:
-        self._lengths_m = [link.length_m for link in robot.links]
-        self._axes = [joint.axis for joint in robot.joints]
+        self._robot = robot
         masses = np.array([link.mass_kg for link in robot.links])
         self._shares = masses / masses.sum()
         self._goal = task.goal
@@ -31,14 +30,12 @@ class Progress:
         if pose is not None:
             self.pose = pose.position_w, pose.orientation_wxyz
         position_w, wxyz = self.pose
-        origins, rotations = link_frames(
-            position_w, rotation_from_quaternion(wxyz), joints.angle_rad, self._axes, self._lengths_m
-        )
-        halves = 0.5 * (origins[1:, :2] + origins[:-1, :2])
-        self._head_w = origins[-1, :2] + self._lengths_m[-1] * rotations[-1, :2, 0]
-        self.centre_w = self._shares[:-1] @ halves + self._shares[-1] * 0.5 * (origins[-1, :2] + self._head_w)
-        self.height_m = float(origins[:, 2].mean())
-        forward = self._head_w - origins[0, :2]
+        nodes = nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
+        origins, self._head_w = nodes[:-1, :2], nodes[-1, :2]
+        halves = 0.5 * (origins[1:] + origins[:-1])
+        self.centre_w = self._shares[:-1] @ halves + self._shares[-1] * 0.5 * (origins[-1] + self._head_w)
+        self.height_m = float(nodes[:-1, 2].mean())
+        forward = self._head_w - origins[0]
         self._heading_rad = math.atan2(forward[1], forward[0])
         if not self._begun:
             self._begin()

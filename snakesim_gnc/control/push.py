@@ -77,9 +77,6 @@ class PushFilter:
 
 def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:
     """Contacts of a chain with nodes (2, n): for each obstacle within reach the point of the body nearest to it."""
-    if not len(outlines):
-        none = np.empty((0, 2))
-        return Touches(np.empty(0, dtype=np.intp), none, none, none, np.empty(0), np.empty(0))
     number, nearest, distances = nearest_on_chain(nodes_w.T, outlines)
     which = np.flatnonzero(distances - radius_m < reach_m)
     at, (link, share) = nearest[which], np.divmod(number[which], len(SHARES))

@@ -22,19 +22,17 @@ class Standstill:
 
     def forget(self) -> None:
         """Begin anew."""
-        self._middle_w: Floats | None = None
-        self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
+        self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was, less noise
 
     def seen(self, time_s: float, period_s: float, middle_w: Floats, within_m: float) -> bool:
         """Whether the middle, (2,), has moved less than this for as long. To be asked at every tick."""
         if self._after_s == 0.0:
             return False
-        if self._middle_w is None:
-            self._middle_w = middle_w
-        self._middle_w = self._middle_w + min(period_s / MIDDLE_S, 1.0) * (middle_w - self._middle_w)
         way = self._way
-        way.append((time_s, self._middle_w))
+        before_w = way[-1][1] if way else middle_w
+        now_w = before_w + min(period_s / MIDDLE_S, 1.0) * (middle_w - before_w)
+        way.append((time_s, now_w))
         while len(way) > 1 and time_s - way[1][0] >= self._after_s:
             way.popleft()
         then_s, then_w = way[0]
-        return time_s - then_s >= self._after_s and float(np.hypot(*(self._middle_w - then_w))) < within_m
+        return time_s - then_s >= self._after_s and float(np.hypot(*(now_w - then_w))) < within_m

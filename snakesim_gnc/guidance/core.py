@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.contacts_w import contact_w
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import (
     Contacts,
     Description,
@@ -29,8 +29,7 @@ class WorldModel:
         self._lengths = [link.length_m for link in robot.links]
         self._rear_s = np.concatenate(([0.0], np.cumsum(self._lengths)))[:-1]
         self._known = list(known)
-        self._centres = np.array([o.position_w[:2] for o in known]).reshape(-1, 2)
-        self._sizes = np.array([_outer_radius_m(o) for o in known])
+        self._outlines = Outlines.of(known)
         self._reach_m = reach_m
         masses = np.array([link.mass_kg for link in robot.links])
         self._shares = masses / masses.sum()
@@ -67,21 +66,11 @@ class WorldModel:
         """The known obstacle at a contact, for sensors that do not identify it."""
         if not self._known:
             return None
-        candidates = np.flatnonzero(np.hypot(*(self._centres - position_w[:2]).T) < self._sizes + 0.1)
-        gaps = {int(i): outline_distance_m(self._known[i], position_w[:2]) for i in candidates}
-        best = min(gaps, key=lambda i: gaps[i], default=None)
-        return self._known[best].name if best is not None and gaps[best] < 0.03 else None
+        gaps = self._outlines.distance_m(position_w[:2])
+        nearest = int(np.argmin(gaps))
+        return self._known[nearest].name if gaps[nearest] < 0.03 else None
 
     def _obstacles_nearby(self, origins: np.ndarray) -> list[Obstacle]:
-        if not self._known:
-            return []
-        gaps = np.hypot(
-            self._centres[:, None, 0] - origins[None, :, 0], self._centres[:, None, 1] - origins[None, :, 1]
-        ).min(axis=1)
-        return [self._known[i] for i in np.flatnonzero(gaps - self._sizes < self._reach_m)]
-
-
-def _outer_radius_m(obstacle: Obstacle) -> float:
-    if obstacle.shape == "box":
-        return math.hypot(obstacle.half_size_m[0], obstacle.half_size_m[1])
-    return obstacle.radius_m
+        x, y = (self._outlines.centre_w[:, None] - origins[:, :2]).transpose(2, 0, 1)
+        gaps = np.hypot(x, y).min(axis=1) - self._outlines.reach_m
+        return [self._known[i] for i in np.flatnonzero(gaps < self._reach_m)]

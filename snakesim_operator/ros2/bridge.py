@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import say
@@ -275,11 +275,5 @@ class Bridge:
         world, joints = self._placed, self._joints
         if world is None or joints is None or time.monotonic() - self._world_s > SILENT_S:
             return None
-        origins, _ = link_frames(
-            world.base_position_w,
-            rotation_from_quaternion(world.base_orientation_wxyz),
-            joints.angle_rad,
-            [joint.axis for joint in self._robot.joints],
-            [link.length_m for link in self._robot.links],
-        )
-        return float(np.arctan2(*(origins[-1] - origins[0])[1::-1]))
+        nodes = nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, joints.angle_rad)
+        return float(np.arctan2(*(nodes[-2] - nodes[0])[1::-1]))

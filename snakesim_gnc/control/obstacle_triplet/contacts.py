@@ -14,6 +14,7 @@ import numpy as np
 
 from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 
@@ -72,29 +73,16 @@ def plan_contact(
 
 
 def _past_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
-    """Arc length nearest to a box, the vector from the box to there, and the distance."""
-    step, low, high = COARSE_M, near_s_m - window_m, near_s_m + window_m
+    """Arc length nearest to a box, the direction from the box to there, and the distance."""
+    outline, step, low, high = Outlines.of([box]), COARSE_M, near_s_m - window_m, near_s_m + window_m
     s, away, distance = near_s_m, np.zeros(2), 0.0
     for finer in (FINE_M, 0.0):
         places = np.arange(low, high, step)
-        away_all, distances = _from_box(box, route.position_w(places))
+        distances, normals = outline.towards(route.position_w(places), np.zeros(len(places), dtype=np.intp))
         best = int(np.argmin(distances))
-        s, away, distance = float(places[best]), away_all[best], float(distances[best])
+        s, away, distance = float(places[best]), normals[best], float(distances[best])
         low, high, step = s - step, s + step, finer
     return s, (float(away[0]), float(away[1])), distance
-
-
-def _from_box(box: Obstacle, points_w: Floats) -> tuple[Floats, Floats]:
-    """The vector from a box's nearest point to each point (k, 2), and the distances (k,); negative inside."""
-    c, s = math.cos(box.yaw_rad), math.sin(box.yaw_rad)
-    world_from_box = np.array([[c, -s], [s, c]])
-    local = (points_w - np.array(box.position_w[:2])) @ world_from_box
-    half = np.array(box.half_size_m[:2])
-    beyond = np.abs(local) - half
-    inside = np.minimum(beyond.max(axis=1), 0.0)
-    outside = np.sign(local) * np.maximum(beyond, 0.0)
-    way = np.where(inside[:, None] < 0, np.sign(local) * (beyond == beyond.max(axis=1)[:, None]), outside)
-    return way @ world_from_box.T, np.hypot(outside[:, 0], outside[:, 1]) + inside
 
 
 def push_points(
