@@ -97,7 +97,8 @@ class PerceivedWorld:
         if body is None or look.link >= len(body.origins_w):
             return
         position, rotation = _mount(body, look)
-        plane = plane_under(self._bottoms(body), position[:2])
+        bottoms_w = np.vstack([body.origins_w, body.head_w]) - [0.0, 0.0, self._radius_m]
+        plane = plane_under(bottoms_w, position[:2])
         if isinstance(look, DepthImage):
             kind = (Intrinsics.of(look), noise)
             scanner = self._scanners.get(kind)
@@ -179,9 +180,6 @@ class PerceivedWorld:
         self.map.take_scan(scan, min(here.position_sd_m, 0.02))
         self._variance_m2 = 0.5 * float(np.trace(here.covariance[:2, :2]))
 
-    def _bottoms(self, body: Body) -> Floats:
-        return np.vstack([body.origins_w, body.head_w]) - [0.0, 0.0, self._radius_m]
-
     def _name_at(self, position_w: Floats) -> str | None:
         track = self.map.at(position_w[:2])
         return None if track is None else track.name
@@ -195,22 +193,16 @@ def confidence_of(position_sd_m: float) -> float:
 def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
     """Unit quaternion wxyz of a rotation matrix (3, 3)."""
     m = rotation
-    four = np.array(
+    four_times_products = np.array(  # row i: 4 q_i q
         [
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
+            [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[2, 1] + m[1, 2]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
         ]
     )
-    k = int(np.argmax(four))
-    off = {
-        0: (four[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]),
-        1: (m[2, 1] - m[1, 2], four[1], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]),
-        2: (m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], four[2], m[2, 1] + m[1, 2]),
-        3: (m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], four[3]),
-    }[k]
-    w, x, y, z = (np.array(off) / np.linalg.norm(off)).tolist()
+    by_largest = four_times_products[np.argmax(np.diagonal(four_times_products))]
+    w, x, y, z = (by_largest / np.linalg.norm(by_largest)).tolist()
     return (w, x, y, z)
 
 
