@@ -4,8 +4,6 @@ A request is answered between two ticks. It is refused, and nothing changes, unl
 and can be made with them. Then the controller is made again: it takes over from the measured state, as after an arming.
 """
 
-from collections.abc import Iterator
-from queue import Empty
 from typing import Any
 
 import msgspec
@@ -61,20 +59,13 @@ class LiveSettings:
     def turn(self, clock: Clock) -> bool:
         """Answer all requests that wait, and publish what is new; whether a controller must be made again."""
         before = self._changes
-        for question in self._questions():
-            answer = self._answer(question)
-            question.reply(answer)
+        while not self._waiting.empty():
+            question = self._waiting.get_nowait()
+            question.reply(self._answer(question))
         if self._published != self._changes:
             self._published = self._changes
             self._publish(clock)
         return self._changes != before
-
-    def _questions(self) -> Iterator[Question]:
-        while not self._waiting.empty():
-            try:
-                yield self._waiting.get_nowait()
-            except Empty:
-                return
 
     def _answer(self, question: Question) -> Answer:
         try:

@@ -26,27 +26,27 @@ class Intents:
 
     def __init__(self, mission_m_s: float) -> None:
         self._mission_m_s = mission_m_s
-        self._bumpless: Intent | None = None
+        self._followed: Intent | None = None
         self._stopped = ""  # why it stands still, after an intent that was followed; empty before any was
         self._heading_w_rad: float | None = None  # stays while it stands still: a stop plans no other path
 
     def start_over(self) -> None:
         """Robot time restarts: earlier stamps are void."""
-        if self._bumpless is not None:
-            self._stop(f"the intent of {self._bumpless.who} was for another start of the robot")
+        if self._followed is not None:
+            self._stop(f"the intent of {self._followed.who} was for another start of the robot")
 
     def desired(self, newest: Intent | None, now_ns: int) -> DesiredMotion:
         """The present speed. newest: the newest intent; now_ns: robot time."""
         refused = ""
-        if newest is not None and newest != self._bumpless:
+        if newest is not None and newest != self._followed:
             refused = _against(newest, now_ns)
             if not refused:
-                self._bumpless, self._stopped = newest, ""
+                self._followed, self._stopped = newest, ""
                 if newest.go:
                     self._heading_w_rad = newest.heading_w_rad
-        if self._bumpless is not None and (why := _against(self._bumpless, now_ns)):
+        if self._followed is not None and (why := _against(self._followed, now_ns)):
             self._stop(why)
-        followed, heading = self._bumpless, self._heading_w_rad
+        followed, heading = self._followed, self._heading_w_rad
         if followed is None:
             return DesiredMotion(0.0 if self._stopped else self._mission_m_s, refused or self._stopped, heading)
         if not followed.go:
@@ -55,7 +55,7 @@ class Intents:
         return DesiredMotion(self._mission_m_s if asked is None else asked, f"as {followed.who} wants it", heading)
 
     def _stop(self, why: str) -> None:
-        self._bumpless, self._stopped = None, f"{why}; send a new one to go on"
+        self._followed, self._stopped = None, f"{why}; send a new one to go on"
 
 
 def _against(intent: Intent, now_ns: int) -> str:

@@ -17,6 +17,7 @@ ROUGH_M = CELL_M * 0.5**0.5  # from a cell's centre to its corner
 REACH_M = 0.30  # beyond this distance from every surface a point counts as free
 NONE = -1
 STEP_OBSTACLES = 20
+OBSTACLE_NODES = 100  # that a search (`beam`) could expand in the time that an obstacle takes
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class ObstacleMap:
 
     @classmethod
     def in_steps(cls, obstacles: Sequence[Obstacle]) -> "Generator[int, None, ObstacleMap]":
-        """The same, made step by step; yields how many obstacles a step takes in, before it does."""
+        """The same, made step by step; yields what its next step costs, in nodes to expand, before it does it."""
         made = cls.__new__(cls)
         yield from made._marking(obstacles)
         return made
@@ -61,7 +62,7 @@ class ObstacleMap:
         least = np.full((nx, ny), REACH_M)
         for i, (centre, around) in enumerate(zip(outlines.centre_w, reach, strict=True)):
             if i % STEP_OBSTACLES == 0:
-                yield min(STEP_OBSTACLES, len(outlines) - i)
+                yield OBSTACLE_NODES * min(STEP_OBSTACLES, len(outlines) - i)
             first = np.maximum(((centre - around - self._low) / CELL_M).astype(int), 0)
             last = np.minimum(((centre + around - self._low) / CELL_M).astype(int) + 2, (nx, ny))
             x = self._low[0] + CELL_M * np.arange(first[0], last[0])

@@ -31,7 +31,7 @@ MIN_AHEAD = 10  # arcs of a new path beyond the head
 JOIN_M = 0.1  # between a path and the trail: nearer, and beside its begin, they would fold it
 TRAIL = 20  # points of the trail that a path keeps
 MAX_REPORTED = 512  # push-points in a message
-MAP_NODES, SNAP_NODES = 100, 12  # that could be expanded in the time that an obstacle in a map takes, a point in `snap`
+SNAP_NODES = 12  # that could be expanded in the time that a point in `snap` takes
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def plan(situation: Situation, search: Search) -> Generator[int, None, Planned]:
     why, body, goal, obstacles = situation.why, situation.body_w, situation.goal, situation.obstacles
     known = isinstance(obstacles, ObstacleMap)
     if not isinstance(obstacles, ObstacleMap):
-        obstacles = yield from _mapped(obstacles)
+        obstacles = yield from ObstacleMap.in_steps(obstacles)
     if why == START and known:  # nobody waits for it while something moves
         search = replace(search, kept_nodes=FIRST_WIDTH, kept_per_wide_cell=FIRST_CROWD)
     beam, heading_rad = Beam(obstacles, search), within_reach(body, goal)
@@ -89,16 +89,6 @@ def plan(situation: Situation, search: Search) -> Generator[int, None, Planned]:
     if behind:
         points = np.concatenate([np.array(behind), points])
     return Planned(Route(points), _pushed_off(points, obstacles, goal, search.radius_m))
-
-
-def _mapped(obstacles: Sequence[Obstacle]) -> Generator[int, None, ObstacleMap]:
-    making = ObstacleMap.in_steps(obstacles)
-    while True:
-        try:
-            taken_in = next(making)
-        except StopIteration as done:
-            return done.value
-        yield MAP_NODES * taken_in
 
 
 def straight_on(body_w: Floats) -> Floats:
