@@ -6,12 +6,12 @@ import statistics
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.bus import FULLEST_FRAMES_PER_S, frame_costs, saturated_share
+from benchmarks.bus import FULLEST_FRAMES_PER_S, say_frame_costs
 from benchmarks.cycle import cycle, load_table
 from benchmarks.echo import echo_us
 from benchmarks.physics import BareLoop, config_of, motion, sensing, wire_bytes
 from benchmarks.size import install_mb
-from benchmarks.table import HEADER, compare
+from benchmarks.table import HEADER, row
 from benchmarks.whole import BESIDE, highest_rate_hz, latency_us, lockstep_tick_us
 
 RESULTS = Path(__file__).parent / "RESULTS.md"
@@ -43,9 +43,9 @@ def main() -> int:
         physics = f"physics in steps of {float(step) * 1000:g} ms"
         published, alone, mujoco = sensing(stepped)
         what = f"simulator tick, all sensors published; {physics}"
-        say(compare(what, "the physics alone", published, alone, 1.15).row())
+        say(row(what, "the physics alone", published, alone, 1.15))
         what = f"the physics alone, with our ground and friction; {physics}"
-        say(compare(what, "`mj_step` of the same states, without", alone, mujoco, None).row())
+        say(row(what, "`mj_step` of the same states, without", alone, mujoco, None))
         floors: list[float] = []
         unrecorded: list[float] = []
         for _ in range(REPEATS):
@@ -54,8 +54,8 @@ def main() -> int:
             points, controller_us = motion(stepped)
             floors.append(BareLoop(stepped).tick_us(points) + echo_us(state, command) + controller_us)
         what, bare = f"lockstep tick, three GNC processes; {physics}", "bare physics + raw echo + controller"
-        say(compare(what, bare, ticks[step], floors, 1.5).row())
-        say(compare(f"the same without a recording (`--no-record`); {physics}", bare, unrecorded, floors, 1.5).row())
+        say(row(what, bare, ticks[step], floors, 1.5))
+        say(row(f"the same without a recording (`--no-record`); {physics}", bare, unrecorded, floors, 1.5))
 
     latencies: list[float] = []
     beside: list[float] = []
@@ -65,9 +65,9 @@ def main() -> int:
         beside.append(latency_us(*BESIDE))
         echoes.append(echo_us(state, command, rounds=300, period_s=config.period_ns * 1e-9))
     what = "realtime state-to-command, p50, controller included"
-    say(compare(what, "raw echo of the same bytes at the same 100 Hz", latencies, echoes, 2.0).row())
-    say(compare(f"{what}, beside the driver", "the same raw echo", beside, echoes, 1.5).row())
-    say(compare("the same, beside the driver", "control in a process of its own", beside, latencies, 1.0).row())
+    say(row(what, "raw echo of the same bytes at the same 100 Hz", latencies, echoes, 2.0))
+    say(row(f"{what}, beside the driver", "the same raw echo", beside, echoes, 1.5))
+    say(row("the same, beside the driver", "control in a process of its own", beside, latencies, 1.0))
 
     period_us = config.period_ns / 1000
     factors = [f"{period_us / statistics.median(ticks[s]):.1f} (steps of {float(s) * 1000:g} ms)" for s in STEPS]
@@ -91,23 +91,18 @@ def main() -> int:
 
 def tell_bus(say: Callable[[str], None]) -> None:
     """What the bus costs, and how regular it is."""
-    costs = frame_costs(REPEATS)
-    say(HEADER)
-    what = f"driver: receive, check, decode and store a frame, on {costs.on}"
-    say(compare(what, "bare `recv_into` + `struct` loop", costs.ours, costs.bare, 3.0).row())
-    if costs.libraries:
-        say(compare(what, "python-can + cantools", costs.ours, costs.libraries, 1.0).row())
-    share = saturated_share(statistics.median(costs.ours))
+    frame_us = say_frame_costs(say, REPEATS)
+    share = frame_us * 1e-6 * FULLEST_FRAMES_PER_S  # none of the frames is stuffed
     say(f"\nA saturated bus, {FULLEST_FRAMES_PER_S:.0f} frames/s, takes {share:.1%} of one core (half of one allowed).")
     took = cycle()
     say(
         f"Control cycle at 100 Hz, 13 joints: a command is ready, and its first set-point is on the bus "
-        f"{took.command_to_first_p50:.2f} ms later (p99 {took.command_to_first_p99:.2f}), its last "
-        f"{took.command_to_last_p50:.2f} ms (p99 {took.command_to_last_p99:.2f}). Sync is off its period by "
-        f"{took.sync_jitter_p50:.3f} ms (p99 {took.sync_jitter_p99:.3f}).\n"
+        f"{took.command_to_first_ms[0]:.2f} ms later (p99 {took.command_to_first_ms[1]:.2f}), its last "
+        f"{took.command_to_last_ms[0]:.2f} ms (p99 {took.command_to_last_ms[1]:.2f}). Sync is off its period by "
+        f"{took.sync_jitter_ms[0]:.3f} ms (p99 {took.sync_jitter_ms[1]:.3f}).\n"
     )
-    for row in load_table():
-        say(row)
+    for line in load_table():
+        say(line)
     say("")
 
 

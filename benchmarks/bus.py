@@ -10,10 +10,10 @@ import statistics
 import struct
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import can
 
+from benchmarks.table import HEADER, row
 from snakesim_can_backend.bus.bus import drain, is_up
 from snakesim_can_backend.bus.load import BIT_RATE, FRAME_BITS
 from snakesim_can_backend.driver.reports import Reading
@@ -28,16 +28,6 @@ RAW = struct.Struct("<IB3x8s")
 WANTED = struct.Struct("<hhhBB")
 
 
-@dataclass(frozen=True)
-class FrameCosts:
-    """Medians, in µs a frame."""
-
-    on: str
-    ours: list[float]
-    bare: list[float]
-    libraries: list[float]  # empty where they cannot be measured
-
-
 def answers(sync: int) -> list[bytes]:
     """What all modules say to one Sync, as the kernel hands it over."""
     state, contact = codec()[Opcode.JOINT_STATE], codec()[Opcode.CONTACT]
@@ -49,8 +39,8 @@ def answers(sync: int) -> list[bytes]:
     return [RAW.pack(frame.id, len(frame.data), frame.data) for frame in frames]
 
 
-def frame_costs(repeats: int) -> FrameCosts:
-    """Measure all of them in turn."""
+def say_frame_costs(say: Callable[[str], None], repeats: int) -> float:
+    """Measure all of them in turn, and say it as a table. Returns what a frame costs the driver, in µs."""
     on_vcan = is_up(CHANNEL)
     ours, bare, libraries = [], [], []
     for _ in range(repeats):
@@ -58,12 +48,12 @@ def frame_costs(repeats: int) -> FrameCosts:
         bare.append(_cost(_bare))
         if on_vcan:
             libraries.append(_libraries())
-    return FrameCosts(CHANNEL if on_vcan else "a local socket pair", ours, bare, libraries)
-
-
-def saturated_share(cost_us: float) -> float:
-    """Share of one core that a bus full of 8-byte frames takes, none of them stuffed."""
-    return cost_us * 1e-6 * FULLEST_FRAMES_PER_S
+    what = f"driver: receive, check, decode and store a frame, on {CHANNEL if on_vcan else 'a local socket pair'}"
+    say(HEADER)
+    say(row(what, "bare `recv_into` + `struct` loop", ours, bare, 3.0))
+    if libraries:
+        say(row(what, "python-can + cantools", ours, libraries, 1.0))
+    return statistics.median(ours)
 
 
 @contextlib.contextmanager
@@ -149,9 +139,4 @@ def _libraries() -> float:
 
 
 if __name__ == "__main__":  # for a VM, where everything else takes too long
-    measured = frame_costs(3)
-    print(f"on {measured.on}: driver {statistics.median(measured.ours):.1f} us a frame")
-    for name, others in (("bare loop", measured.bare), ("python-can + cantools", measured.libraries)):
-        if others:
-            ratio = statistics.median(a / b for a, b in zip(measured.ours, others, strict=True))
-            print(f"  {ratio:.2f} times the {name}")
+    say_frame_costs(print, 3)

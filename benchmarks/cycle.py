@@ -16,44 +16,35 @@ from snakesim_can_backend.protocol.definitions import Opcode, opcode_of
 from tests.unit.can_backend.twin.rig import run_at
 
 WARM_UP = 100  # cycles
+RATE_HZ = 100
 JOINTS, RATES_HZ = (13, 18, 30), (50, 100, 200)
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """Milliseconds."""
+    """Median and 99th percentile of each."""
 
-    command_to_first_p50: float
-    command_to_first_p99: float
-    command_to_last_p50: float
-    command_to_last_p99: float
-    sync_jitter_p50: float
-    sync_jitter_p99: float
+    command_to_first_ms: tuple[float, float]
+    command_to_last_ms: tuple[float, float]
+    sync_jitter_ms: tuple[float, float]
 
 
-def cycle(rate_hz: int = 100, duration_s: float = 10.0) -> Cycle:
+def cycle() -> Cycle:
     """Measure one run."""
     with tempfile.TemporaryDirectory() as folder:
         log, stamps = Path(folder, "bus.log"), Path(folder, "commands.txt")
         run(
-            *("--backend", "can", "--pace", "realtime", "--duration", str(duration_s)),
-            *("--set", f"rate_hz={rate_hz}", "--set", f"backend.log={log}"),
+            *("--backend", "can", "--pace", "realtime", "--duration", "10"),
+            *("--set", f"rate_hz={RATE_HZ}", "--set", f"backend.log={log}"),
             *("--controller", "benchmarks/stamped.py:Stamped", "--set", f"control.path={stamps}"),
         )
         ready = np.loadtxt(stamps)
         syncs, bursts = _frames(log)
     spacing = np.diff(syncs)[WARM_UP:-WARM_UP] * 1000
-    jitter = np.abs(spacing - 1000 / rate_hz)
-    waits = []
-    for first, last in bursts[WARM_UP:-WARM_UP]:
-        command = ready[np.searchsorted(ready, first) - 1]
-        waits.append(((first - command) * 1000, (last - command) * 1000))
-    to_first, to_last = np.array(waits).T
-    return Cycle(
-        *np.percentile(to_first, (50, 99)).tolist(),
-        *np.percentile(to_last, (50, 99)).tolist(),
-        *np.percentile(jitter, (50, 99)).tolist(),
-    )
+    first, last = np.array(bursts[WARM_UP:-WARM_UP]).T
+    commands = ready[np.searchsorted(ready, first) - 1]
+    waits_and_jitter = ((first - commands) * 1000, (last - commands) * 1000, np.abs(spacing - 1000 / RATE_HZ))
+    return Cycle(*(tuple(np.percentile(times_ms, (50, 99)).tolist()) for times_ms in waits_and_jitter))
 
 
 def _frames(log: Path) -> tuple[np.ndarray, list[tuple[float, float]]]:

@@ -1,33 +1,17 @@
-"""One line of the benchmark table."""
+"""The rows of the benchmark table."""
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class Line:
-    """What was compared with what, and how it came out."""
-
-    what: str
-    against: str
-    ours_us: float
-    theirs_us: float
-    ratio: float
-    most: float | None  # None: no aim
-
-    def row(self) -> str:
-        """As a row of a Markdown table."""
-        verdict = " | | |"
-        if self.most is not None:
-            verdict = f" | <= {self.most:g} | {'met' if self.ratio <= self.most else '**missed**'} |"
-        return f"| {self.what} | {self.against} | {self.ours_us:.0f} | {self.theirs_us:.0f} | {self.ratio:.2f}{verdict}"
-
 
 HEADER = "| what | against | ours, µs | theirs, µs | ratio (median) | aim | |\n|---|---|---|---|---|---|---|"
 
 
-def compare(what: str, against: str, ours_us: Sequence[float], theirs_us: Sequence[float], most: float | None) -> Line:
-    """Pair the measurements up, in the order in which they were taken, and quote the median of their ratios."""
+def row(what: str, against: str, ours_us: Sequence[float], theirs_us: Sequence[float], most: float | None) -> str:
+    """What was compared with what, and how it came out. most: the largest ratio that is aimed at; None: no aim.
+
+    Measurements are paired up in the order in which they were taken, and the median of their ratios is quoted.
+    """
     ratio = statistics.median(a / b for a, b in zip(ours_us, theirs_us, strict=True))
-    return Line(what, against, statistics.median(ours_us), statistics.median(theirs_us), ratio, most)
+    verdict = "| |" if most is None else f"<= {most:g} | {'met' if ratio <= most else '**missed**'} |"
+    medians = f"{statistics.median(ours_us):.0f} | {statistics.median(theirs_us):.0f}"
+    return f"| {what} | {against} | {medians} | {ratio:.2f} | {verdict}"

@@ -13,7 +13,7 @@ import zenoh
 from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 
 REQUEST, REPLY = "bench/request", "bench/reply"
-WARM_UP = 100
+PERIOD_S, WARM_UP = 0.01, 100
 LOST_S = 1.0
 
 
@@ -24,7 +24,6 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--bytes", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=0)
-    parser.add_argument("--period-s", type=float, default=0.01)
     parser.add_argument("--key", default="")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
@@ -36,8 +35,7 @@ def main() -> None:
         if given.part == "answer":
             _answer(session, bytes(given.bytes))
         elif given.part == "ask":
-            times = _ask(session, bytes(given.bytes), given.rounds, given.period_s)
-            given.out.write_text(json.dumps(times))
+            given.out.write_text(json.dumps(_ask(session, bytes(given.bytes), given.rounds)))
         elif given.part == "read":
             _read(session, given.key, given.out)
         else:
@@ -57,8 +55,8 @@ def _answer(session: zenoh.Session, reply: bytes) -> None:
         publisher.put(reply)
 
 
-def _ask(session: zenoh.Session, request: bytes, rounds: int, period_s: float) -> list[float]:
-    """Every round trip in microseconds, one every `period_s`; a lost one counts as a second."""
+def _ask(session: zenoh.Session, request: bytes, rounds: int) -> list[float]:
+    """Every round trip in microseconds, one every `PERIOD_S`; a lost one counts as a second."""
     publisher = _publisher(session, REQUEST)
     replies: SimpleQueue[zenoh.Sample] = SimpleQueue()
     _kept = session.declare_subscriber(REPLY, replies.put)
@@ -73,7 +71,7 @@ def _ask(session: zenoh.Session, request: bytes, rounds: int, period_s: float) -
             answered = False
         if answered or times:  # until the other side is there
             times.append((time.perf_counter() - began) * 1e6)
-        time.sleep(max(began + period_s - time.perf_counter(), 0.0))
+        time.sleep(max(began + PERIOD_S - time.perf_counter(), 0.0))
     return times[WARM_UP:]
 
 
