@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 
 from snakesim_gnc.control.controller import Action, Controller, View
+from snakesim_gnc.control.service import SENSED
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ControllerError
 from snakesim_hal.in_process import InProcessRun
@@ -15,18 +16,15 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     AppliedCommand,
-    Contacts,
     Description,
     JointState,
     LifecycleState,
     Message,
     Mode,
-    Pose,
 )
 
 SPARE_S = 1.0  # the run must not be over before the episode is
 OVER = object()
-SENSORS: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 
 class AssistedRobot:
@@ -45,7 +43,7 @@ class AssistedRobot:
             opening.callback(session.close)
             self._joints = session.reader(keys.JOINTS, JointState)
             self._applied = session.reader(keys.APPLIED, AppliedCommand)
-            self._sensors = {key: session.reader(key, message) for key, message in SENSORS.items()}
+            self._sensors = {key: session.reader(key, message) for key, message in SENSED.items()}
             self._turns = self._run.turns(before_services=True)
             opening.callback(self._turns.close)
             self.description: Description = self._run.host.description

@@ -1,6 +1,7 @@
 """Arguments of `snakesim train`. Importable without the extra that it needs."""
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -77,14 +78,7 @@ def _train(arguments: argparse.Namespace) -> int:
         environment,
         arguments.form,
         arguments.begin,
-        Effort(
-            arguments.generations,
-            arguments.population,
-            arguments.fields,
-            arguments.check_fields,
-            arguments.seed,
-            arguments.spread,
-        ),
+        Effort(**{one.name: getattr(arguments, one.name) for one in dataclasses.fields(Effort)}),
         arguments.out,
         workers=arguments.workers,
         cluster=arguments.cluster,
