@@ -39,10 +39,6 @@ class Showing(Hold):
         return self.answers[0](self, view) if self.answers else super().update(view)
 
 
-class StopError(BaseException):
-    """The test is over."""
-
-
 class Serving:
     """A service at work in a thread."""
 
@@ -55,18 +51,8 @@ class Serving:
         with open_session(link) as session:
             try:
                 loop = ServiceLoop(SERVICES[name], config, session)
-                outputs = loop.service.outputs
-
-                def stoppable(clock: Any) -> Any:
-                    if self.stopped.is_set():
-                        raise StopError
-                    return outputs(clock)
-
-                loop.service.outputs = stoppable
                 loop.join()
-                loop.run()
-            except StopError:
-                pass
+                loop.run(self.stopped.is_set)
             except SnakesimError as error:
                 self.error = error
 

@@ -44,3 +44,17 @@ def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
     steady = np.array([mode == Mode.POSITION for mode in back[0].set_points.mode])
     assert np.abs(steps[steady]).max() < STEP_RAD
     assert (Mode.TORQUE in back[-1].set_points.mode) == pushing
+
+
+@pytest.mark.parametrize("without", ["world", "trajectory"])
+@pytest.mark.parametrize("plugin", [PathFollowing, ObstacleTriplet])
+def test_before_it_knows_anything_it_holds_its_first_pose_and_says_what_is_missing(plugin, without):
+    stage = make_stage()
+    controller = plugin(stage.robot, plugin.Settings())
+    view = stage.view(0, TAIL_S_M, without=without)
+    first = controller.update(view)
+    assert first.report.why == {"world": "no world model", "trajectory": "no trajectory"}[without]
+    assert first.set_points.target == pytest.approx(view.joints.angle_rad)
+    assert set(first.set_points.mode) == {Mode.POSITION}
+    slid = controller.update(stage.view(1, TAIL_S_M, without=without, turned={3: 0.2}))
+    assert slid.set_points.target == pytest.approx(first.set_points.target)  # held, not followed

@@ -11,6 +11,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
 from tests.harness.wait import wait_until
 from tests.unit.gnc.services import Showing, Stage, stage
+from tests.unit.gnc.stage import known
 from tests.unit.hal.local_network import threads_switching
 
 PERIOD_NS = 20_000_000
@@ -71,39 +72,25 @@ def test_a_command_names_the_joint_state_that_it_answers() -> None:
         assert len(named - felt) <= 2  # at the ends of what was heard
 
 
-@pytest.mark.parametrize(
-    ("sender", "key", "what", "words"),
-    [
-        ("hal", keys.POSE, "world", "sensor/pose is "),
-        ("navigation", keys.TRAJECTORY, "trajectory", "navigation/trajectory is "),
-    ],
-)
-def test_a_stream_that_stops_is_withheld_named_and_given_again(sender: str, key: str, what: str, words: str) -> None:
+def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_leaves_grows_old() -> None:
     limits = {"pose_s": 0.3, "trajectory_s": 0.5}
     with stage(max_age=limits) as made:
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
-        assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key)).ok
-        wait_until(lambda: blind(made, what), f"views without a {what}")
-        reported = made.tells(words)
-        assert (
-            reported.state == "NotLocomoting"
-            and f"at most {limits[key.partition('/')[2] + '_s']:.3g} s" in reported.reason
-        )
-        since = len(made.views)
-        assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key, end=True)).ok
-        wait_until(lambda: sighted(made, since), "views with everything again")
-        wait_until(lambda: words not in (made.state() or reported).reason, "another reason")
-        assert made.run.status.lifecycle == "armed" and not made.run.status.faults
+        for sender, key, what in (("hal", keys.POSE, "world"), ("navigation", keys.TRAJECTORY, "trajectory")):
+            assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key)).ok
+            wait_until(lambda what=what: blind(made, what), f"views without a {what}")
+            reported, words = made.tells(f"{key} is "), f"at most {limits[key.partition('/')[2] + '_s']:.3g} s"
+            assert reported.state == "NotLocomoting" and words in reported.reason
+            since = len(made.views)
+            assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key, end=True)).ok
+            wait_until(lambda since=since: sighted(made, since), "views with everything again")
+            wait_until(lambda key=key: f"{key} is " not in known(made.state()).reason, "another reason")
         for view in made.views:  # nothing too old was ever handed over
             if view.world is not None:
                 assert view.tick * PERIOD_NS - (view.world.pose_stamp_ns or 0) <= 300_000_000
-
-
-def test_guidance_that_ends_leaves_a_world_and_a_trajectory_that_grow_old() -> None:
-    with stage(max_age={"trajectory_s": 0.5}) as made:
-        made.run.arm()
-        wait_until(lambda: sighted(made), "views with everything in them")
+        assert not made.run.status.faults
+        made.reported.clear()
         made.services["guidance"].stop()
         made.tells("guidance/world is ")
         made.tells("navigation/trajectory is ")  # planned from the last world model over and over

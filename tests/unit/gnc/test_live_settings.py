@@ -41,13 +41,10 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_the_configuration_is_in_force_first_with_its_schema(bench: Bench):
+def test_the_configuration_is_in_force_first_with_its_schema_and_valid_settings_make_the_controller_anew(bench: Bench):
     reported = bench.in_force()
     assert msgspec.json.decode(reported.settings)["propulsion_n"] == 35.0
     assert '"propulsion_n":{"unit":"N"' in reported.schema and reported.who is None and reported.changes == 0
-
-
-def test_valid_settings_make_the_controller_anew(bench: Bench):
     assert bench.ask('{"propulsion_n": 20}').ok and bench.anew == [True]
     reported = bench.in_force()
     assert msgspec.json.decode(reported.settings)["propulsion_n"] == 20.0

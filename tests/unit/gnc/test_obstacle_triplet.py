@@ -20,11 +20,7 @@ def torque_joints(action) -> list[int]:
 
 def stay(controller, stage, ticks, **more):
     """The last of many updates of a body that does not move."""
-    action = None
-    for tick in range(ticks):
-        action = controller.update(stage.view(tick, TAIL_S_M, **more))
-    assert action is not None
-    return action
+    return [controller.update(stage.view(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
 
 
 def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved_triplet():
@@ -111,15 +107,6 @@ def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
     assert known(report.propulsion_n) < 35.0
     assert abs(action.set_points.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
     assert abs(report.bending_torque_nm[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
-
-
-def test_without_a_world_model_it_holds_and_says_so():
-    stage = make_stage()
-    view = stage.view(0, TAIL_S_M, without="world")
-    blind = make_controller(stage).update(view)
-    assert blind.report.why == "no world model"
-    assert blind.set_points.target == pytest.approx(view.joints.angle_rad)
-    assert torque_joints(blind) == []
 
 
 def test_the_torque_does_not_step_when_another_triplet_takes_over_the_same_joint():

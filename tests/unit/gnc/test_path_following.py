@@ -17,10 +17,7 @@ def make_controller(stage, **settings) -> PathFollowing:
 def test_a_held_body_is_asked_for_no_more_than_the_look_ahead():
     stage = make_stage()
     controller = make_controller(stage, look_ahead_m=0.03)
-    action = None
-    for tick in range(200):
-        action = controller.update(stage.view(tick, TAIL_S_M))
-    assert action is not None
+    action = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(200)][-1]
     assert set(action.set_points.mode) == {Mode.POSITION}
     nodes = nodes_of(stage, TAIL_S_M + 0.03)
     headings = np.arctan2(*np.diff(nodes)[::-1])
@@ -45,12 +42,3 @@ def test_it_starts_without_a_jump():
     action = make_controller(stage).update(view)
     steps = np.abs(np.array(action.set_points.target) - view.joints.angle_rad)
     assert steps.max() < 0.02
-
-
-def test_it_holds_while_it_knows_nothing():
-    stage = make_stage()
-    controller = make_controller(stage)
-    first = controller.update(stage.view(0, TAIL_S_M, without="trajectory"))
-    assert first.report.why == "no trajectory"
-    slid = controller.update(stage.view(1, TAIL_S_M, without="trajectory", turned={3: 0.2}))
-    assert slid.set_points.target == first.set_points.target  # held, not followed

@@ -51,24 +51,21 @@ def test_a_peg_is_met_at_its_inflection():
     assert [c.side for c in planned_row()[:4]] in ([1, -1, 1, -1], [-1, 1, -1, 1])
 
 
-@pytest.mark.parametrize(("y", "side"), [(0.1, -1), (-0.1, 1)])
-def test_a_sphere_beside_a_straight_path(y, side):
-    ball = Obstacle(name="ball", shape="sphere", position_w=(2.0, y, 0.0), radius_m=0.03)
-    contact = plan_contact(STRAIGHT, ball, 0.04, **NEAR)
-    assert contact.point_w == pytest.approx((2.0, 0.0))
-    assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y)))
-    assert contact.side == side
-    assert contact.clearance_m == pytest.approx(0.03)
-
-
-def test_the_corner_of_a_turned_box_is_what_is_met():
-    box = Obstacle(
-        name="box", shape="box", position_w=(2.0, 0.3, 0.0), yaw_rad=math.pi / 4, half_size_m=(0.1, 0.1, 0.1)
-    )
-    contact = plan_contact(STRAIGHT, box, 0.04, **NEAR)
+@pytest.mark.parametrize(
+    ("y_m", "shape", "clearance_m"),
+    [
+        (0.1, {"shape": "sphere", "radius_m": 0.03}, 0.03),
+        (-0.1, {"shape": "sphere", "radius_m": 0.03}, 0.03),
+        (0.3, {"shape": "box", "yaw_rad": math.pi / 4, "half_size_m": (0.1, 0.1, 0.1)}, 0.26 - 0.1 * math.sqrt(2)),
+    ],
+    ids=["ball on the left", "ball on the right", "corner of a turned box"],
+)
+def test_what_stands_beside_a_straight_path_is_met_where_it_is_nearest(y_m, shape, clearance_m):
+    contact = plan_contact(STRAIGHT, Obstacle(name="it", position_w=(2.0, y_m, 0.0), **shape), 0.04, **NEAR)
     assert contact.point_w == pytest.approx((2.0, 0.0), abs=1e-3)
-    assert contact.normal_w == pytest.approx((0.0, -1.0))
-    assert contact.clearance_m == pytest.approx(0.3 - 0.1 * math.sqrt(2) - 0.04, abs=1e-4)
+    assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y_m)))
+    assert contact.side == -math.copysign(1.0, y_m)
+    assert contact.clearance_m == pytest.approx(clearance_m, abs=1e-4)
 
 
 def test_a_box_that_the_path_runs_into_has_no_clearance():

@@ -16,8 +16,9 @@ TAIL_S_M = 0.3
 BY_SHAPE = {"shape_nm_per_rad": 0.0}  # in position mode, whose targets show the push
 
 
-def references(controller, stage, ticks: int) -> np.ndarray:
-    return np.array([controller.update(stage.view(t, TAIL_S_M)).report.reference_rad for t in range(ticks)])
+def references(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndarray:
+    views = [stage.view(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(ticks)]
+    return np.array([controller.update(view).report.reference_rad for view in views])
 
 
 def test_the_wave_travels_from_head_to_tail() -> None:
@@ -43,12 +44,8 @@ def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> Non
     controller = ObstacleAided(
         stage.robot, ObstacleAided.Settings(largest_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE)
     )
-    first = controller.update(stage.view(0, TAIL_S_M))
-    start = np.array(first.set_points.target)
-    last = first
-    for tick in range(1, 400):
-        last = controller.update(stage.view(tick, TAIL_S_M))
-    pushed = np.abs(np.array(last.set_points.target) - start)
+    first, *_, last = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(400)]
+    pushed = np.abs(np.array(last.set_points.target) - first.set_points.target)
     assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
     assert last.report.propulsion_n is not None and first.report.propulsion_n is not None
     assert last.report.propulsion_n > first.report.propulsion_n
@@ -113,14 +110,8 @@ def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
 
 def test_a_jammed_wave_travels_the_other_way_for_a_while_and_one_that_comes_on_does_not() -> None:
     settings = CompliantUndulation.Settings(softness_rad_per_nm=0.0, steering=0.0, jam_after_s=0.5, back_s=0.3)
-
-    def phases(speed_m_s: float) -> np.ndarray:
-        stage = make_stage()
-        controller = CompliantUndulation(stage.robot, settings)
-        views = [stage.view(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(200)]
-        return np.array([controller.update(view).report.reference_rad for view in views])
-
-    jammed, free = phases(0.0), phases(0.2)
+    stage = make_stage()
+    jammed, free = (references(CompliantUndulation(stage.robot, settings), stage, 200, speed) for speed in (0.0, 0.2))
     assert np.abs(jammed[:50] - free[:50]).max() < 1e-9
     assert np.abs(jammed[80] - free[20]).max() < 0.05  # 0.5 s on, 0.3 s back
     assert np.abs(jammed[110] - free[50]).max() < 0.05  # and on again

@@ -41,8 +41,7 @@ def test_the_map_corrects_dead_reckoning():
     off: dict[bool, float] = {}
     for images in (False, True):
         drive = Drive(random_field(1))
-        for _ in drive.turns(20):  # it begins with a pose
-            pass
+        list(drive.turns(20))  # it begins with a pose
         drive.world.localiser.pose_stamp_ns = None
         off[images] = errors_m(drive, drive.turns(250, pose=False, images=images))[-1]
         assert off[images] < 4 * drive.world.localiser.position_sd_m
@@ -51,9 +50,7 @@ def test_the_map_corrects_dead_reckoning():
 
 def test_a_pose_that_jumps_is_not_believed_until_it_stays():
     drive = Drive([])
-    for _ in drive.turns(50, images=False):
-        pass
-    here = drive.place(drive.turn)
+    *_, here = drive.turns(50, images=False)
     for here in drive.turns(10, pose=False, images=False):
         drive.world.take_pose(drive.pose(here, off_m=0.3))
     assert abs(drive.world.localiser.base.planar_w[0] - here.base_w[0]) < 0.03 and drive.world.localiser.refused == 10

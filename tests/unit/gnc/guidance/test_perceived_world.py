@@ -75,13 +75,11 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
 
 def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     drive = Drive(random_field(1))
-    for _ in drive.turns(60):
-        pass
+    list(drive.turns(60))
     drive.under_way.clear()
     before = reported(drive)
     assert len(before.obstacles) > 3
-    for _ in drive.turns(100, pose=False, images=False, imu=False):
-        pass
+    list(drive.turns(100, pose=False, images=False, imu=False))
     after = reported(drive)
     assert after.pose_stamp_ns == before.pose_stamp_ns and after.depth_stamp_ns == before.depth_stamp_ns
     assert after.base_confidence < before.base_confidence
