@@ -12,6 +12,7 @@ import zenoh
 from tests.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
+BLOCK = zenoh.CongestionControl.BLOCK
 
 
 def _config(endpoint: str, *, listen: bool) -> zenoh.Config:
@@ -27,10 +28,19 @@ def _config(endpoint: str, *, listen: bool) -> zenoh.Config:
     )
 
 
-def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+def publisher_of(session: zenoh.Session, key: str, congestion: zenoh.CongestionControl = BLOCK) -> zenoh.Publisher:
+    """Of what nothing else is as urgent as."""
     return session.declare_publisher(
-        key, express=True, priority=zenoh.Priority.REAL_TIME, congestion_control=zenoh.CongestionControl.BLOCK
+        key, express=True, priority=zenoh.Priority.REAL_TIME, congestion_control=congestion
     )
+
+
+def answer(session: zenoh.Session, reply: bytes, congestion: zenoh.CongestionControl = BLOCK) -> None:
+    """Answer every request, until somebody ends this process."""
+    publisher = publisher_of(session, REPLY, congestion)
+    requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))  # a temporary one would be closed
+    for _ in requests:
+        publisher.put(reply)
 
 
 def echo_us(request: bytes, reply: bytes, rounds: int = 2000, period_s: float = 0.0) -> float:
@@ -44,7 +54,7 @@ def echo_times_us(
     """Every round trip. prefix: of the command that starts the other process."""
     endpoint = free_endpoint()
     with zenoh.open(_config(endpoint, listen=True)) as session:
-        publisher = _publisher(session, REQUEST)
+        publisher = publisher_of(session, REQUEST)
         replies = session.declare_subscriber(REPLY, zenoh.handlers.RingChannel(4))
         other = subprocess.Popen([*prefix, sys.executable, "-m", "benchmarks.echo", endpoint, str(len(reply))])
         try:
@@ -70,14 +80,6 @@ def echo_times_us(
     return times
 
 
-def _answer(endpoint: str, reply_bytes: int) -> None:
-    reply = bytes(reply_bytes)
-    with zenoh.open(_config(endpoint, listen=False)) as session:
-        publisher = _publisher(session, REPLY)
-        requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))
-        for _ in requests:
-            publisher.put(reply)
-
-
 if __name__ == "__main__":
-    _answer(sys.argv[1], int(sys.argv[2]))
+    with zenoh.open(_config(sys.argv[1], listen=False)) as joined:
+        answer(joined, bytes(int(sys.argv[2])))

@@ -12,10 +12,10 @@ from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.session import Link, Publisher, Session, open_session
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
-from snakesim_hal.wire.messages import Clock, JointCommand, Mode
+from snakesim_hal.wire.messages import JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
 from tests.harness.endpoint import free_endpoint
-from tests.unit.hal.rig import command
+from tests.unit.hal.rig import clock, command
 from tests.whole_run import run as run_in_process
 
 TICKS_A_BLOCK = 50
@@ -35,24 +35,14 @@ def open_simulator(config: RunConfig) -> SimBackend:
 class Publishing:
     """What the host does with samples, and nothing else."""
 
-    def __init__(self, session: Session, period_ns: int) -> None:
+    def __init__(self, session: Session) -> None:
         self._session = session
-        self._period_ns = period_ns
         self._publishers: dict[str, Publisher[JointCommand]] = {}
 
     def put(self, tick: int, samples: Samples) -> None:
         """Publish every sample and the clock."""
-        clock = Clock(
-            tick=tick,
-            stamp_ns=tick * self._period_ns,
-            period_ns=self._period_ns,
-            pace="free",
-            lifecycle="armed",
-            arming=1,
-            lease_epoch=1,
-            newest=dict.fromkeys(samples.others, tick),
-        )
-        for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, clock)):
+        now = clock(tick, arming=1, pace="free", newest=dict.fromkeys(samples.others, tick))
+        for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, now)):
             if key not in self._publishers:
                 self._publishers[key] = self._session.publisher(key, type(message))  # pyright: ignore
             self._publishers[key].put(message)  # pyright: ignore
@@ -115,7 +105,7 @@ def sensing(config: RunConfig) -> tuple[list[float], list[float], list[float]]:
     with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
         first = full.sample(0, 0)
         readers = [other.reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.others.items())]
-        publishing = Publishing(session, config.period_ns)
+        publishing = Publishing(session)
         tick = 0
         for start in range(0, len(points) - TICKS_A_BLOCK + 1, TICKS_A_BLOCK):
             block = points[start : start + TICKS_A_BLOCK]

@@ -10,9 +10,10 @@ from queue import Empty, SimpleQueue
 
 import zenoh
 
+from benchmarks.echo import REPLY, REQUEST, answer, publisher_of
 from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 
-REQUEST, REPLY = "bench/request", "bench/reply"
+DROP = zenoh.CongestionControl.DROP
 PERIOD_S, WARM_UP = 0.01, 100
 LOST_S = 1.0
 
@@ -33,7 +34,7 @@ def main() -> None:
     sys.setswitchinterval(0.0005)
     with zenoh.open(zenoh.Config.from_file(given.file)) as session:
         if given.part == "answer":
-            _answer(session, bytes(given.bytes))
+            answer(session, bytes(given.bytes), DROP)
         elif given.part == "ask":
             given.out.write_text(json.dumps(_ask(session, bytes(given.bytes), given.rounds)))
         elif given.part == "read":
@@ -42,22 +43,9 @@ def main() -> None:
             threading.Event().wait()
 
 
-def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    return session.declare_publisher(
-        key, express=True, priority=zenoh.Priority.REAL_TIME, congestion_control=zenoh.CongestionControl.DROP
-    )
-
-
-def _answer(session: zenoh.Session, reply: bytes) -> None:
-    publisher = _publisher(session, REPLY)
-    requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))  # a temporary one would be closed
-    for _ in requests:
-        publisher.put(reply)
-
-
 def _ask(session: zenoh.Session, request: bytes, rounds: int) -> list[float]:
     """Every round trip in microseconds, one every `PERIOD_S`; a lost one counts as a second."""
-    publisher = _publisher(session, REQUEST)
+    publisher = publisher_of(session, REQUEST, DROP)
     replies: SimpleQueue[zenoh.Sample] = SimpleQueue()
     _kept = session.declare_subscriber(REPLY, replies.put)
     times: list[float] = []
