@@ -144,7 +144,7 @@ def test_the_papers_equations_1_to_11_with_the_corrected_one_give_the_same(case)
 
 
 @given(cases(), st.lists(st.tuples(st.floats(-0.2, 0.9), st.floats(-0.3, 0.3)), min_size=1, max_size=8))
-def test_bending_torque_is_the_same_from_ahead_and_from_behind(case, joints):
+def test_bending_torque_is_the_same_from_ahead_and_from_behind_and_at_the_propulsion_joint_its_torque(case, joints):
     places = np.array([0.0, 0.3, 0.6])
     solved = case.solve()
     pushed = loads(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
@@ -156,13 +156,7 @@ def test_bending_torque_is_the_same_from_ahead_and_from_behind(case, joints):
         moments = cross(case.points - joint_w, pushed)
         assert torque == pytest.approx(moments[behind].sum(), abs=1e-7)
         assert torque == pytest.approx(-moments[~behind].sum(), abs=1e-7)
-
-
-@given(cases())
-def test_bending_torque_at_the_propulsion_joint_is_its_torque(case):
-    solved = case.solve()
-    pushed = loads(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
-    (torque,) = bending_torque_nm(case.joint[None], [0.4], case.points, [0.0, 0.3, 0.6], pushed)
+    (torque,) = bending_torque_nm(case.joint[None], [0.4], case.points, places, pushed)
     assert torque == pytest.approx(solved.torque_nm, rel=1e-9, abs=1e-9)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from snakesim_gnc.guidance.depth_scan import Intrinsics
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
+from snakesim_operator.robots.urdf_tree import rotation
 
 Ground = Callable[[Floats, Floats], Floats]
 INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
@@ -143,8 +144,4 @@ def lidar(
 
 def turned(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:
     """World_from_sensor, from yaw, then pitch (downwards), then roll."""
-    cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw_rad, pitch_rad, roll_rad) for f in (math.cos, math.sin))
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    return about_z @ about_y @ about_x
+    return rotation(roll_rad, pitch_rad, yaw_rad)

@@ -8,7 +8,7 @@ from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_hal.wire.messages import Contacts, World
 from snakesim_operator.results.map_score import MapScore, moved, score
-from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, Place, random_field
+from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, random_field
 from tests.unit.gnc.guidance.rendered import cylinder, hills, lidar
 from tests.unit.hal.rig import contact
 
@@ -90,16 +90,12 @@ def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     assert all(o.last_seen_ns == seen[o.name].last_seen_ns for o in after.obstacles)
 
 
-def touching(here: Place, turn: int) -> Contacts:
-    """A peg, unseen, at the left side of the middle link; the sensor tells no name that is true."""
-    touch = contact(7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0))
-    return Contacts(tick=turn, stamp_ns=turn * STEP_NS, contacts=[touch])
-
-
 def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():
+    """Of a peg, unseen, at the left side of the middle link."""
+    touch = contact(7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0))
     drive = Drive([])
-    for here in drive.turns(10, images=False):
-        drive.world.take_contacts(touching(here, drive.turn))
+    for _ in drive.turns(10, images=False):
+        drive.world.take_contacts(Contacts(tick=drive.turn, stamp_ns=drive.turn * STEP_NS, contacts=[touch]))
     world = drive.world.world(9, 9 * STEP_NS)
     assert world is not None and world.contacts
     assert {c.obstacle for c in world.contacts} <= {o.name for o in world.obstacles}
