@@ -122,16 +122,15 @@ def choose(
     if not free:
         return None
     least = min(c.triplet.torque_per_n for c in free)
-    names: Collection[str] = () if present is None else present.names
+    names: frozenset[str] = frozenset() if present is None else frozenset(present.names)
     for choice in free:
         if choice.triplet is present and least >= switch_share * choice.triplet.torque_per_n:
             return choice
     cheap = [c for c in free if switch_share * c.triplet.torque_per_n <= least]
-    return max(cheap, key=lambda c: (_shared(c, names), -round(c.triplet.torque_per_n, 3), -c.body_s_m[1]))
-
-
-def _shared(choice: Choice, names: Collection[str]) -> int:
-    return sum(name in names for name in choice.triplet.names)
+    return max(
+        cheap,
+        key=lambda c: (len(names.intersection(c.triplet.names)), -round(c.triplet.torque_per_n, 3), -c.body_s_m[1]),
+    )
 
 
 class Triplets:
