@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from snakesim_gnc.guidance.depth_scan import Intrinsics
+from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
 from snakesim_operator.robots.urdf_tree import rotation
@@ -140,6 +141,13 @@ def lidar(
         range_max_m=4.0,
         range_m=[float(r) if r < 4.0 else None for r in found],
     )
+
+
+def scanned(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), stamp_ns: int = 0) -> Scan:
+    """What that lidar sees from a place near the ground, looking along x."""
+    position, ahead = np.array([*at, 0.05]), turned(0.0)
+    ranges = lidar(obstacles, position, ahead, beams=361, stamp_ns=stamp_ns)
+    return scan_of_ranges(ranges, position, ahead, 0.0, Noise(0.002, 0.0))
 
 
 def turned(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:

@@ -9,32 +9,25 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.guidance import obstacle_map
 from snakesim_gnc.guidance.obstacle_map import KEPT_M, ObstacleMap
-from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.guidance.rendered import box, cylinder, lidar, turned
+from tests.unit.gnc.guidance.rendered import box, cylinder, scanned
 
 S = 1_000_000_000
 BODY_M = 0.04
 
 
-def scan_of(*obstacles, at=(0.0, 0.0), stamp_ns=0) -> Scan:
-    position = np.array([*at, 0.05])
-    ranges = lidar(obstacles, position, turned(0.0), stamp_ns=stamp_ns, beams=361)
-    return scan_of_ranges(ranges, position, turned(0.0), 0.0, Noise(0.002, 0.0))
-
-
 def mapped(*obstacles, looks=4) -> ObstacleMap:
     map_ = ObstacleMap()
     for k in range(looks):
-        map_.take_scan(scan_of(*obstacles, stamp_ns=k * S // 20))
+        map_.take_scan(scanned(*obstacles, stamp_ns=k * S // 20))
     return map_
 
 
-def touch(map_, centre, radius_m, angle_rad, stamp_ns=0) -> None:
+def touch(map_, centre, radius_m, angle_rad) -> None:
     """A contact with a round thing, from outside."""
     normal = np.array([math.cos(angle_rad), math.sin(angle_rad)])
-    map_.take_touches([(np.array(centre) + radius_m * normal, normal)], stamp_ns)
+    map_.take_touches([(np.array(centre) + radius_m * normal, normal)], 0)
 
 
 def only(map_, now_ns=0) -> Obstacle:
@@ -76,7 +69,7 @@ def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_
 def test_what_one_can_see_through_is_dropped():
     map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
     for k in range(8):
-        map_.take_scan(scan_of(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), stamp_ns=k))
+        map_.take_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), stamp_ns=k))
     assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.obstacles(0, 0.0))
     assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
 
@@ -84,10 +77,10 @@ def test_what_one_can_see_through_is_dropped():
 def test_what_is_hidden_or_out_of_view_is_kept():
     map_ = mapped(cylinder("a", 1.2, 0.0))
     for k in range(20):
-        map_.take_scan(scan_of(box("screen", 0.5, 0.0, (0.05, 0.8)), stamp_ns=k))
+        map_.take_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), stamp_ns=k))
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
     for k in range(20):
-        map_.take_scan(scan_of(at=(2.0, 0.0), stamp_ns=k))
+        map_.take_scan(scanned(at=(2.0, 0.0), stamp_ns=k))
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
@@ -103,7 +96,7 @@ def test_what_the_body_passes_through_does_not_exist():
 def test_where_the_body_lies_nothing_reaches():
     map_ = ObstacleMap()
     for k in range(4):  # one face of a box: how deep it is, is a guess
-        map_.take_scan(scan_of(box("thin", 0.8, 0.0, (0.03, 0.3)), stamp_ns=k))
+        map_.take_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), stamp_ns=k))
     axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
     assert (outer := only(map_)).half_size_m and _depth_beyond(outer, axis) > 0.02
     for _ in range(5):
@@ -120,7 +113,7 @@ def test_the_newest_look_counts_most_after_drift():
     still, drifted = mapped(cylinder("a", 0.8, 0.0)), mapped(cylinder("a", 0.8, 0.0))
     drifted.drift(0.02**2)
     for map_ in (still, drifted):
-        map_.take_scan(scan_of(cylinder("a", 0.815, 0.0)))
+        map_.take_scan(scanned(cylinder("a", 0.815, 0.0)))
     assert only(drifted).position_w[0] == pytest.approx(0.815, abs=0.003)
     assert only(still).position_w[0] < 0.812
 

@@ -9,25 +9,19 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.guidance.clusters import clusters_of
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import Noise, scan_of_ranges
 from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, Surface
 from snakesim_gnc.guidance.tracks import Track, fit
 from snakesim_hal.model.outlines import outline_distance_m
-from tests.unit.gnc.guidance.rendered import box, cylinder, lidar, turned
+from tests.unit.gnc.guidance.rendered import box, cylinder, scanned
 
-AT = np.array([0.0, 0.0, 0.05])
 NOISE_M = 0.002
-
-
-def scanned(*obstacles, beams=361, at=AT):
-    return scan_of_ranges(lidar(obstacles, at, turned(0.0), beams=beams), at, turned(0.0), 0.0, Noise(NOISE_M, 0.0))
 
 
 def seen(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
     """A track of what a lidar saw of one obstacle, from some places."""
     track = Track(1, "it")
     for x, y in views:
-        scan = scanned(truth, at=np.array([x, y, 0.05]))
+        scan = scanned(truth, at=(x, y))
         hits = np.flatnonzero(np.isfinite(scan.range_m))
         towards = scan.origin_w - scan.points_w[hits]
         towards = towards / np.hypot(*towards.T)[:, None]
