@@ -125,7 +125,8 @@ class SteppedRobot:
     def _sample(self) -> Samples:
         now_ns = self._tick * self._period_ns
         if self._faults is not None:
-            self._faults.turn(now_ns, self._arming, self.lifecycle)
+            arming = 1 if self._authority is None else self._authority.arming
+            self._faults.turn(now_ns, arming, self.lifecycle)
         samples = self._backend.sample(self._tick, now_ns)
         self.newest.update(samples.others)
         if self._authority is not None:
@@ -133,10 +134,6 @@ class SteppedRobot:
             if isinstance(power := samples.others.get(keys.POWER), Power):
                 self._authority.observe_power(power, now_ns)
         return samples
-
-    @property
-    def _arming(self) -> int:
-        return 1 if self._authority is None else self._authority.arming
 
     def _arm(self, authority: Authority) -> None:
         authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=100), 0)

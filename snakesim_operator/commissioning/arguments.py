@@ -21,11 +21,11 @@ def add_commands(commands: Any) -> None:
     verbs = joints.add_subparsers(dest="verb", required=True, metavar="VERB")
     zero = _by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")
     zero.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
-    for verb, act, about in (
-        ("direction", _direction, "turn joints by hand: which count the wrong way round, or have another's id"),
-        ("limits", _limits, "move joints by hand from end to end: their limits"),
+    for verb, about in (
+        ("direction", "turn joints by hand: which count the wrong way round, or have another's id"),
+        ("limits", "move joints by hand from end to end: their limits"),
     ):
-        command = _by_hand(verbs, verb, act, about)
+        command = _by_hand(verbs, verb, _direction_or_limits, about)
         command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
     _add_jog(verbs)
     judge = verbs.add_parser(
@@ -84,16 +84,11 @@ def _jog(arguments: argparse.Namespace) -> int:
     return jog(arguments.file, selection_of(arguments), wanted)
 
 
-def _direction(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.commissioning.by_hand import direction
+def _direction_or_limits(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import direction, limits
 
-    return direction(arguments.file, selection_of(arguments), arguments.joints)
-
-
-def _limits(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.commissioning.by_hand import limits
-
-    return limits(arguments.file, selection_of(arguments), arguments.joints)
+    act = direction if arguments.verb == "direction" else limits
+    return act(arguments.file, selection_of(arguments), arguments.joints)
 
 
 def _check(arguments: argparse.Namespace) -> int:

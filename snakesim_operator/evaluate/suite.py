@@ -105,13 +105,14 @@ def rows_of(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Cas
 
 def settings_of(suite: Suite, source: str) -> list[Setting]:
     """The rows of the table in order. Raises ConfigError."""
-    always = [*_overrides(suite.set, f"{source}: [set]"), *_left_out(suite.unset, f"{source}: `unset`")]
+    always = [*_overrides(suite.set, f"{source}: [set]")]
+    always += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
     varied = {key: _values(key, given, source) for key, given in suite.vary.items()}
     words = _short_names(list(varied))
     found: list[Setting] = []
     for row in suite.row or [Row(name="")]:
         where = f"{source}: row {row.name!r}" if row.name else source
-        own = [*_overrides(row.set, where), *_left_out(row.unset, where)]
+        own = [*_overrides(row.set, where), *(Override(key, None, where) for key in row.unset)]
         draws = _draws(suite, row.without, where)
         for values in itertools.product(*varied.values()):
             parts = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
@@ -214,10 +215,6 @@ def _overrides(given: dict[str, Any], origin: str, prefix: str = "") -> Iterator
             yield from _overrides(value, origin, f"{prefix}{key}.")
         else:
             yield Override(prefix + key, value, origin)
-
-
-def _left_out(keys: Sequence[str], origin: str) -> Iterator[Override]:
-    yield from (Override(key, None, origin) for key in keys)
 
 
 def _values(key: str, given: list[Any] | str, source: str) -> list[Any]:
