@@ -16,7 +16,7 @@ intervals.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,7 +131,7 @@ def friction(moved: Moved, between_nm: Floats, load_nm: Floats, load_by_angle_nm
         share = found.values[5]
         scale = Value(float(1 / share), float(found.within[5] / share**2))
         found = found.divided_by(5)
-    dry, viscous, armature = found.known(3)
+    dry, viscous, armature, *_ = found.known
     shown = np.column_stack((torque, np.full(len(torque), np.nan)))
     shown[used, 1] = torque[used] - found.left
     return Friction(dry, viscous, armature, scale, 1 - float(np.var(found.left) / np.var(torque[used])), shown)
@@ -166,17 +166,16 @@ def servo(moved: Moved) -> Servo:
     every = np.column_stack((of, by_late, by_lag))
     left = torque - of @ gains
     found = _solved(every, left, every, blocks)
-    change, within = found.values, found.within
-    known = [Value(float(v), float(w)) for v, w in zip(gains + change[:3], within[:3], strict=True)]
-    late, lag = late_s + change[3], lag_s + change[4]
-    fine = _behind(moved, fused, float(max(late, 0.0)), float(max(lag, 0.0))) @ (gains + change[:3])[:2]
+    changed = replace(found, values=np.concatenate((gains, (late_s, lag_s))) + found.values)
+    stiffness, damping, offset, late, lag = changed.known
+    fine = _behind(moved, fused, max(late.value, 0.0), max(lag.value, 0.0)) @ changed.values[:2]
     return Servo(
-        known[0],
-        _wider(known[1], known[0].value * LOOP_S / 2),
-        Value(float(lag), float(within[4])),
-        _wider(Value(float(late), float(within[3])), LOOP_S / 2),
+        stiffness,
+        _wider(damping, stiffness.value * LOOP_S / 2),
+        lag,
+        _wider(late, LOOP_S / 2),
         1 - float(np.var(found.left) / np.var(torque)),
-        _sampled(fine) + float(gains[2] + change[2]),
+        _sampled(fine) + offset.value,
         _between(fine),
     )
 
@@ -274,9 +273,10 @@ class Solved:
         """Half-widths of their 95 % intervals."""
         return WIDER * student_95(self.freedom) * np.sqrt(np.diag(self.spread))
 
-    def known(self, first: int) -> list[Value]:
-        """The first few, each with its interval."""
-        return [Value(float(v), float(w)) for v, w in zip(self.values[:first], self.within[:first], strict=True)]
+    @property
+    def known(self) -> list[Value]:
+        """Each with its interval."""
+        return [Value(float(v), float(w)) for v, w in zip(self.values, self.within, strict=True)]
 
     def divided_by(self, last: int) -> "Solved":
         """Every value divided by one of them, with the spread to first order."""

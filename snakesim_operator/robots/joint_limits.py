@@ -83,7 +83,7 @@ def _turning(joint: Joint, negated: bool) -> Turning:
 
 def _number(joint: Joint, tag: str, attribute: str) -> float | None:
     element = joint.element.first(tag)
-    if element is None or not element.has(attribute):
+    if element is None or attribute not in element.attributes:
         return None
     value = element.number(attribute)
     return value if value > 0 or tag == "dynamics" else None

@@ -41,10 +41,6 @@ class Element:
             child.read = True
         return child
 
-    def has(self, name: str) -> bool:
-        """Whether an attribute is there."""
-        return name in self.attributes
-
     def get(self, name: str, default: str | None = None) -> str:
         """An attribute. Raises ConfigError when it is missing and has no default."""
         self.read_attributes.add(name)

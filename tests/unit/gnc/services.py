@@ -8,21 +8,18 @@ from typing import Any
 
 from snakesim_gnc.control.controller import Action, View
 from snakesim_gnc.control.hold import Hold
-from snakesim_gnc.control.service import Control
-from snakesim_gnc.guidance.service import Guidance
-from snakesim_gnc.navigation.service import Navigation
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.model.plugins import CONTROLLERS, offered
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link, Reader, open_session
-from snakesim_hal.service import Service, ServiceLoop
+from snakesim_hal.plugin_check import find_service
+from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Running, running
 from tests.unit.hal.rig import run_config
 
-SERVICES: dict[str, type[Service]] = {"guidance": Guidance, "navigation": Navigation, "control": Control}
 SCHEDULE: dict[str, Any] = {"guidance": {"every_ticks": 2}, "navigation": {"every_ticks": 5}, "control": {}}
 POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of the tests gives it
 
@@ -50,7 +47,7 @@ class Serving:
     def _work(self, name: str, config: RunConfig, link: Link) -> None:
         with open_session(link) as session:
             try:
-                loop = ServiceLoop(SERVICES[name], config, session)
+                loop = ServiceLoop(find_service(config, name), config, session)
                 loop.join()
                 loop.run(self.stopped.is_set)
             except SnakesimError as error:
@@ -103,8 +100,8 @@ def stage(**config: Any) -> Iterator[Stage]:
     ):
         states = session.reader(keys.CONTROL_STATE, ControlState)
         services: dict[str, Serving] = {}
-        for name in SERVICES:
+        for name in SCHEDULE:
             services[name] = Serving(name, made, run.link)
             stack.callback(services[name].stop)
-        wait_until(lambda: set(SERVICES) <= set(run.status.alive), "all services")
+        wait_until(lambda: set(SCHEDULE) <= set(run.status.alive), "all services")
         yield Stage(run, services, states, Showing.views)
