@@ -42,7 +42,6 @@ class WorldModel:
         felt = [] if contacts is None else contacts.contacts
         age_s = max(now_ns - pose.stamp_ns, 0) * 1e-9
         middles = origins + self._half_m[:, None] * rotations[:, :, 0]
-        x, y, z = (self._shares @ middles).tolist()
         return World(
             tick=tick,
             stamp_ns=joints.stamp_ns,
@@ -59,7 +58,7 @@ class WorldModel:
             pose_from="sensor",
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
             contacts_from=None if contacts is None else "sensor",
-            centre_w=(x, y, z),
+            centre_w=tuple((self._shares @ middles).tolist()),
         )
 
     def _touching(self, position_w: np.ndarray) -> str | None:

@@ -43,17 +43,16 @@ class ContactEstimator:
     def _contact(self, felt: FeltContact) -> Contact:
         """At the skin of its link, where the push comes from."""
         normal = np.array(felt.normal_l)
-        x, y, z = (np.array([felt.along_m, 0.0, 0.0]) - self._robot.links[felt.link].radius_m * normal).tolist()
+        position = np.array([felt.along_m, 0.0, 0.0]) - self._robot.links[felt.link].radius_m * normal
         along, across = tangents(felt.normal_l)
-        fx, fy, fz = (felt.force_n * normal).tolist()
         return Contact(
             link=felt.link,
             obstacle=None,
-            position_l=(x, y, z),
+            position_l=tuple(position.tolist()),
             normal_l=felt.normal_l,
             tangent_1_l=along,
             tangent_2_l=across,
-            force_l=(fx, fy, fz),
+            force_l=tuple((felt.force_n * normal).tolist()),
             torque_l=(0.0, 0.0, 0.0),
         )
 

@@ -28,7 +28,7 @@ from snakesim_hal.wire.messages import (
     Pose,
     World,
 )
-from snakesim_hal.wire.quantities import MAX_CONTACTS, Vector
+from snakesim_hal.wire.quantities import MAX_CONTACTS
 
 TOUCH_EVERY_NS = 50_000_000  # the body slides a few millimetres meanwhile
 OWN_BODY_M = 0.01  # beyond its radius
@@ -120,7 +120,6 @@ class PerceivedWorld:
         self.map.take_body(body.axis_w(), self._radius_m, min(here.position_sd_m, 0.01))
         self.map.forget(body.axis_w())
         middles = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
-        x, y, z = (self._shares @ middles).tolist()
         contacts = self._contacts
         felt = [] if contacts is None else [c for c in contacts.contacts if c.link < len(body.origins_w)]
         then = body if contacts is None else here.history.body_at(contacts.stamp_ns) or body
@@ -130,14 +129,14 @@ class PerceivedWorld:
         return World(
             tick=tick,
             stamp_ns=joints.stamp_ns,
-            base_position_w=_vector(base.position_w),
+            base_position_w=tuple(base.position_w.tolist()),
             base_orientation_wxyz=quaternion_of(base.rotation),
             base_confidence=confidence_of(here.position_sd_m),
             contacts=contacts_w,
             obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
             pose_stamp_ns=here.pose_stamp_ns,
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
-            centre_w=(x, y, z),
+            centre_w=tuple((self._shares @ middles).tolist()),
             base_position_sd_m=min(here.position_sd_m, 1e3),
             base_yaw_sd_rad=min(here.yaw_sd_rad, 10.0),
             depth_stamp_ns=self.depth_stamp_ns,
@@ -202,8 +201,7 @@ def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
         ]
     )
     by_largest = four_times_products[np.argmax(np.diagonal(four_times_products))]
-    w, x, y, z = (by_largest / np.linalg.norm(by_largest)).tolist()
-    return (w, x, y, z)
+    return tuple((by_largest / np.linalg.norm(by_largest)).tolist())
 
 
 def _mount(body: Body, sensor: Look) -> tuple[Floats, Floats]:
@@ -211,8 +209,3 @@ def _mount(body: Body, sensor: Look) -> tuple[Floats, Floats]:
     rotation = body.rotations[sensor.link]
     position = body.origins_w[sensor.link] + rotation @ np.array(sensor.position_l)
     return position, rotation @ rotation_from_quaternion(sensor.orientation_l_wxyz)
-
-
-def _vector(values: Floats) -> Vector:
-    x, y, z = values.tolist()
-    return (x, y, z)

@@ -32,11 +32,10 @@ class ReckonedPose:
             here.move(joints, contacts, None)
             felt = [] if contacts is None else contacts.contacts
             self._anchors.hold(here, np.array(joints.angle_rad), felt, ESTIMATED if estimated else MEASURED)
-        x, y, z = here.base.position_w.tolist()
         return Pose(
             tick=joints.tick,
             stamp_ns=joints.stamp_ns,
-            position_w=(x, y, z),
+            position_w=tuple(here.base.position_w.tolist()),
             orientation_wxyz=quaternion_of(here.base.rotation),
             velocity_w=(0.0, 0.0, 0.0),
             angular_velocity_w=(0.0, 0.0, 0.0),
