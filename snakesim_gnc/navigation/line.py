@@ -7,10 +7,10 @@ from snakesim_hal.arrays import Floats
 SPACING_M = 0.01
 
 
-def evenly(points_w: Floats, spacing_m: float = SPACING_M) -> Floats:
-    """Points (n, 2) along a line, evenly spaced; the first and the last stay."""
+def evenly(points_w: Floats) -> Floats:
+    """Points (n, 2) along a line, about `SPACING_M` apart; the first and the last stay."""
     s = _arc_lengths(points_w)
-    return _at(points_w, s, np.linspace(0.0, s[-1], max(round(s[-1] / spacing_m), 2) + 1))
+    return _at(points_w, s, np.linspace(0.0, s[-1], max(round(s[-1] / SPACING_M), 2) + 1))
 
 
 def back_from_end(points_w: Floats, spacing_m: float, steps: int) -> Floats:

@@ -27,7 +27,7 @@ def _threes(count: int) -> tuple[NDArray[np.intp], ...]:
     return indices[:, 0], indices[:, 1], indices[:, 2]
 
 
-def margins_n(contacts: Floats, drag: Floats, largest_n: float = LARGEST_N) -> Floats:
+def margins_n(contacts: Floats, drag: Floats) -> Floats:
     """F* of n bodies, (n,); zero where no three contacts can push.
 
     contacts: (n, k, 3) wrenches of the contacts' unit pushes, zero where a body has fewer; drag: (n, 3) mean wrench of
@@ -39,11 +39,11 @@ def margins_n(contacts: Floats, drag: Floats, largest_n: float = LARGEST_N) -> F
     for count in range(3, contacts.shape[1] + 1):  # most have far fewer than k: those of equal number together
         rows = np.flatnonzero(has == count)
         if len(rows):
-            margins[rows] = _of_as_many(contacts[rows][there[rows]].reshape(-1, count, 3), drag[rows], largest_n)
+            margins[rows] = _of_as_many(contacts[rows][there[rows]].reshape(-1, count, 3), drag[rows])
     return margins
 
 
-def _of_as_many(contacts: Floats, drag: Floats, largest_n: float) -> Floats:
+def _of_as_many(contacts: Floats, drag: Floats) -> Floats:
     """The same for bodies that all have k contacts."""
     first, second, third = _threes(contacts.shape[1])
     scaled = contacts * (1.0, 1.0, 2.0)  # moments over half a metre
@@ -57,7 +57,7 @@ def _of_as_many(contacts: Floats, drag: Floats, largest_n: float) -> Floats:
     cross_da = _cross(d, a)
     forces = np.stack([_dot(d, cross_bc) * inverse, -_dot(c, cross_da) * inverse, _dot(b, cross_da) * inverse])
     pushes = regular & (forces.min(axis=0) >= 0.0)
-    return largest_n / np.where(pushes, np.maximum(forces.max(axis=0), 1e-9), np.inf).min(axis=1)
+    return LARGEST_N / np.where(pushes, np.maximum(forces.max(axis=0), 1e-9), np.inf).min(axis=1)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:

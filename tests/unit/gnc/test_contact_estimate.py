@@ -18,13 +18,13 @@ MASS_KG = sum(link.mass_kg for link in ROBOT.links)
 SHAPE = 0.35 * np.sin(0.9 * np.arange(COUNT))
 
 
-def readings(pushes, shape=SHAPE, *, friction=0.0, acceleration=(0.0, 0.0)):
+def readings(pushes, *, friction=0.0, acceleration=(0.0, 0.0)):
     """Torques and IMU of a body that is pushed as told, (link, side, along_m, force_n) each, and slides along x.
 
     By d'Alembert: forces, and inertia against the common acceleration, are carried by the joints. Also returns what is
     left over of force and moment, which is zero if that acceleration is true.
     """
-    rear, frames = link_frames((0, 0, 0), np.eye(3), shape, ["yaw"] * COUNT, LENGTHS)
+    rear, frames = link_frames((0, 0, 0), np.eye(3), SHAPE, ["yaw"] * COUNT, LENGTHS)
     middles = rear + frames[:, :, 0] * np.array(LENGTHS)[:, None] / 2
     masses = np.array([link.mass_kg for link in ROBOT.links])
     loads = [
@@ -44,8 +44,8 @@ def readings(pushes, shape=SHAPE, *, friction=0.0, acceleration=(0.0, 0.0)):
     return torques, imu, np.sum([load for _, _, load in loads], axis=0), turning_nm
 
 
-def estimated(torques, imu, shape=SHAPE, pose: Pose | None = None) -> list[FeltContact]:
-    return estimate(ROBOT, shape.tolist(), [0.0] * COUNT, torques, imu, pose)
+def estimated(torques, imu, pose: Pose | None = None) -> list[FeltContact]:
+    return estimate(ROBOT, SHAPE.tolist(), [0.0] * COUNT, torques, imu, pose)
 
 
 @pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, pose(velocity_w=(0.3, 0.0, 0.0)))])
