@@ -51,10 +51,11 @@ def read_pictures(path: Path) -> dict[str, Pictures]:
             continue
         camera = name if kind == "colour" else f"{name}_depth"
         pictures = found.setdefault(camera, Pictures(seen.width, seen.height))
-        rgb = _grey(seen) if isinstance(seen, DepthImage) else np.frombuffer(seen.rgb, np.uint8)
+        data, pixel_bytes = (seen.depth, 2) if isinstance(seen, DepthImage) else (seen.rgb, 3)
         alike = (seen.width, seen.height) == (pictures.width, pictures.height)
-        whole = rgb.size == 3 * seen.width * seen.height
+        whole = len(data) == pixel_bytes * seen.width * seen.height
         if alike and whole and (not pictures.ticks or seen.tick > pictures.ticks[-1]):
+            rgb = _grey(seen) if isinstance(seen, DepthImage) else np.frombuffer(data, np.uint8)
             pictures.take(seen.tick, rgb)
     return found
 

@@ -26,6 +26,7 @@ from google.protobuf.message import Message as Protobuf
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.model.scenario import RunConfig, capsules_at_start
 from snakesim_hal.model.scene import place
+from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import (
@@ -241,7 +242,7 @@ class FoxgloveChannels:
     def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
         robot = self._robot
         image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColourImage, payload)
-        if robot is None or image is None or image.link >= len(robot.links):
+        if robot is None or image is None or mismatch(image, robot) is not None:
             return
         _, kind, camera = key.split("/", 2)
         kind, camera = {"colour": "color"}.get(kind, kind), _ros_name(camera)

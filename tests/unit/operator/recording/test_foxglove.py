@@ -22,7 +22,7 @@ from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import Contacts, ControlState
+from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyFrames
 from snakesim_operator.recording.foxglove import FoxgloveChannels
@@ -167,6 +167,15 @@ def test_images_come_with_their_camera(run: Path) -> None:
                  if t.child_frame_id == image.frame_id)  # fmt: skip
     q = mount.rotation  # the camera looks along its z, which is nearly the link's x
     assert 2 * (q.x * q.z + q.w * q.y) > 0.9 and mount.parent_frame_id == "link_13"
+
+
+def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
+    channels, key = FoxgloveChannels(ROBOT), "sensor/depth/head"
+    sent = {one.key: one.payload for one in RecordingReader(run / RECORDING).messages((keys.DESCRIPTION, key))}
+    whole = msgspec.msgpack.decode(sent[key], type=DepthImage)
+    torn = msgspec.msgpack.encode(msgspec.structs.replace(whole, depth=whole.depth[:-1]))
+    channels.take(keys.DESCRIPTION, sent[keys.DESCRIPTION], 0)
+    assert not channels.take(key, torn, 0) and channels.take(key, sent[key], 10**9)
 
 
 def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
