@@ -15,9 +15,10 @@ speed, which takes less energy; once that has led nowhere, it goes on as fast as
 import math
 
 import numpy as np
+from msgspec.structs import replace
 
 from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.felt_wave import FeltWave
+from snakesim_gnc.control.felt_wave import FeltWave, spacings
 from snakesim_gnc.control.standstill import Standstill
 from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
 from snakesim_hal.arrays import Floats
@@ -38,7 +39,9 @@ class ContactSearch:
         self._standstill = Standstill(after_s)
         self._after_s, self._for_s = after_s, for_s
         self._felt, self._slow = FeltWave(robot), FeltWave(robot, slower=SLOWER)
-        self._to_head = HeadSteeredUndulation(robot, TO_HEAD)
+        apart = spacings(robot)
+        wave = replace(TO_HEAD, amplitude_rad=apart * TO_HEAD.amplitude_rad, lag_rad=apart * TO_HEAD.lag_rad)
+        self._to_head = HeadSteeredUndulation(robot, wave)
         self._wave: LateralUndulation | None = None  # by which the body moves
         self._from_w: Floats | None = None  # where it was when the last search had ended
         self._since_s = 0.0  # when the search began

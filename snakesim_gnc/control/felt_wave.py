@@ -7,6 +7,9 @@ turns counts the joints that bend from the head on, share goes from 0 at the hea
 shipped policy `lab` (`snakesim train`, `docs/environments.md`) with its numbers, and with the contacts that guidance
 tells, measured or estimated. The policy was trained on an angle for every 50 ms; at every tick, and as fast as drives
 are, what is felt would cost a quarter more energy.
+
+It was trained on one robot. Another one moves by the same curve: its angles and lags grow with the distance between its
+joints, and a torque counts by how much it is of the joints' limit.
 """
 
 import math
@@ -15,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import View
+from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.undulation import LateralUndulation, aside_rad
 from snakesim_hal.wire.messages import Description
 
@@ -27,6 +31,12 @@ ANGLE_GAINS = np.array([-0.646916, -0.096146, 0.21155]) / 0.5  # 1/rad
 VELOCITY_GAINS = np.array([0.172301, 0.047595, 0.425563]) / 2.0  # s/rad
 TORQUE_GAINS = np.array([0.556468, -0.344171, -0.676491]) / 5.0  # 1/(N m)
 CONTACT_GAINS = np.array([0.335405, 0.117568]) / 50.0  # rad/N, of the links behind and ahead of a joint
+TRAINED_SPACING_M, TRAINED_TORQUE_NM = 0.11, 7.0  # of the robot that it was trained on: planar13
+
+
+def spacings(robot: Description) -> float:
+    """How far apart a robot's joints are, as a multiple of those of the robot that the waves were trained on."""
+    return PlanarBody(robot).spacing_m / TRAINED_SPACING_M
 
 
 class FeltWave(LateralUndulation):
@@ -34,13 +44,20 @@ class FeltWave(LateralUndulation):
 
     def __init__(self, robot: Description, *, slower: float = 1.0) -> None:
         """slower: how many times as long all that it does takes."""
-        wave = LateralUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=slower * PERIOD_S, lag_rad=LAG_RAD)
-        super().__init__(robot, wave)
+        apart = spacings(robot)
+        super().__init__(
+            robot,
+            LateralUndulation.Settings(
+                amplitude_rad=apart * AMPLITUDE_RAD, period_s=slower * PERIOD_S, lag_rad=apart * LAG_RAD
+            ),
+        )
         count = len(self._body.bends)
         share = np.arange(count)[::-1] / max(count - 1, 1)
-        self._swing_rad = AMPLITUDE_RAD + GROWTH_RAD * share
+        self._swing_rad = apart * (AMPLITUDE_RAD + GROWTH_RAD * share)
         self._felt_rad: NDArray[np.float64] | None = None
-        self._felt_rad_s = FELT_RAD_S / slower
+        self._most_felt_rad, self._felt_rad_s = apart * FELT_RAD, apart * FELT_RAD_S / slower
+        self._gains = ANGLE_GAINS / apart, VELOCITY_GAINS / apart, TORQUE_GAINS
+        self._limits = np.array(self._body.torque_limit_nm) / TRAINED_TORQUE_NM  # as multiples of the trained one's
         self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - share)) / count
 
     def start_from(self, angles_rad: NDArray[np.float64]) -> None:
@@ -52,14 +69,11 @@ class FeltWave(LateralUndulation):
         """Angles of all joints, a time later than before."""
         reference, bends, joints = super().reference_rad(view, passed_s), self._body.bends, view.joints
         felt = np.zeros(len(bends))
-        for measured, gains in (
-            (joints.angle_rad, ANGLE_GAINS),
-            (joints.velocity_rad_s, VELOCITY_GAINS),
-            (joints.torque_nm, TORQUE_GAINS),
-        ):
+        shares = np.array(joints.torque_nm) / self._limits
+        for measured, gains in zip((joints.angle_rad, joints.velocity_rad_s, shares), self._gains, strict=True):
             beside = np.pad(np.array(measured)[bends], 1)
             felt += gains[0] * beside[:-2] + gains[1] * beside[1:-1] + gains[2] * beside[2:]
-        felt, most_rad = FELT_RAD * np.tanh(felt), self._felt_rad_s * passed_s
+        felt, most_rad = self._most_felt_rad * np.tanh(felt), self._felt_rad_s * passed_s
         if self._felt_rad is not None:
             felt = self._felt_rad + np.clip(felt - self._felt_rad, -most_rad, most_rad)
         self._felt_rad = felt

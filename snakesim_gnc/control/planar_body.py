@@ -4,6 +4,7 @@ import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
+from statistics import median
 
 import numpy as np
 
@@ -31,6 +32,7 @@ class PlanarBody:
         self.segments_m = yaw_segments_m(axes, lengths)
         self.node_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]
         self.length_m = self.node_s_m[-1]
+        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighbouring joints that bend
         self.joint_s_m = np.cumsum(lengths)[:-1]
         self._joint_s: list[float] = self.joint_s_m.tolist()
         self._all_bend = len(self.bends) == len(axes)

@@ -130,6 +130,25 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
 
 
+def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
+    """Angles of all joints of a straight body, whatever path there is."""
+    joints = stage.view(0, TAIL_S_M, torque_nm=torque_nm).joints
+    straight = msgspec.structs.replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
+    view = replace(stage.view(0, TAIL_S_M, without="world"), joints=straight)
+    return FeltWave(stage.robot).reference_rad(view, 0.3)
+
+
+def test_joints_twice_as_far_apart_bend_twice_as_much_and_so_along_the_same_curve() -> None:
+    near, apart = felt_by(make_stage(13)), felt_by(make_stage(14, ("yaw", "pitch")))
+    assert apart[::2] == pytest.approx(2.0 * near[::2]) and np.ptp(near) > 0.5
+    assert not apart[1::2].any()
+
+
+def test_a_torque_is_felt_by_how_much_it_is_of_the_limit() -> None:
+    weak, strong = (felt_by(make_stage(torque_nm=limit_nm), 0.2 * limit_nm) for limit_nm in (3.5, 7.0))
+    assert weak == pytest.approx(strong) and weak != pytest.approx(felt_by(make_stage()))
+
+
 def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     stage = make_stage()
     view = stage.view(0, TAIL_S_M)
