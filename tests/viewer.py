@@ -12,6 +12,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
+from tests.harness.wait import LIMIT_S
+
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": (1.0, 0.0, 0.0, 0.0),
@@ -102,7 +104,7 @@ class Viewer:
 def viewing(address: str) -> connect:
     """The connection of a page; `async with` it."""
     socket = address.replace("http", "ws")
-    return connect(socket, subprotocols=[PROTOCOL], compression=None, max_size=None, proxy=None)
+    return connect(socket, subprotocols=[PROTOCOL], compression=None, max_size=None, proxy=None, open_timeout=LIMIT_S)
 
 
 async def watch(address: str) -> None:

@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from tests.harness.wait import wait_until
+from tests.harness.wait import LIMIT_S, wait_until
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -42,6 +42,7 @@ class Page:
             compression=None,
             max_size=None,
             proxy=None,
+            open_timeout=LIMIT_S,
         )
         self.controls: dict[str, dict[str, Any]] = {}  # by their id
         self.closed_by: int | None = None
