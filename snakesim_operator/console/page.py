@@ -125,8 +125,8 @@ class Page:
     # --- viewers ---------------------------------------------------------------------------------------------
 
     def _came(self, client: viser.ClientHandle) -> None:
-        """In a thread of viser's: the viewer may be gone before it ends."""
-        with self._of_who_is_there(client):
+        """In a thread of viser's: the viewer may be gone before it ends. Nothing is shown before it can be pressed."""
+        with self._of_who_is_there(client), client.atomic():
             with self._lock:
                 add_appearance(client, self._server.admission, dark=self._server.prefers_dark(client.client_id))
             if self._operations is not None:
