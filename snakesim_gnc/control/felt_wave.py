@@ -45,12 +45,7 @@ class FeltWave(LateralUndulation):
     def __init__(self, robot: Description, *, slower: float = 1.0) -> None:
         """slower: how many times as long all that it does takes."""
         apart = spacings(robot)
-        super().__init__(
-            robot,
-            LateralUndulation.Settings(
-                amplitude_rad=apart * AMPLITUDE_RAD, period_s=slower * PERIOD_S, lag_rad=apart * LAG_RAD
-            ),
-        )
+        super().__init__(robot, LateralUndulation.Settings(period_s=slower * PERIOD_S, lag_rad=apart * LAG_RAD))
         count = len(self._body.bends)
         share = np.arange(count)[::-1] / max(count - 1, 1)
         self._swing_rad = apart * (AMPLITUDE_RAD + GROWTH_RAD * share)
