@@ -40,17 +40,7 @@ def place_robot(
         yaw, down = quaternion_from_yaw(pose.yaw_rad), np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
         mujoco.mju_mulQuat(data.qpos[3:FREE_QPOS], np.array(yaw), down)
     physics.begin()
-    limits = [joint.limits.torque_nm for joint in config.robot.joint_table]
-    motors.enact(SetPoints([Mode.POSITION] * motors.count, pose.angles_rad.tolist(), limits))
-    physics.grip(GRIP)
-    steps = max(round(ROUND_S / model.opt.timestep), 1)
-    at_rest = 0
-    for _ in range(round(settle_s / (steps * model.opt.timestep))):
-        physics.step(steps)
-        at_rest = at_rest + 1 if np.abs(data.qvel).max() < REST else 0
-        if at_rest == REST_ROUNDS:
-            break
-    physics.grip(0.0)
+    _settle(model, data, physics, config, motors, pose, settle_s)
     data.qvel[:] = 0.0
     data.act[:] = 0.0
     data.qacc_warmstart[:] = 0.0
@@ -80,3 +70,26 @@ def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConf
                 drop = mujoco.mj_ray(model, data, point, down, only_ground, 1, -1, hit)
                 highest = max(highest, above - drop)
     return float(highest)
+
+
+def _settle(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    physics: Physics,
+    config: RunConfig,
+    motors: Motors,
+    pose: StartPose,
+    settle_s: float,
+) -> None:
+    count = motors.count
+    limits = [joint.limits.torque_nm for joint in config.robot.joint_table]
+    motors.enact(SetPoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
+    physics.grip(GRIP)
+    steps = max(round(ROUND_S / model.opt.timestep), 1)
+    at_rest = 0
+    for _ in range(round(settle_s / (steps * model.opt.timestep))):
+        physics.step(steps)
+        at_rest = at_rest + 1 if np.abs(data.qvel).max() < REST else 0
+        if at_rest == REST_ROUNDS:
+            break
+    physics.grip(0.0)

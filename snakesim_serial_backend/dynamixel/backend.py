@@ -44,33 +44,8 @@ class DynamixelBackend(FamilyBackend):
     @classmethod
     def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
         """Servos, and the load of their ports."""
-        real = not all(map(is_emulated, settings.ports))
-        for joint in joints:
-            travel_rad = (joint.limits.most_rad - joint.limits.least_rad) * joint.drive.gear
-            if joint.id > LAST_ID:
-                raise ConfigError(f"{who(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}")
-            if travel_rad + 2 * SLACK_RAD >= TURN:
-                raise ConfigError(
-                    f"{who(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when it is "
-                    f"off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
-                    f"{TURN - 2 * SLACK_RAD:.2f} rad"
-                )
-            if joint.motor.torque_constant_nm_per_a is None and real:
-                raise ConfigError(
-                    f"{who(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
-                    f"amperes: take stall torque over stall current from the e-Manual, and measure it "
-                    f"(docs/dynamixel.md)"
-                )
-        on = port_of(joints, settings.ports)
-        fullest = max(on.count(bus) for bus in set(on))
-        rate_hz, busy_s = config.rate_hz / settings.every_ticks, cycle_s(fullest, settings.baud)
-        if busy_s * rate_hz > MAX_LOAD:
-            raise ConfigError(
-                f"{fullest} servos at {rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
-                f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
-                f"most {MAX_LOAD:.0%}: use rate_hz = {fits_hz(fullest, settings.baud)}, a higher "
-                f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`"
-            )
+        check_joints(config, settings, joints)
+        check_load(config.rate_hz / settings.every_ticks, settings, joints)
 
     @classmethod
     def buses(
@@ -124,6 +99,40 @@ def constant_of(joint: Joint) -> float:
     """Its torque constant, N·m/A; without one, of a twin whose current limit is twice what its joint may ask for."""
     most_a = MOST_CURRENT * CURRENT_A / 2
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / most_a
+
+
+def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
+    """Raise ConfigError for joints that no servo can be."""
+    real = not all(map(is_emulated, settings.ports))
+    for joint in joints:
+        travel_rad = (joint.limits.most_rad - joint.limits.least_rad) * joint.drive.gear
+        if joint.id > LAST_ID:
+            raise ConfigError(f"{who(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}")
+        if travel_rad + 2 * SLACK_RAD >= TURN:
+            raise ConfigError(
+                f"{who(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when it is "
+                f"off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
+                f"{TURN - 2 * SLACK_RAD:.2f} rad"
+            )
+        if joint.motor.torque_constant_nm_per_a is None and real:
+            raise ConfigError(
+                f"{who(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit amperes: "
+                f"take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+            )
+
+
+def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
+    """Raise ConfigError when a port cannot carry its servos."""
+    on = port_of(joints, settings.ports)
+    fullest = max(on.count(bus) for bus in set(on))
+    busy_s = cycle_s(fullest, settings.baud)
+    if busy_s * rate_hz > MAX_LOAD:
+        raise ConfigError(
+            f"{fullest} servos at {rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
+            f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
+            f"most {MAX_LOAD:.0%}: use rate_hz = {fits_hz(fullest, settings.baud)}, a higher "
+            f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`"
+        )
 
 
 def twin_on(

@@ -87,13 +87,7 @@ class View:
         self._gl.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._free, every, self._scene)
-        position_w, world_from_camera = self.mount.place()
-        half = NEAREST_M / self._focal_px / 2
-        for eye in self._scene.camera:  # the eyes of the scene, where the camera is
-            eye.pos, eye.forward, eye.up = position_w, world_from_camera[:, 0], world_from_camera[:, 2]
-            eye.frustum_center, eye.frustum_width = 0.0, half * self._frame.width
-            eye.frustum_bottom, eye.frustum_top = -half * self._frame.height, half * self._frame.height
-            eye.frustum_near, eye.frustum_far = NEAREST_M, FURTHEST_M
+        self._look()
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._own:
                 geom.size[:] = 0.0  # the camera is not in its own way
@@ -102,6 +96,16 @@ class View:
         near, far = NEAREST_M, FURTHEST_M
         depth_m = near * far / (near + self._buffer * (far - near))  # the buffer goes from 0, far, to 1, near
         return np.flipud(self._rgb), np.flipud(depth_m)
+
+    def _look(self) -> None:
+        """Put the eyes of the scene where the camera is."""
+        position_w, world_from_camera = self.mount.place()
+        half = NEAREST_M / self._focal_px / 2
+        for eye in self._scene.camera:
+            eye.pos, eye.forward, eye.up = position_w, world_from_camera[:, 0], world_from_camera[:, 2]
+            eye.frustum_center, eye.frustum_width = 0.0, half * self._frame.width
+            eye.frustum_bottom, eye.frustum_top = -half * self._frame.height, half * self._frame.height
+            eye.frustum_near, eye.frustum_far = NEAREST_M, FURTHEST_M
 
 
 def opened_context(width: int, height: int, what: str) -> Any:
