@@ -85,14 +85,23 @@ def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
 @needs_uv
 @pytest.mark.parametrize("section", README, ids=named)
 def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
-    """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule."""
-    git = ["git", "-C", str(tmp_path / "origin"), "-c", "user.name=x", "-c", "user.email=x@example.org"]
-    shutil.copytree(REPOSITORY, tmp_path / "origin", ignore=documents.LEFT_OUT, symlinks=True)
+    """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule.
+
+    The tests, which this is one of, are only collected there.
+    """
+    origin = tmp_path / "origin"
+    git = ["git", "-c", "user.name=x", "-c", "user.email=x@example.org"]
+    shutil.copytree(REPOSITORY, origin, ignore=documents.LEFT_OUT, symlinks=True)
     for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "As it is"]):
-        subprocess.run([*git, *arguments], check=True)
-    script = documents.script(section).replace(" URL ", f" {tmp_path / 'origin'} ")
-    said = typed(script, tmp_path, [])
-    assert "report:" in said and (tmp_path / "snakesim" / "runs" / "demo" / "report.html").is_file()
+        subprocess.run([*git, "-C", str(origin), *arguments], check=True)
+    clone = tmp_path / "snakesim"
+    subprocess.run([*git, "clone", "-q", str(origin), str(clone)], check=True)
+    printed = documents.script(section)
+    assert "\nmake demo" in printed and "\nmake test" in printed
+    script = printed.replace("\nmake test", "\nmake test-here WORKERS=0 ARGS='--collect-only -q'")
+    said = typed(script, clone, [])
+    assert "report:" in said and (clone / "runs" / "demo" / "report.html").is_file()
+    assert "tests collected" in said
 
 
 def test_the_documents_ask_for_something() -> None:
