@@ -96,6 +96,7 @@ class InProcessRun:
             faults=faults,
         )
         self.network.answer = self.host.take_in
+        opened.callback(self.network.close)
         for name in config.services:
             part = self._parts[name] = opened.enter_context(ExitStack())
             session = self.network.session()

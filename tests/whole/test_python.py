@@ -1,9 +1,13 @@
 """`import snakesim`: runs from a program, with what it gives as a controller, and what comes of them."""
 
+import gc
 import importlib.util
 import re
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,7 @@ import numpy as np
 import pytest
 
 import snakesim
+from snakesim.environments import SnakeEnv
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.playback.export import UNITS
 from snakesim_operator.run.in_process import simulate
@@ -172,6 +177,50 @@ def test_a_first_example_starts_gently_from_the_measured_pose(page: str, name: s
     controller = names[name](0.3) if name == "wave" else names[name]
     run = snakesim.run("triplet", controller=controller, duration=0.2)
     assert np.abs(run["velocity_rad_s"]).max() < 1.0  # rad/s; the robot's limit is 7.5
+
+
+def live_objects() -> Counter[str]:
+    """How many objects of our classes are in memory, by class."""
+    names = [f"{type(one).__module__}.{type(one).__qualname__}" for one in gc.get_objects()]
+    return Counter(name for name in names if name.startswith("snakesim"))
+
+
+def run_on(backend: str) -> None:
+    snakesim.run("triplet", duration=0.05, backend=backend)
+
+
+def run_that_fails() -> None:
+    with pytest.raises(snakesim.ControllerError):
+        snakesim.run("triplet", duration=0.05, controller=lambda time_s, joints: [1 / 0])
+
+
+def step_an_environment(action: str) -> None:
+    env = SnakeEnv("triplet", action=action)
+    env.reset(seed=1)
+    env.step(np.zeros(13))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        *(partial(run_on, backend) for backend in ("sim", "can", "moteus", "dynamixel")),
+        run_that_fails,
+        *(partial(step_an_environment, action) for action in ("position", "residual:hold")),
+    ],
+    ids=["sim", "can", "moteus", "dynamixel", "fails", "environment", "residual"],
+)
+def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> None:
+    use()  # what is cached for good
+    gc.collect()
+    gc.disable()
+    try:
+        before = live_objects()
+        use()
+        left = live_objects() - before
+    finally:
+        gc.enable()
+    assert not left, left
 
 
 def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
