@@ -5,6 +5,7 @@ import importlib.util
 import re
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -40,6 +41,17 @@ class Nod:
 
     def update(self, view):
         return snakesim.Action(snakesim.positions(self.robot, [self.by_rad] * len(self.robot.joints)))
+
+
+FAILING = """\
+import numpy as np
+from snakesim_gnc.control.hold import Hold
+
+
+class Failing(Hold):
+    def update(self, view):
+        np.linalg.solve(np.zeros((2, 2)), np.ones(2))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -109,16 +121,56 @@ def test_simulate_says_what_it_takes() -> None:
         simulate("triplet")  # pyright: ignore[reportArgumentType]
 
 
+def solve_singular(time_s, joints):
+    return np.linalg.solve(np.zeros((13, 13)), joints.angle_rad)  # the line that an error names
+
+
+SINGULAR_LINE = solve_singular.__code__.co_firstlineno + 1
+
+
 @pytest.mark.parametrize(
-    ("controller", "words"),
+    ("controller", "words", "cause"),
     [
-        (lambda time_s, joints: [0.0] * 3, r"returned \[0.0, 0.0, 0.0\], must return 13 angles in rad"),
-        (lambda time_s, joints: 1 / 0, r"raised ZeroDivisionError: division by zero \(test_python.py line \d+\)"),
+        (
+            lambda time_s, joints: [0.0] * 12,
+            r"returned \[0.0.*, must return 13 angles in rad, tail to head; got 12$",
+            None,
+        ),
+        (lambda time_s, joints: np.zeros((13, 1)), r"got an array of shape \(13, 1\)$", None),
+        (lambda time_s, joints: "ahead", r"returned 'ahead', must return 13 angles in rad", ValueError),
+        (
+            solve_singular,
+            rf"LinAlgError: Singular matrix \(test_python.py line {SINGULAR_LINE}\)$",
+            np.linalg.LinAlgError,
+        ),
     ],
+    ids=["length", "shape", "type", "in NumPy"],
 )
-def test_a_controller_that_fails_is_an_error_that_names_it(controller, words: str) -> None:
-    with pytest.raises(snakesim.ControllerError, match=words):
-        snakesim.run("triplet", controller=controller, duration=1)
+def test_a_controller_that_fails_is_an_error_that_names_it(controller, words: str, cause: type | None) -> None:
+    with pytest.raises(snakesim.ControllerError, match=words) as caught:
+        snakesim.run("triplet", controller=controller, duration=0.1)
+    assert type(caught.value.__cause__) is (type(None) if cause is None else cause)
+
+
+def test_a_controller_that_fails_in_a_child_process_is_a_cause_too(tmp_path: Path) -> None:
+    """As when NumPy was imported first."""
+    (tmp_path / "failing.py").write_text(FAILING)
+    code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
+    done = call([sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    assert "raised LinAlgError: Singular matrix (failing.py line 7)" in done.err.splitlines()[-1]
+    assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in done.err
+
+
+def test_a_controller_that_is_too_slow_for_real_time_is_reported() -> None:
+    def slow(time_s, joints):
+        time.sleep(0.1)
+        return joints.angle_rad
+
+    run = snakesim.run("triplet", controller=slow, duration=0.03)
+    assert run.complete and re.match(
+        r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0]
+    )
+    assert "update() took" in repr(run)
 
 
 def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path: Path) -> None:
