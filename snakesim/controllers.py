@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, ControllerError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description, JointState
 
@@ -53,12 +53,25 @@ def _class_of(function: JointFunction, name: str) -> Any:
             self._robot = robot
 
         def update(self, view: View) -> Action:
-            answered = function(view.time_s, view.joints)
-            angles_rad, count = np.asarray(answered, dtype=float), len(self._robot.joints)
-            if angles_rad.shape != (count,):
-                raise ValueError(f"{name}() returned {answered!r:.60}, must return {count} angles in rad, tail to head")
-            asked = angles_rad.tolist()
-            return Action(positions(self._robot, asked), Report(why=f"{name} moves the joints", reference_rad=asked))
+            answer = function(view.time_s, view.joints)
+            angles_rad = _as_angles(answer, len(self._robot.joints), name)
+            report = Report(why=f"{name} moves the joints", reference_rad=angles_rad)
+            return Action(positions(self._robot, angles_rad), report)
 
     OfFunction.__name__ = name
+    OfFunction.__module__ = getattr(function, "__module__", None) or OfFunction.__module__
     return OfFunction
+
+
+def _as_angles(answer: Any, count: int, name: str) -> list[float]:
+    """Return a function's answer as `count` angles in rad. Raises ControllerError."""
+    shown = " ".join(repr(answer).split())  # NumPy prints several lines
+    wanted = f"{name}() returned {shown:.60}, must return {count} angles in rad, tail to head"
+    try:
+        angles_rad = np.asarray(answer, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ControllerError(f"{wanted}: {error}") from error
+    if angles_rad.shape == (count,):
+        return angles_rad.tolist()
+    got = f"{len(angles_rad)}" if angles_rad.ndim == 1 else f"an array of shape {angles_rad.shape}"
+    raise ControllerError(f"{wanted}; got {got}")

@@ -152,7 +152,8 @@ class Result:
         of, moved_m = self.summary, distance_m(self.summary)
         moved = "" if moved_m is None else f", moved {moved_m:.3f} m"
         what = f"{of.scenario}, {of.controller}, {of.backend}"
-        return f"<Result {what}: {of.duration_s:g} s{moved}, {of.ended}, digest {self.digest[:16]}>"
+        slow = "".join(f", {words}" for words in of.too_slow)
+        return f"<Result {what}: {of.duration_s:g} s{moved}, {of.ended}{slow}, digest {self.digest[:16]}>"
 
     def _repr_html_(self) -> str:
         from snakesim_operator.results.report import playback_page

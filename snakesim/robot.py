@@ -184,8 +184,11 @@ class Robot:
         points = angles_rad if isinstance(angles_rad, SetPoints) else positions(self.description, list(angles_rad))
         count = len(self.names)
         for what, values in (("target", points.target), ("torque_limit_nm", points.torque_limit_nm)):
-            if len(values) != count or not all(math.isfinite(value) for value in values):
-                raise ConfigError(f"{what} is {values!r:.80}, must be {count} finite numbers, tail to head")
+            wanted = f"{what} is {values!r:.80}, must be {count} finite numbers, tail to head"
+            if len(values) != count:
+                raise ConfigError(f"{wanted}; got {len(values)}")
+            if not all(math.isfinite(value) for value in values):
+                raise ConfigError(wanted)
         self._commanding().send(points)
 
     def arm(self, *, unchecked: bool = False) -> None:

@@ -22,8 +22,6 @@ from snakesim_operator.run.in_process import simulate
 from snakesim_operator.run.run import RunRequest
 from snakesim_operator.run.run import run as run_processes
 
-FAILED = "control ended: "  # how a run's end names a controller that could not go on
-
 
 def run(
     scenario: str | os.PathLike[str],
@@ -66,9 +64,14 @@ def run(
 
 def _in_this_process(config: RunConfig, out: Path | None) -> Result:
     found = simulate(config, out)
-    if FAILED in found.summary.ended:
-        raise ControllerError(found.summary.ended.partition(FAILED)[2])
-    return Result(found.record, found.summary)
+    failure = found.control_failure
+    if failure is None:
+        return Result(found.record, found.summary)
+    try:
+        raise ControllerError(failure.message) from failure.cause
+    finally:
+        # The traceback of the cause holds this function's frame, so nothing in the frame may hold the cause.
+        del found, failure
 
 
 def _in_processes(config: RunConfig, out: Path | None) -> Result:

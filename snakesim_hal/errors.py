@@ -54,13 +54,51 @@ class RefusedError(SnakesimError, PermissionError):
     """The HAL refused a request, with its reason: a lease held by another, an arming condition not met."""
 
 
-def raised(error: BaseException) -> str:
-    """An exception of code that is not ours, in a line: what, and where."""
-    import traceback  # as in `nearest`
+OUR_PACKAGES = frozenset(
+    {
+        "snakesim",
+        "snakesim_can_backend",
+        "snakesim_gnc",
+        "snakesim_hal",
+        "snakesim_operator",
+        "snakesim_serial_backend",
+        "snakesim_sim_backend",
+    }
+)
+INSTALLED_IN = ("site-packages", "dist-packages")  # the second one is Debian's
 
-    last = traceback.extract_tb(error.__traceback__)[-1]
+
+def raised(error: BaseException, plugin: str = "") -> str:
+    """Describe an exception of a plugin in one line: what it is, and the line of the plugin that led to it.
+
+    Args:
+        error: The exception, as caught.
+        plugin: Module of the plugin's class; its package is where the line is looked for if the plugin is installed.
+    """
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    return f"raised {what} ({last.filename.rpartition('/')[2]} line {last.lineno})"
+    file, line = _line_of_plugin(error, plugin.partition(".")[0])
+    return f"raised {what} ({file.rpartition('/')[2]} line {line})"
+
+
+def _line_of_plugin(error: BaseException, package: str) -> tuple[str, int]:
+    """Return file and number of the newest line that the plugin's author has written, not NumPy's and not ours."""
+    import sysconfig  # as in `nearest`
+    import traceback
+
+    standard = (f"{sysconfig.get_path('stdlib')}/", "<frozen ")
+    newest_first = [
+        (str(frame.f_globals.get("__name__", "")).partition(".")[0], frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+    ][::-1]
+    for name, file, line in newest_first:
+        installed = any(f"/{folder}/" in file for folder in INSTALLED_IN)
+        if name not in OUR_PACKAGES and not installed and not file.startswith(standard):
+            return file, line
+    for name, file, line in newest_first:
+        if name == package:
+            return file, line
+    _, file, line = newest_first[0]
+    return file, line
 
 
 def short(text: str, most: int = 120) -> str:

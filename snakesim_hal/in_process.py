@@ -58,6 +58,7 @@ class InProcessRun:
         self.config = config
         self.network = LocalNetwork()
         self.failed: list[str] = []  # services that could not go on, and why
+        self._errors: dict[str, SnakesimError] = {}  # what ended them
         self._loops: dict[str, ServiceLoop] = {}
         self._parts: dict[str, ExitStack] = {}
         self._opened = ExitStack()
@@ -96,6 +97,7 @@ class InProcessRun:
             faults=faults,
         )
         self.network.answer = self.host.take_in
+        opened.callback(self.network.close)
         for name in config.services:
             part = self._parts[name] = opened.enter_context(ExitStack())
             session = self.network.session()
@@ -133,6 +135,20 @@ class InProcessRun:
         """End the run in order."""
         self.host.stop()
 
+    def take_errors(self) -> dict[str, SnakesimError]:
+        """Return what ended each service that could not go on, and forget it.
+
+        A traceback holds this run, and the run must not hold the traceback too: nothing would release them.
+        """
+        taken = self._errors
+        self._errors = {}
+        return taken
+
+    def too_slow(self) -> list[str]:
+        """Return the services that could not keep up in real time, and what shows it."""
+        loops = self._loops.items()
+        return [f"{name}: {loop.service.too_slow}" for name, loop in loops if loop.service.too_slow]
+
     def _let_act(self) -> None:
         for name, loop in list(self._loops.items()):
             try:
@@ -140,5 +156,6 @@ class InProcessRun:
             except SnakesimError as error:  # its process would end here, and the host would go on
                 report_error(error, f"snakesim {name}")
                 self.failed.append(f"{name} ended: {error}")
+                self._errors[name] = error
                 del self._loops[name]
                 self._parts[name].close()

@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
 BY_POSE = {GUIDANCE, "navigation"}
-SERVICE_HAS = ("name", "urgent", "configure", "outputs", "silence", "pause")
+SERVICE_HAS = ("name", "urgent", "too_slow", "configure", "outputs", "silence", "pause")
 
 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:

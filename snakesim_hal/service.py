@@ -31,6 +31,7 @@ class Service(Protocol):
 
     name: str
     urgent: bool = False  # whether the robot waits for this service in every tick
+    too_slow: str = ""  # what shows that it cannot keep up in real time; empty: nothing does
 
     def __init__(self, client: Client, config: RunConfig) -> None: ...
 
@@ -67,6 +68,7 @@ class ServiceLoop:
         name = service_type.name
         schedule = config.services.get(name, Schedule())
         self._who = f"service {schedule.code or name} (class {getattr(service_type, '__name__', service_type)})"
+        self._module = service_type.__module__
         self._client = client = Client(session, name, every_ticks=schedule.every_ticks, pace=config.pace)
         with self._named("__init__"):
             self.service = service_type(client, config)
@@ -148,7 +150,7 @@ class ServiceLoop:
             raise
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise ServiceError(f"{self._who}: {method}() {raised(error)}") from error
+            raise ServiceError(f"{self._who}: {method}() {raised(error, self._module)}") from error
 
 
 def _met(client: Client, goes_on: Callable[[], bool]) -> Description:

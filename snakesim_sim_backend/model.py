@@ -132,7 +132,7 @@ def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
     option.timestep = step_s
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # damping of the joints is taken implicitly
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake; 4.0.0's sparse Newton factor has a defect
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake than the sparse one
     # A diverged run is reported, not silently restarted. One snake is one constraint island.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -9,10 +10,10 @@ import msgspec
 from snakesim_gnc.control.controller import Action, Controller, View
 from snakesim_gnc.control.service import SENSED
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import BackendError, ControllerError
+from snakesim_hal.errors import BackendError, ControllerError, SnakesimError
 from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import CONTROL, RunConfig
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     AppliedCommand,
@@ -85,7 +86,11 @@ class AssistedRobot:
         with contextlib.redirect_stderr(self._said):
             over = next(self._turns, OVER) is OVER
         if self._run.failed:
-            raise ControllerError("; ".join(self._run.failed))
+            errors = self._run.take_errors()
+            try:
+                raise ControllerError("; ".join(self._run.failed)) from _cause_of(errors)
+            finally:
+                del errors  # the traceback in it holds this frame
         if over and self.lifecycle == "armed":
             raise BackendError(f"the run ended early: {self._run.host.ended_why or self._run.host.ended}")
         if (joints := self._joints.newest(lambda _: True)) is not None:
@@ -93,6 +98,12 @@ class AssistedRobot:
         for key, reader in self._sensors.items():
             if (message := reader.newest(lambda _: True)) is not None:
                 self.newest[key] = message
+
+
+def _cause_of(errors: Mapping[str, SnakesimError]) -> BaseException | None:
+    """Return what the controller has raised, if that is what ended control."""
+    error = errors.get(CONTROL)
+    return None if error is None else error.__cause__
 
 
 def _corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:

@@ -31,7 +31,11 @@ FIELD_TRIES = 20  # random fields that do not fit, until a reset gives up
 
 
 class SnakeEnv(gymnasium.Env[Any, Any]):
-    """One robot in one scenario, stepped; see `docs/environments.md`."""
+    """One robot in one scenario, stepped; see `docs/environments.md`.
+
+    A pickle holds the arguments, and no robot: what is loaded from it needs a `reset`, as Gymnasium's own MuJoCo
+    environments do.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
@@ -64,6 +68,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
         Raises ConfigError for wrong input, in the words of the command.
         """
+        self._arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         if scenario is None:
             raise ConfigError("SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file")
         if type(frame_skip) is not int or frame_skip < 1:
@@ -107,6 +112,13 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         ends = np.cumsum([len(part.names) for part in parts]).tolist()
         self._slices = None if flat else dict(zip(self.parts, map(slice, [0, *ends], ends), strict=False))
 
+    def __reduce__(self) -> Any:
+        return _rebuild, (type(self), self._arguments, self.spec)
+
+    def check_action(self, action: Any) -> None:
+        """Raise the ValueError of `step` for what is no action of this environment."""
+        self._commands.target(action)
+
     @property
     def digest(self) -> str:
         """Hash of every set-point as applied in this episode: the same for the same seed and actions, to the bit."""
@@ -127,9 +139,11 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command these targets for `frame_skip` ticks, or until the robot is stopped or the time is over."""
-        robot, target = self._armed(), self._commands.target(action)
+        robot = self._armed()
+        target = self._commands.target(action)
         if self._over:
-            raise gymnasium.error.ResetNeeded("the episode is over; call reset()")
+            raise gymnasium.error.ResetNeeded("the episode is over, or its last step did not finish; call reset()")
+        self._over = True  # an interrupt would leave some ticks uncounted
         energy_j, limited, before_m, ticks = 0.0, 0, self._observer.progress.along_m, 0
         while ticks < min(self._frame_skip, self._left) and robot.lifecycle == "armed":
             robot.step(self._commands.mode, target)
@@ -157,15 +171,20 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         return observation, sum(terms.values()), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The robot in its scene, as `snakesim video` draws it: (height, width, 3)."""
+        """Return a picture of the robot in its scene, (height, width, 3), drawn as by `snakesim video`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There is no robot before the first `reset`, nor after `close`.
+        """
         if self.render_mode is None:
             return None
+        robot = self._armed()
         if self._film is None:
             self._film = find_plugin(FILMS, "mujoco")(self.config, *self._size)
         progress = self._observer.progress
         position_w, wxyz = (np.array(part) for part in progress.pose)
         look_at_w = np.array([*progress.centre_w, progress.height_m])
-        return self._film.picture(position_w, wxyz, np.array(self._armed().joints.angle_rad), look_at_w)
+        return self._film.picture(position_w, wxyz, np.array(robot.joints.angle_rad), look_at_w)
 
     def close(self) -> None:
         """Release the robot and the renderer."""
@@ -242,6 +261,13 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         if robot.lifecycle != "armed":
             info["why"] = robot.why
         return info
+
+
+def _rebuild(kind: type[SnakeEnv], arguments: dict[str, Any], spec: Any) -> SnakeEnv:
+    """Return a new environment like the one that was pickled."""
+    made = kind(**arguments)
+    made.spec = spec
+    return made
 
 
 def _box(low: Sequence[float], high: Sequence[float]) -> spaces.Box:

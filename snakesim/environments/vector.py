@@ -1,15 +1,20 @@
-"""Many environments at once: a process for each processor, each with its share of them, one after the other.
+"""Many environments at once: one process for each processor, and each process steps its share of the environments.
 
-With a process for each environment, a step waits for the slowest, and every environment pays for its own messages.
+With one process for each environment, a step waits for the slowest process, and every environment pays for its own
+messages.
 """
 
+import contextlib
 import multiprocessing
 import os
-from collections.abc import Sequence
-from multiprocessing.connection import Connection
+import signal
+from collections.abc import Iterator, Sequence
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import numpy as np
+from gymnasium import error
+from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
@@ -17,90 +22,111 @@ from numpy.typing import NDArray
 from snakesim.environments.environment import SnakeEnv
 from snakesim_hal.errors import BackendError, ConfigError
 
-LEAVE_S = 5.0
+CLOSE_TIMEOUT_S = 5.0
+CLOSE = "close"  # a request without an answer
 Outcome = tuple[Any, float, bool, bool, dict[str, Any]]
 
 
 class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
-    """Environments of one scenario. After the end of an episode the next step resets it, as Gymnasium's own do."""
+    """Environments of one scenario. After the end of an episode the next step resets it, as Gymnasium's own do.
+
+    A pickled one starts new processes when it is loaded, and needs a `reset`.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(self, num_envs: int = 1, *, processes: int | None = None, **arguments: Any) -> None:
-        """processes: None: one for each processor that this one may use. arguments: those of `SnakeEnv`.
+        """Start the processes.
 
-        Raises ConfigError for wrong input, here rather than in a process.
+        Args:
+            num_envs: Number of environments.
+            processes: Number of processes; None starts one for each processor that this process may use.
+            **arguments: Those of `SnakeEnv`.
+
+        Raises:
+            ConfigError: An argument is wrong. It is raised here rather than in a process.
         """
         if num_envs < 1 or (processes is not None and processes < 1):
             raise ConfigError(f"num_envs={num_envs!r}, processes={processes!r}: give whole numbers, 1 or more")
-        one = SnakeEnv(**arguments)
-        self.num_envs, self.render_mode = num_envs, one.render_mode
+        self._arguments = {"num_envs": num_envs, "processes": processes, **arguments}
+        one = self._example = SnakeEnv(**arguments)
+        self.num_envs = num_envs
+        self.render_mode = one.render_mode
         self.metadata = {**self.metadata, "render_fps": one.metadata["render_fps"]}
-        self.single_observation_space, self.single_action_space = one.observation_space, one.action_space
+        self.single_observation_space = one.observation_space
+        self.single_action_space = one.action_space
         self.observation_space = batch_space(one.observation_space, num_envs)
         self.action_space = batch_space(one.action_space, num_envs)
         count = min(processes or len(os.sched_getaffinity(0)), num_envs)
         self._shares = [part.tolist() for part in np.array_split(np.arange(num_envs), count)]
-        self._ends: list[Connection] = []
-        self._workers: list[multiprocessing.Process] = []
-        for share in self._shares:
-            ours, theirs = multiprocessing.Pipe()
-            worker = multiprocessing.Process(target=_work, args=(theirs, [*self._ends, ours], len(share), arguments))
-            worker.daemon = True  # it ends with this process
-            worker.start()
-            theirs.close()
-            self._ends.append(ours)
-            self._workers.append(worker)
+        self._workers = _Workers([len(share) for share in self._shares], arguments)
+        self._unequal = False  # a request has not reached all environments, or not all have answered it
+
+    def __reduce__(self) -> Any:
+        return _rebuild_vector, (type(self), self._arguments, self.spec)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """All of them. seed: of the first one, the next ones count up; or one for each."""
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed has {len(seeds)} entries, must be one number, or {self.num_envs}")
-        found = self._ask("reset", seeds)
+        """Reset all environments.
+
+        Args:
+            seed: Seed of the first environment, the next ones count up; or one seed for each environment.
+            options: `reset_mask` is not supported; nothing else is read.
+
+        Raises:
+            gymnasium.error.Error: A seed is not a Python integer of 0 or more, as in Gymnasium.
+            ValueError: The number of seeds is wrong, or `options` has a `reset_mask`.
+        """
+        if options and "reset_mask" in options:
+            raise ValueError("options['reset_mask'] is not supported: every environment is reset; leave it out")
+        seeds = _seeds_of(seed, self.num_envs)
+        self._unequal = True
+        found = self._request("reset", seeds)
+        self._unequal = False
         return self._joined([observation for observation, _ in found]), self._merged([info for _, info in found])
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """An action for each, (num_envs, joints)."""
+        """Step every environment by its row of actions, (num_envs, joints).
+
+        Raises:
+            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example.
+            ValueError: The number of rows is wrong, or a row is no action. No environment has taken a step then.
+        """
         if len(actions) != self.num_envs:
             raise ValueError(f"actions has {len(actions)} rows, must have {self.num_envs}: one an environment")
-        seen, rewards, terminated, truncated, infos = zip(*self._ask("step", actions), strict=True)
-        ended = np.array(terminated, dtype=np.bool_), np.array(truncated, dtype=np.bool_)
-        return self._joined(seen), np.array(rewards, dtype=np.float64), *ended, self._merged(infos)
+        for action in actions:
+            self._example.check_action(action)  # here, so that all environments take the step or none does
+        if self._unequal:
+            raise error.ResetNeeded(
+                "the last step or reset did not finish, so some environments may be a step ahead of the others; "
+                "call reset()"
+            )
+        self._unequal = True
+        outcomes = self._request("step", actions)
+        self._unequal = False
+        seen, rewards, terminated, truncated, infos = zip(*outcomes, strict=True)
+        return (
+            self._joined(seen),
+            np.array(rewards, dtype=np.float64),
+            np.array(terminated, dtype=np.bool_),
+            np.array(truncated, dtype=np.bool_),
+            self._merged(infos),
+        )
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture of each."""
-        return None if self.render_mode is None else tuple(self._ask("render", [None] * self.num_envs))
+        """Return a picture of each environment; None without a `render_mode`."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._request("render", [None] * self.num_envs))
 
     def close_extras(self, **_named: Any) -> None:
         """End the processes."""
-        for end in self._ends:
-            end.close()
-        for worker in self._workers:
-            worker.join(LEAVE_S)
-            if worker.is_alive():
-                worker.kill()
+        self._workers.close()
 
-    def _ask(self, what: str, each: Sequence[Any]) -> list[Any]:
-        """Have every process do it for its share, at the same time. Raises what one of them has raised."""
-        found: list[Any] = []
-        errors: list[Exception] = []
-        try:
-            for end, share in zip(self._ends, self._shares, strict=True):
-                end.send((what, [each[i] for i in share]))
-            for end in self._ends:
-                answer = end.recv()
-                if isinstance(answer, Exception):
-                    errors.append(answer)
-                else:
-                    found += answer
-        except (EOFError, ConnectionError):
-            raise BackendError("a process with environments has ended; see what it said above") from None
-        if errors:
-            raise errors[0]
-        return found
+    def _request(self, what: str, each: Sequence[Any]) -> list[Any]:
+        """Return the answers of all environments, in their order."""
+        return self._workers.request(what, [[each[i] for i in share] for share in self._shares])
 
     def _joined(self, observations: Sequence[Any]) -> Any:
         space = self.single_observation_space
@@ -113,11 +139,131 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         return merged
 
 
+def _rebuild_vector(kind: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any) -> SnakeVectorEnv:
+    """Return a new vector environment like the one that was pickled."""
+    made = kind(**arguments)
+    made.spec = spec
+    return made
+
+
+def _seeds_of(seed: Any, count: int) -> list[int | None]:
+    """Return a seed for each environment, by the rules of Gymnasium.
+
+    Raises:
+        gymnasium.error.Error: A seed is not a Python integer of 0 or more.
+        ValueError: There is not one seed for each environment.
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int):
+        _check_seed("seed", seed)
+        return [seed + number for number in range(count)]
+    try:
+        seeds = list(seed)
+    except TypeError:
+        _check_seed("seed", seed)
+        raise
+    if len(seeds) != count:
+        raise ValueError(f"seed has {len(seeds)} entries, must be one number, or {count}")
+    for number, one in enumerate(seeds):
+        _check_seed(f"seed[{number}]", one)
+    return seeds
+
+
+def _check_seed(name: str, seed: Any) -> None:
+    try:
+        np_random(seed)
+    except error.Error as refusal:
+        raise error.Error(f"{name} is {seed!r:.60}: {refusal}") from None
+
+
+class _Workers:
+    """Processes with environments, and the numbered requests to them.
+
+    The number tells an answer from that of an earlier request whose caller was interrupted, by Ctrl-C for example,
+    before the answer came.
+    """
+
+    def __init__(self, counts: Sequence[int], arguments: dict[str, Any]) -> None:
+        """Start a process for each count of environments."""
+        self._number = 0
+        self._mid_message = False
+        self._ends: list[Connection] = []
+        self._processes: list[multiprocessing.Process] = []
+        with _interrupts_blocked():  # a worker inherits this, until it ignores them
+            for count in counts:
+                ours, theirs = multiprocessing.Pipe()
+                ends_of_parent = [*self._ends, ours]
+                process = multiprocessing.Process(target=_work, args=(theirs, ends_of_parent, count, arguments))
+                process.daemon = True  # it ends with this process
+                process.start()
+                theirs.close()
+                self._ends.append(ours)
+                self._processes.append(process)
+
+    def request(self, what: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
+        """Have every process do it for its share, at the same time; return all answers in order.
+
+        Raises:
+            BackendError: A process has ended, or a message was cut off.
+            Exception: What an environment has raised.
+        """
+        if self._mid_message:
+            raise BackendError(
+                "an interrupt has cut off a message between the processes of these environments; make them anew"
+            )
+        self._number += 1
+        answers: list[Any] = []
+        errors: list[Exception] = []
+        try:
+            for end, share in zip(self._ends, shares, strict=True):
+                self._send(end, (self._number, what, share))
+            for end in self._ends:
+                answer = self._receive(end)
+                if isinstance(answer, Exception):
+                    errors.append(answer)
+                else:
+                    answers += answer
+        except (EOFError, ConnectionError):
+            raise BackendError("a process with environments has ended; see what it said above") from None
+        if errors:
+            raise errors[0]
+        return answers
+
+    def close(self) -> None:
+        """End the processes."""
+        for end in self._ends:
+            # A process that was forked later, for other environments, holds a copy of this end: closing is not enough.
+            with contextlib.suppress(OSError):
+                end.send((self._number, CLOSE, []))
+            end.close()
+        for process in self._processes:
+            process.join(CLOSE_TIMEOUT_S)
+            if process.is_alive():
+                process.kill()
+
+    def _send(self, end: Connection, message: Any) -> None:
+        self._mid_message = True
+        end.send(message)
+        self._mid_message = False
+
+    def _receive(self, end: Connection) -> Any:
+        """Return the answer to the newest request, and drop those to interrupted ones."""
+        while True:
+            wait([end])  # interrupts come here, between two messages, as good as always
+            self._mid_message = True
+            number, answer = end.recv()
+            self._mid_message = False
+            if number == self._number:
+                return answer
+
+
 class _Seat:
     """One environment, which resets itself in the step after its end."""
 
     def __init__(self, arguments: dict[str, Any]) -> None:
-        self._env, self._over = SnakeEnv(**arguments), False
+        self._env = SnakeEnv(**arguments)
+        self._over = False
 
     def reset(self, seed: int | None) -> tuple[Any, dict[str, Any]]:
         self._over = False
@@ -135,18 +281,40 @@ class _Seat:
         return self._env.render()
 
 
-def _work(end: Connection, not_ours: Sequence[Connection], count: int, arguments: dict[str, Any]) -> None:
-    """In a process of its own. not_ours: ends that a fork has copied, and which must close with their owner."""
-    for other in not_ours:
+def _work(end: Connection, ends_of_parent: Sequence[Connection], count: int, arguments: dict[str, Any]) -> None:
+    """Serve requests until the parent's end is closed; the main function of a worker process.
+
+    Args:
+        end: This worker's end of its pipe.
+        ends_of_parent: Ends that a fork has copied; they must close with their owner.
+        count: Number of environments.
+        arguments: Those of `SnakeEnv`.
+    """
+    # Ctrl-C reaches all processes of a terminal. What it ends is decided by the parent alone.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    for other in ends_of_parent:
         other.close()
     seats = [_Seat(arguments) for _ in range(count)]
     while True:
         try:
-            what, each = end.recv()
+            number, what, each = end.recv()
+            if what == CLOSE:
+                return
             try:
                 answer: Any = [getattr(seat, what)(one) for seat, one in zip(seats, each, strict=True)]
-            except Exception as error:  # noqa: BLE001 - whatever it is, the one who asked gets it
-                answer = error
-            end.send(answer)
-        except (EOFError, ConnectionError, KeyboardInterrupt):
+            except Exception as raised:  # noqa: BLE001 - the parent raises it, whatever it is
+                answer = raised
+            end.send((number, answer))
+        except (EOFError, ConnectionError):
             return
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Keep SIGINT waiting for this thread, and for processes that it starts."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -111,15 +111,16 @@ class Reading:
         self._read_action, self._command_length = command.reader("action"), command.length
         faults = [f"fault_{fault.name.lower()}" for fault in ModuleFault]
         self._read_heartbeat = layouts[Opcode.HEARTBEAT].reader("state", "last_stop", "uptime", *faults)
+        # Functions rather than bound methods, which would keep this object until the garbage collector comes.
         takers = {
-            Opcode.JOINT_STATE: self._take_state,
-            Opcode.CONTACT: self._take_contact,
-            Opcode.TAIL_CONTACT: self._take_tail_contact,
-            Opcode.HEARTBEAT: self._take_heartbeat,
-            Opcode.GYRO: self._take_gyro,
-            Opcode.ACCELEROMETER: self._take_acceleration,
-            Opcode.SHAFT_LOAD: self._take_shaft,
-            Opcode.HEALTH: self._take_health,
+            Opcode.JOINT_STATE: Reading._take_state,
+            Opcode.CONTACT: Reading._take_contact,
+            Opcode.TAIL_CONTACT: Reading._take_tail_contact,
+            Opcode.HEARTBEAT: Reading._take_heartbeat,
+            Opcode.GYRO: Reading._take_gyro,
+            Opcode.ACCELEROMETER: Reading._take_acceleration,
+            Opcode.SHAFT_LOAD: Reading._take_shaft,
+            Opcode.HEALTH: Reading._take_health,
         }
         self._known = {
             frame_id(opcode, module.node): (take, module, layouts[opcode].length)
@@ -157,7 +158,7 @@ class Reading:
         take, module, length = known
         module.frames += 1
         if len(frame.data) == length:
-            take(module, frame)
+            take(self, module, frame)
         else:
             self.malformed += 1
 

@@ -8,7 +8,6 @@ Only ARMED and STOPPING drive the motor. Only a valid set-point feeds the watchd
 passed in; nothing here waits. `frames` collects frames to send; the caller empties it.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 from snakesim_can_backend.protocol.definitions import (
@@ -96,14 +95,6 @@ class Module:
         self.refused = 0  # frames with a wrong checksum, count or length
         self._stepped = stepped
         self._last_joint_state: Frame | None = None
-        self._do: dict[int, Callable[[float], None]] = {
-            Action.ARM: self._arm,
-            Action.DISARM: self._disarm,
-            Action.STOP: self._stop,
-            Action.CLEAR: self._clear,
-            Action.REBOOT: self.reboot,
-            Action.IDENTIFY: self._identify,
-        }
         self._forget(now_us)
         self.last_stop = LastStop.NONE
 
@@ -123,10 +114,28 @@ class Module:
             self.frames.append(self.parameters.answer(self.node, frame.data, driven))
         elif opcode == Opcode.COMMAND and intact(frame):
             action, key = read_command(frame.data)
-            if key == COMMAND_KEY and action in self._do:
-                self._do[action](now_us)
+            if key == COMMAND_KEY:
+                self._carry_out(action, now_us)
         else:
             self.refused += 1
+
+    def _carry_out(self, action: int, now_us: float) -> None:
+        """Carry out the action of a Command; an unknown one has no effect."""
+        match action:
+            case Action.ARM:
+                self._arm(now_us)
+            case Action.DISARM:
+                self._disarm(now_us)
+            case Action.STOP:
+                self._stop(now_us)
+            case Action.CLEAR:
+                self._clear(now_us)
+            case Action.REBOOT:
+                self.reboot(now_us)
+            case Action.IDENTIFY:
+                self._identify(now_us)
+            case _:
+                pass
 
     def receive_set_point(self, frame: Frame, now_us: float) -> None:
         """A SetPoint for this node. It waits for the next Sync."""

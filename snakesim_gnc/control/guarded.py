@@ -26,6 +26,7 @@ class Guarded:
     def __init__(self, name: str, plugin: type[Controller], robot: Description, settings: Any) -> None:
         """name: as configured: an entry point, or `./file.py:Class`."""
         self._who = f"controller {name} (class {getattr(plugin, '__name__', plugin)})"
+        self._module = plugin.__module__
         self._joints = robot.joints
         with self._named("__init__"):
             self._controller = plugin(robot, settings)
@@ -49,9 +50,11 @@ class Guarded:
         """Turn exceptions of a method into errors that name it; the traceback goes to the log."""
         try:
             yield
+        except ControllerError as error:  # it says all: an answer that is not allowed
+            raise self.wrong(str(error)) from error.__cause__
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise self.wrong(f"{method}() {raised(error)}") from error
+            raise self.wrong(f"{method}() {raised(error, self._module)}") from error
 
 
 def check(action: Action, described: Sequence[JointDescription]) -> None:
@@ -110,6 +113,6 @@ def _check_report(report: Report, joints: Sequence[str]) -> None:
 
 def _repr(value: Any) -> str:
     """A value for an error message, with its type unless that is plain."""
-    text = repr(value)
+    text = " ".join(repr(value).split())  # NumPy prints several lines
     text = text if len(text) <= 60 else f"{text[:57]}..."
     return text if value is None or type(value) in (int, float, str) else f"{text} ({type(value).__name__})"

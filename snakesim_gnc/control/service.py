@@ -4,6 +4,7 @@ A controller gets only fresh inputs (`freshness`). With stale joints no command 
 the robot is stopped. Its output is checked (`guarded`): a controller that fails ends this process at once.
 """
 
+import time
 from collections.abc import Sequence
 
 from snakesim_gnc.control.controller import Senses, Task, View
@@ -11,6 +12,7 @@ from snakesim_gnc.control.freshness import Limits
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.live_settings import LiveSettings
 from snakesim_gnc.control.state_reports import StateReports
+from snakesim_gnc.control.update_times import UpdateTimes
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
@@ -68,6 +70,7 @@ class Control(Service):
         self._commander = Commander(self._client, robot)
         self._limits = Limits.of(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
+        self._times = UpdateTimes(robot)
         self._controller: Guarded | None = None
         self._sensed.clear()
 
@@ -130,7 +133,9 @@ class Control(Service):
                 trajectory=trajectory,
                 senses=senses,
             )
+            began_s = time.perf_counter()
             action = controller.update(view)
+            self._note_time(clock, time.perf_counter() - began_s)
             self._commander.send(clock, joints, action.set_points)
             rests = _why_it_rests(trajectory)
             try:
@@ -172,6 +177,16 @@ class Control(Service):
             if clock.arming != self._arming:
                 self._arming, self._armed_at_ns = clock.arming, clock.stamp_ns
         return self._controller
+
+    def _note_time(self, clock: Clock, took_s: float) -> None:
+        """Count an update, and write into the log when the controller has become too slow for real time."""
+        before = self.too_slow
+        self._times.add(took_s)
+        self.too_slow = self._times.too_slow
+        if clock.pace == "realtime":  # elsewhere there are no deadlines, and no message may depend on the wall clock
+            self._reports.too_slow = self.too_slow
+        if self.too_slow and not before:
+            print_stderr(f"{clock.stamp_ns * 1e-9:.3f} s: {self.too_slow}")
 
     def _note(self, clock: Clock, late: Sequence[str] = (), so: str = "") -> None:
         """Write into the log when other streams are too old than before, and when all is fresh again."""

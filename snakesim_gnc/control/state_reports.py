@@ -17,6 +17,7 @@ class StateReports:
     """Makes the state's message when it is due."""
 
     def __init__(self, controller: str, robot: Description) -> None:
+        self.too_slow = ""  # what shows that the controller misses its deadlines, in every message from then on
         self._controller = controller[-64:]
         self._joints = [joint.name for joint in robot.joints]
         self._advance = Advance()
@@ -59,7 +60,16 @@ class StateReports:
             still=report.why_if_still,
             advanced_m=self._advance.metres,
         )
-        mark = (state, bool(missing), rests, report.propulsion_joint, report.jammed, clock.lifecycle, clock.arming)
+        mark = (
+            state,
+            bool(missing),
+            rests,
+            report.propulsion_joint,
+            report.jammed,
+            clock.lifecycle,
+            clock.arming,
+            bool(self.too_slow),
+        )
         if not (silent or stands) and mark == self._last and clock.stamp_ns < self._next_ns:
             return None
         self._last, self._next_ns = mark, clock.stamp_ns + round(TELEMETRY_S * 1e9)
@@ -90,6 +100,7 @@ class StateReports:
             torque_headroom_nm=report.torque_headroom_nm,
             saturated=report.saturated,
             jammed=report.jammed,
+            too_slow=self.too_slow,
         )
         try:
             return self._decoder.decode(msgspec.msgpack.encode(message))

@@ -19,13 +19,13 @@ class HostFaults(Injector):
     def __init__(self, config: RunConfig, backend: Backend, session: Session) -> None:
         self.backend = FaultyBackend(backend)
         self._period_ns, self._tick = config.period_ns, 0
-        super().__init__(HAL, config, session, carry_out=self.backend.inject, note=self._note_tick)
+        super().__init__(HAL, config, session, carry_out=self.backend.inject)
 
     def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> Sequence[str]:
         """As of any part, at a tick to be noted."""
         self._tick = stamp_ns // self._period_ns
         return super().turn(stamp_ns, arming, lifecycle)
 
-    def _note_tick(self, text: str, _now_s: float) -> None:
+    def _note(self, text: str, _now_s: float) -> None:
         if len(self.noted) < MAX_KEPT:
             self.noted.append(f"tick {self._tick}: {text}")

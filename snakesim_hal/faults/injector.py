@@ -57,7 +57,9 @@ class Injector:
         """
         self.part = part
         self._messages = MessageFaults(session, config.seed)
-        self._carry_out, self._newest, self._note = carry_out, newest, note
+        self._carry_out = carry_out
+        self._newest = newest
+        self._print_note = note
         self.noted: list[str] = []  # the host's have their tick
         self._refused: list[str] = []  # planned, and not possible
         self._planned = Plan(injection for injection in planned(config) if injection.part == part)
@@ -97,6 +99,10 @@ class Injector:
     def close(self) -> None:
         """Drop delayed messages."""
         self._messages.close()
+
+    def _note(self, text: str, now_s: float) -> None:
+        """Report the begin or the end of a fault."""
+        self._print_note(text, now_s)
 
     # --- time ------------------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ requests delays a command. Each lane is bounded, so a flood costs no memory and 
 """
 
 import time
+import weakref
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from queue import Empty
@@ -74,8 +75,17 @@ class Inbox:
         services: Collection[str],
         reply: Callable[[Question, Answer], None],
     ) -> None:
-        """Declares all subscriptions of the host. services: those whose presence matters; reply: answers a query."""
-        self._receiver, self._reply = receiver, reply
+        """Declare all subscriptions of the host.
+
+        Args:
+            session: The host's session.
+            receiver: Handles the input. It must live as long as anything is taken from this inbox.
+            services: Services whose presence matters.
+            reply: Answers a query.
+        """
+        # The receiver owns its inbox. A reference back that counts would keep a whole run in memory after its end.
+        self._receiver: Receiver = weakref.proxy(receiver)
+        self._reply = reply
         self._queue: Mailbox[Any] = Mailbox(LIMITS)
         self._command_decoder = Decoder(JointCommand)
         self._done_decoder = Decoder(Done)

@@ -5,7 +5,7 @@ gives every service the same inputs, however the processes were scheduled.
 """
 
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from queue import Empty
 from typing import Any, Generic
@@ -80,6 +80,28 @@ class Feed(Generic[MessageT]):
         return self._kept.get(tick)
 
 
+class RobotFilter:
+    """Accepts the messages that fit a robot, and counts the others.
+
+    It is an object of its own because a client's feeds hold it: held by them, the client would never be released.
+    """
+
+    def __init__(self, rejected: Counter[str]) -> None:
+        """Count into `rejected`, by reason."""
+        self._rejected = rejected
+        self.robot: Description | None = None  # None: not known yet; every message is accepted
+
+    def accepts(self, message: Message) -> bool:
+        """Return whether a message fits the robot, as far as that is known."""
+        if self.robot is None:
+            return True
+        wrong = mismatch(message, self.robot)
+        if wrong is None:
+            return True
+        self._rejected[wrong.reason] += 1
+        return False
+
+
 class Client:
     """A service's connection to one robot's HAL."""
 
@@ -97,7 +119,7 @@ class Client:
         self._clock_decoder = Decoder(Clock)
         self._feeds: dict[str, Feed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
-        self._robot: Description | None = None
+        self._filter = RobotFilter(session.rejected)
         self._clock: Clock | None = None
         self._ahead: Clock | None = None  # taken from the queue, but not due yet
         self._started_over = False
@@ -109,23 +131,17 @@ class Client:
 
     def description(self, timeout_s: float = 10.0) -> Description:
         """The robot's description. Raises NotConnectedError when no HAL publishes one in time."""
-        self._robot = self._robot or self._own_description(timeout_s)
-        if self._robot is None:
+        robot = self._filter.robot or self._own_description(timeout_s)
+        if robot is None:
             raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
-        return self._robot
+        self._filter.robot = robot
+        return robot
 
     def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
         """Subscribe to a key; do this for all keys before `announce`."""
-        feed = Feed(self.session.reader(key, message), key, self._fits)
+        feed = Feed(self.session.reader(key, message), key, self._filter.accepts)
         self._feeds[key] = feed
         return feed
-
-    def _fits(self, message: Message) -> bool:
-        """Whether a message fits our robot, as far as it is known; others are counted."""
-        wrong = None if self._robot is None else mismatch(message, self._robot)
-        if wrong is not None:
-            self.session.rejected[wrong.reason] += 1
-        return wrong is None
 
     def announce(self) -> None:
         """Declare the service's liveliness token. A lockstep run waits for it from now on."""
@@ -186,8 +202,8 @@ class Client:
         if not self._started_over and not left:
             return None
         self._started_over = self._host_left = False
-        self._robot = self._own_description(MISSING_LIMIT_S) or self._robot
-        return self._robot
+        self._filter.robot = self._own_description(MISSING_LIMIT_S) or self._filter.robot
+        return self._filter.robot
 
     def _own_description(self, timeout_s: float) -> Description | None:
         """The description of our own run's host; a forged one is ignored."""
@@ -196,7 +212,8 @@ class Client:
 
     def _take_host(self, key: str, present: bool) -> None:
         """In Zenoh's thread: a host has appeared or vanished; or the network has, and with it our view of the host."""
-        if not present and self._robot is not None and keys.service_of(key) == self._robot.host:
+        robot = self._filter.robot
+        if not present and robot is not None and keys.service_of(key) == robot.host:
             self._host_left = True
 
     def _take_clock(self, arrival: Arrival) -> None:
@@ -250,8 +267,9 @@ class Client:
     def put(self, key: str, message: Message) -> None:
         """Publish an output of this service. Raises WireError, and sends nothing, when no reader would accept it."""
         try:
-            payload = checked(key, message, None if self._robot is None else own_kind_at(key, self._robot))
-            wrong = None if self._robot is None else mismatch(message, self._robot)
+            robot = self._filter.robot
+            payload = checked(key, message, None if robot is None else own_kind_at(key, robot))
+            wrong = None if robot is None else mismatch(message, robot)
             if wrong is not None:
                 raise wrong
         except WireError as error:

@@ -46,6 +46,10 @@ class LocalNetwork:
         """A new session."""
         return LocalSession(self)
 
+    def close(self) -> None:
+        """Let go of the parts that answered queries; they hold this network."""
+        self.answer = lambda: None
+
     def takers(self, key: str) -> list[Take]:
         """The subscribers of a key."""
         found = self._takers.get(key)

@@ -128,6 +128,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         dict[str, Timing],
         Meta(description="while armed: cycle, late (begin after the deadline), read and write (calls of the backend)"),
     ] = {}
+    too_slow: Annotated[
+        list[str], Meta(description="services that could not keep up in real time, and what shows it")
+    ] = []
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
     limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
     faults: list[Fault]
@@ -211,6 +214,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         **vars(Effort.of(record, advance, has_power=has_power)),
         state_to_command_us=host.state_to_command_us,
         tick_times=host.tick_times,
+        too_slow=[f"control: {last.too_slow}"] if last and last.too_slow else [],
         rejected_commands=host.rejected_commands,
         limited_commands=host.limited_commands,
         faults=host.faults,

@@ -38,6 +38,7 @@ class Outcome:
     restarts: Sequence[Restart] = ()
     hosts: int = 1
     lost: Sequence[str] = ()  # why the recording lacks something
+    too_slow: Sequence[str] = ()  # services that could not keep up in real time; known of a run in one process
 
 
 def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcome, *, stay: bool = False) -> int:
@@ -102,6 +103,8 @@ def leave(
     files.settle()
     record = RunRecord.load(folder, outcome.host)
     summary = summarise(record, _ended(ending), outcome.restarts, outcome.hosts)
+    if outcome.too_slow:
+        summary = msgspec.structs.replace(summary, too_slow=list(outcome.too_slow))
     files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
     if report and extras.has("report"):
         from snakesim_operator.results.report import page  # templates take a while to import, which no start waits for
@@ -171,6 +174,7 @@ def _print_summary(summary: RunSummary) -> None:
         ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
     ]
+    rows += [("too slow", words) for words in summary.too_slow]
     rows += [("estimated", words) for words in estimates_of(summary).in_words()]
     if summary.faults:
         count = len(summary.faults) + summary.faults_left_out

@@ -11,20 +11,21 @@ The run takes as long as its computing. Several at a time go into processes of t
 
 import contextlib
 import io
+import traceback
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.arithmetic import is_pinned
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, ControllerError, SnakesimError
 from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
 from snakesim_hal.model.plugins import anything_offered
-from snakesim_hal.model.scenario import RunConfig, write
+from snakesim_hal.model.scenario import CONTROL, RunConfig, write
 from snakesim_hal.network.session import Session
 from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.record.recorder import HostRecordWriter
@@ -51,6 +52,35 @@ WORDS = "run.log"  # what the parts of the run say
 TAKEN_EVERY = 50  # turns
 
 
+class ChildTracebackError(Exception):
+    """Stands for an exception of a child process; its text is the traceback there."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+@dataclass(frozen=True)
+class ControlFailure:
+    """Why control could not go on."""
+
+    message: str
+    cause: BaseException | None  # what the controller raised; None: its answer was not allowed
+
+    @staticmethod
+    def of(error: SnakesimError | None) -> "ControlFailure | None":
+        """Return the failure of an error that has ended control."""
+        if error is None:
+            return None
+        return ControlFailure(str(error), error.__cause__ if isinstance(error, ControllerError) else error)
+
+    def __reduce__(self) -> Any:
+        """Pickle the traceback as text: frames stay in their process."""
+        if self.cause is None:
+            return ControlFailure, (self.message, None)
+        text = "".join(traceback.format_exception(self.cause))
+        return ControlFailure, (self.message, ChildTracebackError(text))
+
+
 @dataclass(frozen=True)
 class Result:
     """A run that is over; `summary.ended` says how."""
@@ -58,6 +88,7 @@ class Result:
     record: RunRecord  # every tick, and what control and guidance reported
     summary: RunSummary
     gave_up: bool = False  # it was ended because it was stuck
+    control_failure: ControlFailure | None = None  # None: control went on to the end
 
 
 def simulate(
@@ -97,7 +128,9 @@ def simulate(
             config, files, ending, None, recorded, until_goal=until_goal, give_up_s=give_up_s, raw_only=out is None
         )
         explain(ending, record_of(run.host), config)
-        return Result(*leave(files, files.folder, ending, outcome, report=out is not None), gave_up)
+        record, summary = leave(files, files.folder, ending, outcome, report=out is not None)
+        # No local variable holds the failure: its traceback holds this function's frame.
+        return Result(record, summary, gave_up, ControlFailure.of(run.take_errors().get(CONTROL)))
 
 
 def run_in_process(
@@ -159,7 +192,8 @@ def _go(
     for failure in run.failed:
         ending.because(failure)
     lost = [] if recording is None or not recording.failure else [recording.failure]
-    return run, Outcome(record_of(run.host), run.host.description, lost=lost), watch.gave_up
+    outcome = Outcome(record_of(run.host), run.host.description, lost=lost, too_slow=run.too_slow())
+    return run, outcome, watch.gave_up
 
 
 @contextlib.contextmanager

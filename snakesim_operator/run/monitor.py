@@ -230,3 +230,12 @@ class RunMonitor:
         while self._supervisor.host_runs() and time.monotonic() < deadline and not self._ending.interrupted:
             self._take_in()
             time.sleep(POLL_S)
+        self._blame_slow_controller()
+
+    def _blame_slow_controller(self) -> None:
+        """Name the controller as the cause of an expired lease. Its own message comes after the fault."""
+        status, state = self._status, self._state
+        if status is None or state is None or not state.too_slow:
+            return
+        if any(fault.what == "lease_expired" for fault in status.faults):
+            self._ending.because(f"control: {state.too_slow}", first=True)

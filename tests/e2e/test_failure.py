@@ -1,6 +1,7 @@
 """What happens when a part dies, a person presses Ctrl-C, or the supervisor itself is killed."""
 
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -67,3 +68,19 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, pace
     assert f"fault: control ended with exit code 1: {said}" in ended.out
     assert summary.last_reason is not None and summary.last_reason.startswith(said)
     assert (tmp_path / "run" / "control.log").read_text().splitlines()[-1].startswith(f"snakesim control: {said}")
+
+
+@pytest.mark.slow  # tests/unit/gnc/test_control_service.py has what control reports of it
+def test_a_controller_that_is_too_slow_is_named_as_the_cause_of_the_stop(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text(
+        "import time\n\n"
+        "from snakesim_gnc.control.hold import Hold\n\n\n"
+        "class Slow(Hold):\n"
+        "    def update(self, view):\n"
+        "        time.sleep(0.1)\n"
+        "        return super().update(view)\n"
+    )
+    flags = ["--controller", "./slow.py:Slow", "--pace", "realtime", "--duration", "10"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 1
+    assert re.match(r"control: update\(\) took \d\d\d ms of 10 ms; lease of control expired", summary.ended)

@@ -30,7 +30,7 @@ SHIPPED = (
     "hold",
 )
 WITHOUT_PATH = ("lateral_undulation", "compliant_undulation", "hold")  # a mission's speed does not change them
-AMPLITUDES_RAD = (0.2, 0.3, 0.4, 0.5, 0.6)  # of README's wave
+AMPLITUDES_RAD = (0.2, 0.3, 0.4, 0.5, 0.6)  # of the wave
 FASTER_M_S = 0.3
 STEP_S = 0.002
 SHIFTS_S = np.arange(-0.1, 0.105, 0.01)  # from command to force
@@ -44,7 +44,7 @@ Forces = Mapping[str, Floats]  # of each obstacle, in every physics step
 
 
 def wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
-    """README's ten-line wave."""
+    """A wave that grows from straight, wherever the joints are."""
     lag_rad = 0.9 * np.arange(13)[::-1]
     return lambda time_s, joints: min(time_s, 1.0) * amplitude_rad * np.sin(np.pi * time_s - lag_rad)
 

@@ -1,8 +1,12 @@
 """Gymnasium environments: what the checker asks for, one seed one digest, the gate inside, rewards by name, errors."""
 
 import importlib.util
+import os
+import pickle
+import signal
 import subprocess
 import sys
+import threading
 import warnings
 from typing import Any
 
@@ -226,6 +230,57 @@ def test_many_say_what_is_wrong() -> None:
     envs.close()
 
 
+def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
+    envs = SnakeVectorEnv(num_envs=2, processes=2, scenario="triplet", frame_skip=300, duration=9)
+    still = np.zeros((2, 13))
+    envs.reset(seed=1)
+    threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
+    with pytest.raises(KeyboardInterrupt):
+        envs.step(still)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="did not finish, so some environments may be a step ahead"):
+        envs.step(still)
+    _, at_reset = envs.reset(seed=1)
+    _, _, _, _, after = envs.step(still)
+    envs.close()
+    assert at_reset["time_s"].tolist() == [0.0, 0.0] and after["time_s"].tolist() == [3.0, 3.0]
+
+
+def test_seeds_are_read_as_by_gymnasium() -> None:
+    envs = SnakeVectorEnv(num_envs=2, processes=1, scenario="triplet", duration=0.1)
+    wrong: list[tuple[Any, str]] = [
+        (np.int64(0), r"seed is np.int64\(0\): Seed must be a python integer"),
+        (-1, "seed is -1: Seed must be greater or equal to zero"),
+        ([], "seed has 0 entries, must be one number, or 2"),
+        ([1, -2], r"seed\[1\] is -2: Seed must be greater"),
+        ([1, np.int64(2)], r"seed\[1\] is np.int64\(2\): Seed must be a python integer"),
+        ("12", r"seed\[0\] is '1': Seed must be a python integer"),
+        (1.0, "seed is 1.0: Seed must be a python integer"),
+    ]
+    for seed, words in wrong:
+        with pytest.raises((ValueError, gymnasium.error.Error), match=words):
+            envs.reset(seed=seed)
+    with pytest.raises(ValueError, match="reset_mask'] is not supported"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.close()
+
+
+def test_a_pickle_is_a_new_environment_of_the_same_arguments() -> None:
+    env = gymnasium.make("SnakeSIM/Scenario-v0", scenario="triplet", duration=0.1, flat=False)
+    env.reset(seed=1)
+    again = pickle.loads(pickle.dumps(env))
+    assert isinstance(env.unwrapped, SnakeEnv)
+    assert again.spec == env.spec and again.observation_space == env.observation_space
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        again.unwrapped.step(np.zeros(13))
+    assert episode(again.unwrapped)["digest"] == episode(env.unwrapped)["digest"]
+    many = SnakeVectorEnv(num_envs=2, processes=1, scenario="triplet", duration=0.1)
+    loaded = pickle.loads(pickle.dumps(many))
+    seen, _ = loaded.reset(seed=1)
+    assert np.array_equal(seen, many.reset(seed=1)[0])
+    many.close()
+    loaded.close()
+
+
 def test_two_in_one_process_do_not_disturb_each_other() -> None:
     envs = [made(action="residual:obstacle_triplet", duration=0.3) for _ in range(3)]
     alone = episode(envs.pop(), action=lambda _: np.zeros(13))["digest"]
@@ -286,9 +341,10 @@ def test_a_wrong_action_is_a_value_error(action: Any, words: str) -> None:
 
 
 def test_an_episode_that_is_over_wants_a_reset() -> None:
-    env = made(duration=0.05)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
-        env.step(wave(0.0))
+    env = made(duration=0.05, render_mode="rgb_array")
+    for before_reset in (lambda: env.step(wave(0.0)), env.render):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="there is no robot yet; call reset"):
+            before_reset()
     episode(env)
     env.reset()
     env.step(wave(0.0))

@@ -1,14 +1,22 @@
 """`import snakesim`: runs from a program, with what it gives as a controller, and what comes of them."""
 
+import gc
 import importlib.util
+import re
 import subprocess
 import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import snakesim
+from snakesim.environments import SnakeEnv
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.playback.export import UNITS
 from snakesim_operator.run.in_process import simulate
@@ -33,6 +41,17 @@ class Nod:
 
     def update(self, view):
         return snakesim.Action(snakesim.positions(self.robot, [self.by_rad] * len(self.robot.joints)))
+
+
+FAILING = """\
+import numpy as np
+from snakesim_gnc.control.hold import Hold
+
+
+class Failing(Hold):
+    def update(self, view):
+        np.linalg.solve(np.zeros((2, 2)), np.ones(2))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -102,16 +121,56 @@ def test_simulate_says_what_it_takes() -> None:
         simulate("triplet")  # pyright: ignore[reportArgumentType]
 
 
+def solve_singular(time_s, joints):
+    return np.linalg.solve(np.zeros((13, 13)), joints.angle_rad)  # the line that an error names
+
+
+SINGULAR_LINE = solve_singular.__code__.co_firstlineno + 1
+
+
 @pytest.mark.parametrize(
-    ("controller", "words"),
+    ("controller", "words", "cause"),
     [
-        (lambda time_s, joints: [0.0] * 3, r"returned \[0.0, 0.0, 0.0\], must return 13 angles in rad"),
-        (lambda time_s, joints: 1 / 0, r"raised ZeroDivisionError: division by zero \(test_python.py line \d+\)"),
+        (
+            lambda time_s, joints: [0.0] * 12,
+            r"returned \[0.0.*, must return 13 angles in rad, tail to head; got 12$",
+            None,
+        ),
+        (lambda time_s, joints: np.zeros((13, 1)), r"got an array of shape \(13, 1\)$", None),
+        (lambda time_s, joints: "ahead", r"returned 'ahead', must return 13 angles in rad", ValueError),
+        (
+            solve_singular,
+            rf"LinAlgError: Singular matrix \(test_python.py line {SINGULAR_LINE}\)$",
+            np.linalg.LinAlgError,
+        ),
     ],
+    ids=["length", "shape", "type", "in NumPy"],
 )
-def test_a_controller_that_fails_is_an_error_that_names_it(controller, words: str) -> None:
-    with pytest.raises(snakesim.ControllerError, match=words):
-        snakesim.run("triplet", controller=controller, duration=1)
+def test_a_controller_that_fails_is_an_error_that_names_it(controller, words: str, cause: type | None) -> None:
+    with pytest.raises(snakesim.ControllerError, match=words) as caught:
+        snakesim.run("triplet", controller=controller, duration=0.1)
+    assert type(caught.value.__cause__) is (type(None) if cause is None else cause)
+
+
+def test_a_controller_that_fails_in_a_child_process_is_a_cause_too(tmp_path: Path) -> None:
+    """As when NumPy was imported first."""
+    (tmp_path / "failing.py").write_text(FAILING)
+    code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
+    done = call([sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    assert "raised LinAlgError: Singular matrix (failing.py line 7)" in done.err.splitlines()[-1]
+    assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in done.err
+
+
+def test_a_controller_that_is_too_slow_for_real_time_is_reported() -> None:
+    def slow(time_s, joints):
+        time.sleep(0.1)
+        return joints.angle_rad
+
+    run = snakesim.run("triplet", controller=slow, duration=0.03)
+    assert run.complete and re.match(
+        r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0]
+    )
+    assert "update() took" in repr(run)
 
 
 def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path: Path) -> None:
@@ -158,10 +217,68 @@ def test_importing_it_loads_neither_numpy_nor_a_simulator() -> None:
     assert done.stdout == "[]\n"
 
 
+FIRST_EXAMPLES = [("first-controller.md", "Wave"), ("tutorial.md", "Wave"), ("python.md", "wave"), ("python.md", "Nod")]
+
+
+@pytest.mark.parametrize(("page", "name"), FIRST_EXAMPLES, ids=lambda one: one)
+def test_a_first_example_starts_gently_from_the_measured_pose(page: str, name: str) -> None:
+    blocks = [content for section in sections(REPOSITORY / "docs" / page) for _, content in section.blocks]
+    defined = next(block for block in blocks if f"class {name}" in block or f"def {name}" in block)
+    names: dict[str, Any] = {"__name__": "example", "snakesim": snakesim}
+    exec(re.split(r"first = |snakesim.run\(", defined)[0], names)
+    controller = names[name](0.3) if name == "wave" else names[name]
+    run = snakesim.run("triplet", controller=controller, duration=0.2)
+    assert np.abs(run["velocity_rad_s"]).max() < 1.0  # rad/s; the robot's limit is 7.5
+
+
+def live_objects() -> Counter[str]:
+    """How many objects of our classes are in memory, by class."""
+    names = [f"{type(one).__module__}.{type(one).__qualname__}" for one in gc.get_objects()]
+    return Counter(name for name in names if name.startswith("snakesim"))
+
+
+def run_on(backend: str) -> None:
+    snakesim.run("triplet", duration=0.05, backend=backend)
+
+
+def run_that_fails() -> None:
+    with pytest.raises(snakesim.ControllerError):
+        snakesim.run("triplet", duration=0.05, controller=lambda time_s, joints: [1 / 0])
+
+
+def step_an_environment(action: str) -> None:
+    env = SnakeEnv("triplet", action=action)
+    env.reset(seed=1)
+    env.step(np.zeros(13))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        *(partial(run_on, backend) for backend in ("sim", "can", "moteus", "dynamixel")),
+        run_that_fails,
+        *(partial(step_an_environment, action) for action in ("position", "residual:hold")),
+    ],
+    ids=["sim", "can", "moteus", "dynamixel", "fails", "environment", "residual"],
+)
+def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> None:
+    use()  # what is cached for good
+    gc.collect()
+    gc.disable()
+    try:
+        before = live_objects()
+        use()
+        left = live_objects() - before
+    finally:
+        gc.enable()
+    assert not left, left
+
+
 def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
     study = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "study.py" in s.files).files["study.py"]
-    assert len(study.splitlines()) <= 25
+    assert len([line for line in study.splitlines() if line]) <= 20
     assert f"```python\n{study}```" in (REPOSITORY / "README.md").read_text()
     (tmp_path / "study.py").write_text(study)
     done = call([sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})

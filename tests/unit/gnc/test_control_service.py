@@ -1,11 +1,13 @@
 """The control service on a real host: what it gives its controller when streams stop; what it does without joints."""
 
 import math
+import re
+import time
 from collections.abc import Iterator
 
 import pytest
 
-from snakesim_gnc.control.controller import Action, Report, positions
+from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
@@ -115,6 +117,19 @@ def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why() -> 
         assert reported.state == "Idle" and "send a new one to go on" in reported.reason
         intents.put(Intent(stamp_ns=clocks.drain()[-1].stamp_ns, who="ann"))
         wait_until(lambda: speed(made) == 0.2, "a new intent")
+
+
+def test_an_update_that_outlasts_the_lease_is_reported_after_the_stop() -> None:
+    def slow(self: Showing, view: View) -> Action:
+        time.sleep(0.3)
+        return Action(positions(self._robot, view.joints.angle_rad))
+
+    with stage() as made:
+        Showing.answers.append(slow)
+        made.run.arm()
+        made.run.reaches("fault")
+        wait_until(lambda: known(made.state()).too_slow, "a state that names the slow update")
+        assert re.match(r"update\(\) took 3\d\d ms of 20 ms$", known(made.state()).too_slow)
 
 
 @pytest.mark.parametrize(
