@@ -13,6 +13,7 @@ from math import inf
 from snakesim_hal.faults.disturbance import Disturbance
 from snakesim_hal.injection import Injection
 from snakesim_hal.network.session import Session
+from snakesim_hal.workers import start_worker
 
 SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter
 
@@ -83,8 +84,7 @@ class MessageFaults:
                 del self._lines[line.key]
         elif self._next_s() < inf and not self._closed:
             if self._later is None:
-                self._later = threading.Thread(target=self._send_later, name="late messages", daemon=True)
-                self._later.start()
+                self._later = start_worker("late messages", self._send_later, is_over=lambda: self._closed)
             self._changed.notify()
 
     def _next_s(self) -> float:

@@ -18,6 +18,7 @@ from snakesim_hal.model.whole_file import sync_folder, write_whole
 from snakesim_hal.network.local_registry import state_folder
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Answer
+from snakesim_hal.workers import start_worker
 
 ESTOP = "estop.json"
 ANSWER_LIMIT_S = 1.0  # for a disk that hangs; requesters wait longer
@@ -38,11 +39,10 @@ class EstopLatch:
         self._path = None if folder is None else folder / ESTOP
         self._asked: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._waiting: SimpleQueue[_Once | None] = SimpleQueue()
-        self._writer = threading.Thread(target=self._write, name="estop", daemon=True)
         self.found = None if self._path is None else _read(self._path)  # left by an earlier host
         self._kept = self.found is not None and self.found.tick >= 0
-        self._writer.start()
-        threading.Thread(target=self._give_up, name="estop late", daemon=True).start()
+        self._writer = start_worker("estop", self._write)
+        start_worker("estop late", self._give_up)
 
     def engage(self, who: str, tick: int, then: Callable[[str | None], None]) -> None:
         """Store a stop. `then` is called once, from another thread: with None, or with why it could not be stored."""

@@ -6,12 +6,12 @@ trusting anything on the network, which robot that is, its state, and that it is
 
 import contextlib
 import socket
-import threading
 from collections.abc import Callable
 
 import msgspec
 
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
+from snakesim_hal.workers import start_worker
 
 MAX_BYTES = 1 << 18
 
@@ -64,7 +64,7 @@ class HostEnd:
                     return
                 take(decoder.decode(request), lambda answer: self.say(HostMessage(answer=answer)))
 
-        threading.Thread(target=listen, name="private channel", daemon=True).start()
+        start_worker("private channel", listen)
 
 
 class StarterEnd:

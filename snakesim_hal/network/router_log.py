@@ -12,12 +12,13 @@ import os
 import re
 import select
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from io import RawIOBase
 
 from snakesim_hal.terminal import print_stderr
+from snakesim_hal.workers import start_worker
 
 ZENOH_LEVELS = (
     "info,zenoh::net::routing::interceptor::access_control=trace,"
@@ -132,17 +133,19 @@ def short_log() -> Iterator[None]:
     os.set_blocking(reading, False)
     with contextlib.suppress(PermissionError):  # somebody has too many pipes
         fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    reader = threading.Thread(target=_read, args=(reading, log), name="log", daemon=True)
+    source = os.fdopen(reading, "rb", buffering=0)
     with open(os.dup(1), "w", buffering=1) as stdout:  # noqa: PTH123 - a descriptor
         os.dup2(writing, 1)
         os.close(writing)
-        reader.start()
+        reader = start_worker("log", lambda: _read(source, log))
         try:
             with contextlib.redirect_stdout(stdout):
                 yield
         finally:
             os.dup2(stdout.fileno(), 1)
             reader.join(CLOSE_LIMIT_S)
+            if not reader.is_alive():
+                source.close()
             log.turn()
 
 
@@ -153,15 +156,15 @@ def _to_stderr(line: str) -> None:
             print_stderr(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}")
 
 
-def _read(pipe: int, log: RouterLog) -> None:
+def _read(source: RawIOBase, log: RouterLog) -> None:
     """Until the last writer has closed the pipe."""
-    rest, turn_at_s = b"", time.monotonic() + AGAIN_S
-    with os.fdopen(pipe, "rb", buffering=0) as source:
-        while (got := source.read(PIPE_BYTES)) != b"":
-            *lines, rest = (rest + (got or b"")).split(b"\n")
-            for line in lines:
-                log.take(line.decode(errors="replace"))
-            if time.monotonic() >= turn_at_s:
-                turn_at_s += AGAIN_S
-                log.turn()
-            time.sleep(LOOK_S)
+    rest = b""
+    turn_at_s = time.monotonic() + AGAIN_S
+    while (got := source.read(PIPE_BYTES)) != b"":
+        *lines, rest = (rest + (got or b"")).split(b"\n")
+        for line in lines:
+            log.take(line.decode(errors="replace"))
+        if time.monotonic() >= turn_at_s:
+            turn_at_s += AGAIN_S
+            log.turn()
+        time.sleep(LOOK_S)

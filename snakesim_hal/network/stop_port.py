@@ -5,30 +5,37 @@ connections, idle sessions, floods) leave this path open. A datagram is
 
     request  b"SNAKSTOP", 16 bytes chosen by the sender, name of the requester in UTF-8 (at most 64 bytes)
     answer   b"SNAKDONE", the same 16 bytes, in UTF-8: the robot's namespace, a line feed, the result
+    test     b"SNAKTEST": does nothing, and is not answered; tells a sender whether the port is closed
 
 The kernel drops all other datagrams before they are queued, so a flood of them takes no room from a stop; and a
 flood of requests is a stop. Restrict access to the port by the network: stopping a robot needs no permission.
 """
 
 import ctypes
+import errno
 import os
+import select
 import socket
 import struct
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from contextlib import closing
 from dataclasses import dataclass
 
 from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.workers import start_worker
 
 REQUEST, ANSWER = b"SNAKSTOP", b"SNAKDONE"
+TEST = b"SNAKTEST"  # does nothing, and is never answered
 NONCE_BYTES, MAX_WHO_BYTES, MAX_ANSWER_BYTES = 16, 64, 1024
 UDP_HEADER = 8
 SO_ATTACH_FILTER = 26
 PAUSE_S = 0.001  # between two requests: a flood of them must not block the interpreter
 MAX_REFUSED = 10  # answers of the kernel that the port is closed
 REPEAT_S = 0.02  # after which a sender repeats an unanswered request
+TEST_WAIT_S = 0.01  # for the kernel's answer that a port is closed; on loopback it comes at once
 
+Address = tuple[str, int]  # host and port
 Reply = Callable[[str], None]
 
 
@@ -73,7 +80,7 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
             take(who.decode(errors="replace") or "an unnamed client", reply)
             time.sleep(PAUSE_S)
 
-    threading.Thread(target=serve, name="stop port", daemon=True).start()
+    start_worker("stop port", serve)
 
 
 @dataclass(frozen=True)
@@ -84,36 +91,102 @@ class Stopped:
     text: str
 
 
+class StopRequester:
+    """Asks stop ports to stop, and tests whether they are open, over sockets that it opens once.
+
+    After `prepare` neither needs another file descriptor. Not thread-safe.
+    """
+
+    def __init__(self) -> None:
+        self._sockets: dict[Address, socket.socket] = {}
+
+    def prepare(self, addresses: Collection[Address]) -> None:
+        """Open a socket for each of these stop ports, and close those of others. Raises OSError."""
+        for address in addresses:
+            if address not in self._sockets:
+                self._sockets[address] = _open_for(address)
+        for address in [known for known in self._sockets if known not in addresses]:
+            self._sockets.pop(address).close()
+
+    def ask(self, address: Address, who: str, timeout_s: float) -> Stopped | None:
+        """Repeat a request until it is answered; None when no answer came in time.
+
+        Raises NotConnectedError when that port is closed, OSError when `address` is not prepared and no socket is left.
+        """
+        asking = self._sockets.get(address)
+        if asking is None:
+            self._sockets[address] = asking = _open_for(address)
+        return _ask(asking, address, who, timeout_s)
+
+    def test(self, address: Address, wait_s: float = TEST_WAIT_S) -> None:
+        """Send a datagram that does nothing to a stop port. Raises NotConnectedError when the port is closed.
+
+        The robot's kernel drops it unread, so that a flood of tests takes no room from a stop; it answers for a port
+        that nobody has open.
+        """
+        asking = self._sockets.get(address)
+        if asking is None:
+            raise NotConnectedError(f"no socket is prepared for udp/{address[0]}:{address[1]}")
+        try:
+            asking.connect(address)
+            asking.send(TEST)
+            errors = select.poll()
+            errors.register(asking, select.POLLERR)
+            errors.poll(1000 * wait_s)
+            code = asking.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        except OSError as error:
+            code = error.errno or errno.EIO
+        if code == errno.ECONNREFUSED:
+            raise NotConnectedError(f"no host takes emergency stops on udp/{address[0]}:{address[1]}")
+        if code:
+            raise NotConnectedError(f"udp/{address[0]}:{address[1]} cannot be reached: {os.strerror(code)}")
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for opened in self._sockets.values():
+            opened.close()
+        self._sockets.clear()
+
+
 def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | None:
     """Repeat the request until it is answered; None when no answer came in time.
 
     Raises NotConnectedError when that port is closed.
     """
+    with closing(StopRequester()) as requester:
+        return requester.ask((host, port), who, timeout_s)
+
+
+def _open_for(address: Address) -> socket.socket:
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    return socket.socket(family, socket.SOCK_DGRAM)
+
+
+def _ask(asking: socket.socket, address: Address, who: str, timeout_s: float) -> Stopped | None:
     nonce = os.urandom(NONCE_BYTES)
     request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    deadline, refused = time.monotonic() + timeout_s, 0
-    with socket.socket(family, socket.SOCK_DGRAM) as asking:
-        asking.settimeout(REPEAT_S)
-        while time.monotonic() < deadline:
-            try:
-                asking.connect((host, port))  # so that the kernel accepts answers only from there
-                asking.send(request)
-                until = time.monotonic() + REPEAT_S
-                while time.monotonic() < until:
-                    answer = asking.recv(MAX_ANSWER_BYTES)
-                    if answer.startswith(ANSWER + nonce):
-                        robot, _, text = answer[len(ANSWER) + NONCE_BYTES :].decode(errors="replace").partition("\n")
-                        return Stopped(robot, text)
-            except TimeoutError:
-                continue
-            except ConnectionRefusedError:
-                refused += 1
-                if refused > MAX_REFUSED:
-                    raise NotConnectedError(f"no host takes emergency stops on udp/{host}:{port}") from None
-                time.sleep(REPEAT_S)
-            except OSError:  # currently unreachable
-                time.sleep(REPEAT_S)
+    deadline = time.monotonic() + timeout_s
+    refused = 0
+    asking.settimeout(REPEAT_S)
+    while time.monotonic() < deadline:
+        try:
+            asking.connect(address)  # so that the kernel accepts answers only from there
+            asking.send(request)
+            until = time.monotonic() + REPEAT_S
+            while time.monotonic() < until:
+                answer = asking.recv(MAX_ANSWER_BYTES)
+                if answer.startswith(ANSWER + nonce):
+                    robot, _, text = answer[len(ANSWER) + NONCE_BYTES :].decode(errors="replace").partition("\n")
+                    return Stopped(robot, text)
+        except TimeoutError:
+            continue
+        except ConnectionRefusedError:
+            refused += 1
+            if refused > MAX_REFUSED:
+                raise NotConnectedError(f"no host takes emergency stops on udp/{address[0]}:{address[1]}") from None
+            time.sleep(REPEAT_S)
+        except OSError:  # currently unreachable
+            time.sleep(REPEAT_S)
     return None
 
 

@@ -20,6 +20,7 @@ from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire.messages import Description
+from snakesim_hal.workers import start_worker
 
 PERIOD_S = 0.5
 CLOSE_LIMIT_S = 2.0  # for a disk that hangs
@@ -48,17 +49,18 @@ class HostRecordWriter:
         self._skipped = 0  # rows that were overwritten before they were written to disk
         self._failure = ""
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Self:
         if self._memory is not None:
             os.ftruncate(self._memory, 0)  # of an earlier host
-        self._thread.start()
+        self._thread = start_worker("recorder", self._run, is_over=self._closing.is_set)
         return self
 
     def __exit__(self, *_error: object) -> None:
         """Write the rest, and how the host ended. Waits for a hanging disk no longer than CLOSE_LIMIT_S."""
         self._closing.set()
+        assert self._thread is not None
         self._thread.join(CLOSE_LIMIT_S)
         if self._thread.is_alive():
             self._note(f"{self._folder}: the disk has not answered for {CLOSE_LIMIT_S:g} s")

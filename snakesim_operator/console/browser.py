@@ -8,7 +8,9 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
+from snakesim_hal.workers import ErrorReport
 from snakesim_operator.console.admission import Admission
+from snakesim_operator.console.message_age import MessageAge
 
 MOST_BYTES = 64 * 1024  # of a message: far above any of a page
 MOST_HZ = 300.0  # messages; more wait at the sender. A page sends at most 50 of a camera and 20 of a slider a second.
@@ -22,6 +24,8 @@ class Browser(ServerConnection):
     def __init__(self, admission: Admission, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
         self.viewer: int | None = None  # until viser has given it a number
+        self.age = MessageAge()
+        self._errors = ErrorReport("a page")
         self._admission = admission
         self._allowance, self._since_s = AT_ONCE, time.monotonic()
 
@@ -35,7 +39,11 @@ class Browser(ServerConnection):
                     self._admission.drop(self.viewer, "too long", f"more than {MOST_BYTES} bytes; it was hung up on")
                 raise
             await self._in_pace()
-            checked = self._admission.checked(self.viewer, data)
+            try:
+                checked = self._admission.checked(self.viewer, data, self.age)
+            except Exception as error:  # noqa: BLE001 - this connection's outermost loop: its next message may be a stop
+                self._errors.write(error)
+                continue
             if checked is not None:
                 return checked
 

@@ -13,11 +13,13 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read
 from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import Link
-from snakesim_hal.process import on_stop_signal
+from snakesim_hal.process import on_stop_signal, raise_open_files
 from snakesim_hal.serve import process_options
 from snakesim_operator import extras
 from snakesim_operator.console_port import open_port
 from snakesim_operator.tools.targets import RobotSelection, only_robot
+
+MAX_OPEN_FILES = 4096  # connections of browsers take few of them; see `connections.ConnectionLimits`
 
 
 def console(where: RobotSelection, port: int | None, commission: Path | None = None) -> int:
@@ -29,6 +31,7 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
     if commission is not None:
         extras.check("commission", "commissioning")
         decode(read_part(str(commission), "robots"), RobotFile)
+    raise_open_files(MAX_OPEN_FILES)
     from snakesim_operator.console.console import show_live
 
     link = only_robot(where, "console")
@@ -39,6 +42,7 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
 def show_record(folder: Path, at_s: float, port: int | None) -> int:
     """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
     extras.check("console", "the console")
+    raise_open_files(MAX_OPEN_FILES)
     from snakesim_operator.console.console import show_recorded
 
     return show_recorded(folder, at_s, open_port(port), _until_signal())
@@ -72,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited socket
     given = process_options(parser.parse_args(argv))
     extras.check("console", "the console")
+    raise_open_files(MAX_OPEN_FILES)
     from snakesim_operator.console.console import show_live
     from snakesim_operator.console.drawing import Surroundings
     from snakesim_operator.console.snapshot import expected_of

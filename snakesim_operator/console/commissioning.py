@@ -7,6 +7,7 @@ import shlex
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -17,9 +18,10 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link
 from snakesim_hal.wire.messages import Configuration
 from snakesim_hal.wire.quantities import MAX_JOINTS
-from snakesim_operator.console.admission import Admission
+from snakesim_operator.console.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.console.joint_step import BACKWARDS, ENTER, FORWARDS, JointStep
 from snakesim_operator.console.joint_table import Range, commissioning_html
+from snakesim_operator.console.message_age import PageAction
 from snakesim_operator.console.operations import Log
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.texts import plain
@@ -162,8 +164,12 @@ class CommissioningControls:
         admission: Admission,
         may: Callable[[], bool],
         do: Callable[[str, Callable[[], str]], object],
+        on_late: Callable[[float], None],
     ) -> None:
-        """may: whether this viewer is in control; do: does something, and tells the viewer what came of it."""
+        """may: whether this viewer is in control; do: does something, and tells the viewer what came of it.
+
+        on_late: called with the age of a press that was too old.
+        """
         self._commissioning, self._may, self._do = commissioning, may, do
         self._viewer, gui = client.client_id, client.gui
         with tab:
@@ -180,15 +186,17 @@ class CommissioningControls:
             self._forwards = gui.add_button("Hold: forwards (+)", color="green")
             self._backwards = gui.add_button("Hold: backwards (-)", color="green")
             end = gui.add_button("End step", color="gray")
-        for one in (self._verb, self._joint, self._speed, self._travel, self._torque, start, self._enter, end):
+        for one in (self._verb, self._joint, self._speed, self._travel, self._torque, end):
             admission.admit(one, self._viewer, may)
-        for one in (self._forwards, self._backwards):
-            admission.admit(one, self._viewer, may, HOLD_HZ)
+        for one in (start, self._enter):
+            admission.admit(one, self._viewer, may, max_age_s=MAX_PRESS_AGE_S, on_late=on_late)
+        for one, key in ((self._forwards, FORWARDS), (self._backwards, BACKWARDS)):
+            one.on_hold(lambda _: None, callback_hz=HOLD_HZ)  # so that the page repeats that it is held
+            act = partial(self._on_held, key)
+            admission.admit(one, self._viewer, may, HOLD_HZ, act=act, max_age_s=MAX_HOLD_AGE_S)
         self._verb.on_update(lambda _: self._describe())
         start.on_click(lambda _: self._start())
         self._enter.on_click(lambda _: commissioning.press(self._viewer, ENTER))
-        self._forwards.on_hold(lambda _: commissioning.press(self._viewer, FORWARDS), callback_hz=HOLD_HZ)
-        self._backwards.on_hold(lambda _: commissioning.press(self._viewer, BACKWARDS), callback_hz=HOLD_HZ)
         end.on_click(lambda _: self._end())
         self._describe()
 
@@ -203,6 +211,10 @@ class CommissioningControls:
         self._joint.visible, self._enter.visible = verb != "zero", verb != "jog"
         for one in (self._speed, self._travel, self._torque, self._forwards, self._backwards):
             one.visible = verb == "jog"
+
+    def _on_held(self, key: bytes, _viewer: int, _action: PageAction) -> None:
+        """A button is held, by a message that is not too old."""
+        self._commissioning.press(self._viewer, key)
 
     def _start(self) -> None:
         verb, joint = self._verb.value, int(self._joint.value)

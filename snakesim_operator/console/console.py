@@ -48,10 +48,7 @@ def show_live(
     signals = SignalsPage(kept, SECOND_STOP)
     signals.now_s = kept.now_s
 
-    with page_server(listening, report, lambda: operations.estop("a page's second stop"), signals.answer) as (
-        server,
-        address,
-    ):
+    with page_server(listening, report, operations.stop, signals.answer) as (server, address):
         page = Page(server, around, operations, log, commission=commission)
         say(f"console: {address}")
         page.show(expected)

@@ -3,8 +3,8 @@
 import math
 import threading
 import time
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Collection
+from typing import Any, Literal
 
 import viser
 
@@ -13,8 +13,10 @@ from snakesim_hal.injection import KINDS, TargetType
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
-from snakesim_operator.console.admission import Admission
+from snakesim_hal.workers import ErrorReport
+from snakesim_operator.console.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission, in_words
 from snakesim_operator.console.commissioning import Commissioning, CommissioningControls
+from snakesim_operator.console.message_age import PageAction
 from snakesim_operator.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.snapshot import RobotSnapshot
@@ -30,7 +32,7 @@ FAULTS: dict[str, tuple[str, TargetType]] = {
 }
 TARGETS: dict[TargetType, str] = {"process": "control", "key": keys.JOINTS, "joint": "joint_3", "bus": "bus_1"}
 DRIVE_HZ = 10.0
-ACTS_AT_ONCE, STOPS_AT_ONCE = 4, 2  # of one viewer
+ACTS_AT_ONCE = 4  # of one viewer
 FASTEST_M_S = 0.5
 Key = Literal["I", "J", "K", "L"]
 KEYS: dict[str, Key] = {"Ahead": "I", "Backwards": "K", "Left": "J", "Right": "L"}  # viser's arrows turn the view
@@ -59,11 +61,12 @@ class Controls:
         self.client, self._token, self._operations = client, token, operations
         self._moment, self._changed = snapshot, changed
         self._settings_tab, self._admission = settings_tab, admission
-        self._acts, self._stops = threading.Semaphore(ACTS_AT_ONCE), threading.Semaphore(STOPS_AT_ONCE)
+        self._acts = threading.Semaphore(ACTS_AT_ONCE)
         self._form: SettingsForm | None = None
         self._offers_unchecked = False  # this viewer was refused because the joints were not checked
         self._way, self._driven_s = 1, -math.inf  # by keys: ahead or backwards, and when last
         self.viewer = client.client_id
+        self._errors = ErrorReport(f"console, {self.who}")
         with folder:
             self._take = client.gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
             self._lifecycle = client.gui.add_button_group("Robot", ("Arm", "Disarm", "Clear"))
@@ -84,11 +87,16 @@ class Controls:
                 self._target = client.gui.add_text("Target", TARGETS["joint"])
                 inject = client.gui.add_button_group("Fault", ("Inject", "End it"))
         admission.admit(self._take, self.viewer)
-        driven = (self._lifecycle, time_buttons, self._time_speed, self._heading, self._speed)
-        for control in (*driven, self._kind, self._target, inject):
+        for control in (self._heading, self._speed, self._kind, self._target):
             admission.admit(control, self.viewer, self._in_control)
-        admission.admit(self._arm_unchecked, self.viewer, lambda: self._in_control() and self._offers_unchecked)
-        admission.admit(self._drive, self.viewer, self._in_control, DRIVE_HZ)
+        self._admit_press(self._lifecycle, at_any_age=("Disarm",))
+        self._admit_press(time_buttons, at_any_age=("Pause",))
+        self._admit_press(self._time_speed)
+        self._admit_press(inject, at_any_age=("End it",))
+        self._admit_press(self._arm_unchecked, lambda: self._in_control() and self._offers_unchecked)
+        admission.admit(
+            self._drive, self.viewer, self._in_control, DRIVE_HZ, act=self._on_held, max_age_s=MAX_HOLD_AGE_S
+        )
         self._take.on_click(lambda _: self._take_or_release())
         self._lifecycle.on_click(lambda event: self._ask(event.target.value))
         self._arm_unchecked.on_click(lambda _: self._arm(unchecked=True))
@@ -96,13 +104,15 @@ class Controls:
         self._time_speed.on_update(lambda _: self._change_time("speed"))
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
-        admission.admit(self._apply, self.viewer, self._in_control)
+        self._admit_press(self._apply)
         about, tab = commissioning
-        self._commissioning = CommissioningControls(client, tab, about, admission, self._in_control, self.do)
+        self._commissioning = CommissioningControls(
+            client, tab, about, admission, self._in_control, self.do, self._on_late
+        )
         self._kind.on_update(lambda _: self._suggest_target())
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
-        # The page repeats this while the button is held; without it, motion stops.
-        self._drive.on_hold(lambda _: self._ask_for(self._speed.value, BUTTON_NS), callback_hz=DRIVE_HZ)
+        # So that the page repeats that the button is held; `_on_held` gets that, and without it motion stops.
+        self._drive.on_hold(lambda _: None, callback_hz=DRIVE_HZ)
         self._apply.on_click(lambda _: self._configure())
         self.show()
 
@@ -193,9 +203,31 @@ class Controls:
             order = SimulatorOrder(action, speed=float(self._time_speed.value), who=self.who)
             self.do("Simulator", lambda: self._operations.change_time(self.who, order))
 
-    def press(self, key: str) -> None:
-        """A key of `KEYS` was pressed, or its keyboard repeats it; only the last one of several is repeated."""
-        if not self._in_control():
+    def _admit_press(
+        self, control: Any, may: Callable[[], bool] | None = None, at_any_age: Collection[str] = ()
+    ) -> None:
+        """Admit a control whose press may move the robot, now or later: an old one does not count."""
+        self._admission.admit(
+            control,
+            self.viewer,
+            may or self._in_control,
+            max_age_s=MAX_PRESS_AGE_S,
+            at_any_age=at_any_age,
+            on_late=self._on_late,
+        )
+
+    def _on_late(self, age_s: float) -> None:
+        self.tell("Not done", f"{in_words(age_s)}; press again if you still want it", bad=True)
+
+    def _on_held(self, _viewer: int, action: PageAction) -> None:
+        self._ask_for(self._speed.value, BUTTON_NS, action)
+
+    def press(self, key: str, action: PageAction) -> None:
+        """A key of `KEYS` was pressed, or its keyboard repeats it; only the last one of several is repeated.
+
+        action: when that was; what is too old is ignored.
+        """
+        if not self._in_control() or action.age_s > MAX_HOLD_AGE_S:
             return
         now_s = time.monotonic()
         if key in ("Ahead", "Backwards"):
@@ -206,13 +238,12 @@ class Controls:
             if now_s - self._driven_s > KEY_NS * 1e-9:
                 return  # it turns only while it drives
         self._driven_s = now_s
-        self._ask_for(self._way * self._speed.value, KEY_NS)
+        self._ask_for(self._way * self._speed.value, KEY_NS, action)
 
-    def _ask_for(self, speed_m_s: float, valid_ns: int) -> None:
-        snapshot = self._moment()
-        if snapshot is not None and snapshot.time_s is not None and self._in_control():
-            now_ns = round(snapshot.time_s * 1e9)
-            self._operations.drive(self.who, self._heading_w_rad, speed_m_s, now_ns, valid_ns)
+    def _ask_for(self, speed_m_s: float, valid_ns: int, action: PageAction) -> None:
+        """Ask the robot to go, from the moment at which the viewer is known to have wanted it."""
+        if action.robot_ns is not None and self._in_control():
+            self._operations.drive(self.who, self._heading_w_rad, speed_m_s, action.robot_ns, valid_ns)
 
     @property
     def _heading_w_rad(self) -> float:
@@ -238,13 +269,12 @@ class Controls:
         if form is not None and self._in_control():
             self.do("Settings", lambda: self._operations.configure(self.who, form.controller, form.asked()))
 
-    def do(self, title: str, call: Callable[[], str], at_once: threading.Semaphore | None = None) -> bool:
+    def do(self, title: str, call: Callable[[], str]) -> bool:
         """Do something, and show its outcome; whether it was done.
 
         Few at once, so that a viewer keeps no other one's click waiting.
         """
-        at_once = at_once or self._acts
-        if not at_once.acquire(blocking=False):
+        if not self._acts.acquire(blocking=False):
             self.tell(title, "not done: what you asked for before is still under way", bad=True)
             return False
         try:
@@ -253,12 +283,12 @@ class Controls:
         except SnakesimError as error:
             self.tell(title, str(error), bad=True)
             return False
+        except Exception as error:  # noqa: BLE001 - outermost in a thread of viser's, which tells no viewer
+            self._errors.write(error)
+            self.tell(title, f"not done: unexpected error: {type(error).__name__}: {error}", bad=True)
+            return False
         finally:
-            at_once.release()
-
-    def estop(self) -> None:
-        """Which what else is under way does not keep waiting."""
-        self.do("Emergency stop", lambda: self._operations.estop(self.who), self._stops)
+            self._acts.release()
 
 
 def _degrees(angle_rad: float) -> int:

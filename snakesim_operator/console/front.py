@@ -1,26 +1,73 @@
 """In front of the pages: accepts each connection, and answers those of the second stop itself.
 
 A stop over `POST /stop` shares nothing with the pages but the port: no websocket, no viser, no event loop, a thread of
-its own. All other connections are handed on to viser's server as they came.
+its own. All other connections are handed on to viser's server as they came, once their request is complete.
+
+No number of connections keeps a stop from being asked for. Requests that are not complete are limited in number, in
+total and of one user, and in time; of too many the oldest one is closed. So are connections to the pages. Should the
+file table be full all the same, a reserved descriptor is given up to accept the next connection.
 """
 
 import contextlib
-import selectors
+import errno
+import os
+import resource
+import select
 import socket
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import Protocol
 
-from snakesim_hal.errors import SnakesimError
+from snakesim_hal.workers import start_worker
+from snakesim_operator.console.connections import ConnectionLimits, Waiting, limits_for, why_no_page
+from snakesim_operator.console.peer_user import PeerUsers
 from snakesim_operator.page_origin import why_head_refused
 
 PATH = "/stop"
 OURS = tuple(f"{method} {PATH} ".encode() for method in ("GET", "POST"))
-LONGEST_HEAD = 16 * 1024
-UNDECIDED = 256  # connections that have not said what they want; a browser opens some ahead of need
-CONFIRMING_S = 10.0  # browsers and clients ask within this, or are forgotten
+END_OF_HEAD = b"\r\n\r\n"
+MAX_HEAD_BYTES = 16 * 1024
+HEAD_LIMIT_S = 10.0  # from the connection to the end of its request
+BACKLOG = 1024  # connections that the kernel keeps until they are accepted; it may have a lower limit
+ACCEPTED_AT_ONCE = 128  # before those that are waiting are looked at again
+RESERVED_DESCRIPTORS = 4
+OUT_OF_FILES = (errno.EMFILE, errno.ENFILE)
 REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 503: "Service Unavailable"}
+
+
+class Readiness(Protocol):
+    """Whether a stop would reach the robot."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether it would."""
+        ...
+
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        ...
+
+
+class StopPath(Protocol):
+    """What stops the robot, and tests itself. None of its methods waits."""
+
+    def request(self, requester: str) -> "Future[str]":
+        """Stop the robot; the future has the result in words, or an error."""
+        ...
+
+    def readiness(self) -> Readiness:
+        """Return the result of the newest self-test."""
+        ...
+
+    def test_if_due(self) -> None:
+        """Begin a self-test, if it is time for one."""
+        ...
 
 
 class HandedOn(socket.socket):
@@ -66,6 +113,34 @@ class HandedOn(socket.socket):
         super().close()
 
 
+class ReservedDescriptors:
+    """Open descriptors of nothing, given up when the file table is full, and taken again when it is not."""
+
+    def __init__(self, count: int) -> None:
+        """Open so many."""
+        self._count = count
+        self._held: list[int] = []
+        self.refill()
+
+    def refill(self) -> None:
+        """Open those that were given up, as far as the file table has room."""
+        with contextlib.suppress(OSError):
+            while len(self._held) < self._count:
+                self._held.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+
+    def give_up_one(self) -> bool:
+        """Close one, so that another file can be opened; whether there was one."""
+        if not self._held:
+            return False
+        os.close(self._held.pop())
+        return True
+
+    def close(self) -> None:
+        """Close all of them."""
+        while self.give_up_one():
+            pass
+
+
 class Front:
     """The thread that accepts. A context manager."""
 
@@ -73,116 +148,192 @@ class Front:
         self,
         listening: socket.socket,
         handed_on: HandedOn,
-        stop: Callable[[], str] | None,
-        refused: Callable[[str], None] = lambda _: None,
+        stop: StopPath | None,
+        refused: Callable[[str, str], None] = lambda _kind, _why: None,
+        limits: ConnectionLimits | None = None,
     ) -> None:
-        """stop: stops the robot, returns what came of it or raises SnakesimError; None: there is nothing to stop.
+        """Open what it needs, but accept nothing yet.
 
-        refused: told why a page was refused.
+        Args:
+            listening: Where browsers connect.
+            handed_on: Gets the connections that are not for the second stop.
+            stop: Stops the robot; None for a recording, where there is nothing to stop.
+            refused: Called with a kind and a reason for each connection that is refused.
+            limits: None: by the number of files that this process may open.
         """
         self._listening, self._handed_on, self._stop, self._refused = listening, handed_on, stop, refused
-        self._heads: dict[socket.socket, tuple[float, bytearray]] = {}  # since when, and what is read of those of PATH
-        self._asking: list[socket.socket] = []
-        self._stopping = False
-        self._lock = threading.Lock()
+        self._limits = limits_for(*_files()) if limits is None else limits
+        # Connections, by what they are at. A stop answers those that asked for it in another thread.
+        self._waiting: Waiting[socket.socket] = Waiting(self._limits)
+        self._pages: dict[socket.socket, int] = {}  # their users
+        self._asking = 0
+        self._asking_changed = threading.Lock()
+        self._current: socket.socket | None = None  # the one that is looked at
+        # Owned from the start: a stop must not depend on what can be opened then.
+        self._users = PeerUsers()
+        self._reserved = ReservedDescriptors(RESERVED_DESCRIPTORS)
+        self._poll = select.epoll()
+        self._by_descriptor: dict[int, socket.socket] = {}
         self._closed = threading.Event()
-        self._selector = selectors.DefaultSelector()
-        self._thread = threading.Thread(target=self._serve, name="front", daemon=True)
+        self._thread: threading.Thread | None = None
 
     def __enter__(self) -> "Front":
         self._listening.setblocking(False)
-        self._selector.register(self._listening, selectors.EVENT_READ)
-        self._thread.start()
+        self._listening.listen(BACKLOG)
+        self._poll.register(self._listening, select.EPOLLIN)
+        self._thread = start_worker("front", self._serve, is_over=self._closed.is_set, on_error=self._drop_current)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._closed.set()
+        assert self._thread is not None
         self._thread.join()
-        for connection in self._heads:
+        for connection in self._waiting.list_all():
             connection.close()
-        self._selector.close()
+        self._poll.close()
+        self._users.close()
+        self._reserved.close()
         self._listening.close()
 
     def _serve(self) -> None:
         while not self._closed.is_set():
-            for key, _ in self._selector.select(0.1):
-                if key.fileobj is self._listening:
-                    self._accept()
-                elif isinstance(key.fileobj, socket.socket) and key.fileobj in self._heads:
-                    self._read(key.fileobj)
-            old_s = time.monotonic() - CONFIRMING_S
-            for connection in [one for one, (since_s, head) in self._heads.items() if head and since_s < old_s]:
-                self._forget(connection).close()
+            for descriptor, _ in self._poll.poll(0.1):
+                if descriptor == self._listening.fileno():
+                    self._accept_all()
+                elif descriptor in self._by_descriptor:
+                    self._look_at(self._by_descriptor[descriptor])
+            for late in self._waiting.list_older_than(time.monotonic() - HEAD_LIMIT_S):
+                self._forget(late)
+                late.close()
+            self._reserved.refill()
+            if self._stop is not None:
+                self._stop.test_if_due()
 
-    def _accept(self) -> None:
+    def _drop_current(self, _error: Exception) -> None:
+        """Close the connection at which an unexpected error was raised."""
+        connection, self._current = self._current, None
+        if connection is not None:
+            if connection in self._waiting:
+                self._forget(connection)
+            connection.close()
+
+    # --- connections
+
+    def _accept_all(self) -> None:
+        for _ in range(ACCEPTED_AT_ONCE):
+            try:
+                connection, _ = self._listening.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # no file is left, or a client that has gone
+                if error.errno in OUT_OF_FILES and not self._make_room():
+                    self._closed.wait(0.05)
+                    return
+                continue
+            self._current = connection
+            connection.setblocking(False)
+            evicted = self._waiting.add(connection, self._users.user_of(connection), time.monotonic())
+            if evicted is not None:
+                self._unregister(evicted)
+                evicted.close()
+            # With its edge triggered: what has come already and stays unread does not wake this thread again.
+            self._poll.register(connection, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET)
+            self._by_descriptor[connection.fileno()] = connection
+            self._look_at(connection)
+            self._current = None
+
+    def _make_room(self) -> bool:
+        """Free a descriptor: of the connection that has waited longest, else a reserved one."""
+        oldest = self._waiting.oldest()
+        if oldest is None:
+            return self._reserved.give_up_one()
+        self._forget(oldest)
+        oldest.close()
+        return True
+
+    def _forget(self, connection: socket.socket) -> int:
+        """Wait for this one no longer; returns its user."""
+        self._unregister(connection)
+        return self._waiting.remove(connection)
+
+    def _unregister(self, connection: socket.socket) -> None:
+        self._poll.unregister(connection)
+        del self._by_descriptor[connection.fileno()]
+
+    def _look_at(self, connection: socket.socket) -> None:
+        """Look at what has come of a request, and decide when it is complete. It stays unread until then."""
+        self._current = connection
         try:
-            connection, _ = self._listening.accept()
+            head = connection.recv(MAX_HEAD_BYTES, socket.MSG_PEEK)
         except BlockingIOError:
             return
-        except OSError:  # no file handles left, or a client that has gone
-            self._closed.wait(0.05)
-            return
-        connection.setblocking(False)
-        if len(self._heads) >= UNDECIDED:
-            self._forget(next(iter(self._heads))).close()
-        self._heads[connection] = time.monotonic(), bytearray()
-        self._selector.register(connection, selectors.EVENT_READ)
-
-    def _forget(self, connection: socket.socket) -> socket.socket:
-        self._selector.unregister(connection)
-        del self._heads[connection]
-        return connection
-
-    def _read(self, connection: socket.socket) -> None:
-        head = self._heads[connection][1]
-        try:
-            if not head and not connection.recv(len(OURS[1]), socket.MSG_PEEK).startswith(OURS):
-                self._handed_on.put(self._forget(connection))
-                return
-            data = connection.recv(4096)
         except OSError:
-            data = b""
-        head += data
-        if b"\r\n\r\n" in head:
-            self._answer(self._forget(connection), bytes(head))
-        elif not data or len(head) > LONGEST_HEAD:
-            self._forget(connection).close()
+            head = b""
+        if END_OF_HEAD in head:
+            user = self._forget(connection)
+            if head.startswith(OURS):
+                self._answer(connection, head[: head.index(END_OF_HEAD) + len(END_OF_HEAD)])
+            else:
+                self._hand_on(connection, user)
+        elif not head or len(head) == MAX_HEAD_BYTES:
+            self._forget(connection)
+            connection.close()
+        self._current = None
+
+    def _hand_on(self, connection: socket.socket, user: int) -> None:
+        """Hand a connection on to the pages' server, if that has not too many."""
+        self._pages = {page: its_user for page, its_user in self._pages.items() if page.fileno() != -1}
+        why_not = why_no_page(Counter(self._pages.values()), user, self._limits)
+        if why_not is not None:
+            self._refused("too many connections", why_not)
+            _respond(connection, 503, why_not)
+            return
+        self._pages[connection] = user
+        self._handed_on.put(connection)
+
+    # --- the second stop
 
     def _answer(self, connection: socket.socket, request: bytes) -> None:
-        why = why_head_refused(request.partition(b"\r\n\r\n")[0])
+        connection.recv(len(request))  # what stays unread would reset the connection, and lose the answer
+        why = why_head_refused(request.removesuffix(END_OF_HEAD))
         if why is not None:
-            self._refused(why)
+            self._refused("another origin", why)
             _respond(connection, 403, why)
         elif self._stop is None:
             _respond(connection, 503, "a recording has nothing to stop")
         elif request.startswith(b"GET "):
-            _respond(connection, 200, "ready")
+            readiness = self._stop.readiness()
+            _respond(connection, 200 if readiness.ready else 503, readiness.text)
         else:
-            self._ask(connection)
+            self._ask(connection, self._stop)
 
-    def _ask(self, connection: socket.socket) -> None:
-        """Stop the robot, beside this thread. Who asks meanwhile gets a stop that begins after the present one."""
-        with self._lock:
-            self._asking.append(connection)
-            if self._stopping:
-                return
-            self._stopping = True
-        threading.Thread(target=self._stop_for_all, name="second stop", daemon=True).start()
+    def _ask(self, connection: socket.socket, stop: StopPath) -> None:
+        """Stop the robot, and answer when that is done."""
+        stopped = stop.request("a page's second stop")
+        with self._asking_changed:
+            too_many = self._asking >= self._limits.asking
+            self._asking += not too_many
+        if too_many:
+            _respond(connection, 503, "the robot is being stopped; too many ask at once to wait for the result")
+        else:
+            stopped.add_done_callback(partial(self._answer_stop, connection))
 
-    def _stop_for_all(self) -> None:
-        assert self._stop is not None
-        while True:
-            with self._lock:
-                asking, self._asking = self._asking, []
-                self._stopping = bool(asking)
-            if not asking:
-                return
-            try:
-                status, text = 200, self._stop()
-            except SnakesimError as error:
-                status, text = 503, str(error)
-            for connection in asking:
-                _respond(connection, status, text)
+    def _answer_stop(self, connection: socket.socket, stopped: "Future[str]") -> None:
+        """In a thread of the stop's."""
+        with self._asking_changed:
+            self._asking -= 1
+        error = stopped.exception()
+        if error is None:
+            _respond(connection, 200, stopped.result())
+        else:
+            _respond(connection, 503, str(error) or type(error).__name__)
+
+
+def _files() -> tuple[int, int]:
+    """How many files this process may have open, and how many of these are free."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = 1 << 20 if soft == resource.RLIM_INFINITY else soft
+    return allowed, allowed - len(list(Path("/proc/self/fd").iterdir()))
 
 
 def _respond(connection: socket.socket, status: int, text: str) -> None:

@@ -66,12 +66,17 @@ class JointStep:
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        with self._process.stdout as said:
-            for line in said:
-                with self._lock:
-                    self._lines.append(line.rstrip("\n")[:300])
-        code = self._process.wait()
-        with self._lock:
-            self._lines.append("done" if code == 0 else f"ended ({code})")
-            os.close(self._terminal)
-            self._terminal = -1
+        try:
+            with self._process.stdout as said:
+                for line in said:
+                    with self._lock:
+                        self._lines.append(line.rstrip("\n")[:300])
+        except BaseException:  # its output cannot be read: a step that nobody sees must not go on
+            self.end()
+            raise
+        finally:
+            code = self._process.wait()
+            with self._lock:
+                self._lines.append("done" if code == 0 else f"ended ({code})")
+                os.close(self._terminal)
+                self._terminal = -1

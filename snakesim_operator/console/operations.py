@@ -15,14 +15,16 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Intent, Message, SettingsRequest
 from snakesim_operator.tools.command import ANSWER_S, arm, clear, disarm, simulator
 from snakesim_operator.tools.fault import FaultOrder, fault
+from snakesim_operator.tools.prepared_stop import PreparedStop
 from snakesim_operator.tools.simulator_order import SimulatorOrder
-from snakesim_operator.tools.stop import estop
 from snakesim_operator.tools.targets import RobotSelection
 
 LOG_LINES = 200
-# How long an intent from the page is valid: then a viewer who is gone moves nothing. A button tells ten times a second
-# that it is held; a held key at first after as long as its keyboard takes to repeat it, mostly 0.25 to 0.66 s.
-BUTTON_NS, KEY_NS = 500_000_000, 800_000_000
+# How long an intent from the page is valid, from the last moment at which its button or key is known to have been held.
+# Then a viewer who is gone moves nothing. A button sends ten times a second that it is held; a held key at first after
+# as long as its keyboard takes to repeat it, mostly 0.25 to 0.66 s. Both include the page's answer to a question, by
+# which that moment is known: about 0.2 s.
+BUTTON_NS, KEY_NS = 700_000_000, 1_000_000_000
 
 
 class Log:
@@ -52,16 +54,14 @@ class Operations:
         self.link = link
         self._where = RobotSelection(link.endpoint, link.namespace, link.session)
         self._log = log
+        self.stop = PreparedStop(self._where, link, lambda who, text: log.write(f"{who}: EMERGENCY STOP: {text}"))
         self._session: Session | None = None
         self._intents: Publisher[Intent] | None = None
 
     def connect(self, session: Session) -> None:
         """Use this session for what the command line has no command for."""
         self._session, self._intents = session, session.publisher(keys.INTENT, Intent)
-
-    def estop(self, who: str) -> str:
-        """Emergency stop: over the stop port and over the network at once."""
-        return self._do(f"{who}: EMERGENCY STOP", lambda say: estop(self._where, say))
+        self.stop.connect(session)
 
     def arm(self, who: str, robot: Description, *, unchecked: bool = False) -> str:
         """Arm the robot that the page shows. unchecked: also without a check of its joints."""
@@ -89,11 +89,11 @@ class Operations:
         request = SettingsRequest(who=who, controller=controller, settings=settings)
         return self._do(f"{who}: settings", lambda say: self._ask(keys.SETTINGS, request, say))
 
-    def drive(self, who: str, heading_w_rad: float, speed_m_s: float, now_ns: int, valid_ns: int) -> None:
-        """Ask for a direction and a speed, from a robot time on for so long."""
+    def drive(self, who: str, heading_w_rad: float, speed_m_s: float, acted_ns: int, valid_ns: int) -> None:
+        """Ask for a direction and a speed. acted_ns: robot time at which the viewer did; valid_ns: from then on."""
         if self._intents is not None:
             intent = Intent(
-                stamp_ns=now_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=valid_ns
+                stamp_ns=acted_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=valid_ns
             )
             self._intents.put(intent)
 

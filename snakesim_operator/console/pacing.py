@@ -42,6 +42,12 @@ async def _paced(
         await windows.aclose()
 
 
+def ask_page(page: viser.ClientHandle, request: str) -> None:
+    """Ask a page to answer once it has handled what it was sent before; from any thread."""
+    page._websock_connection.queue_message(wire.LocalStorageGetItemRequestMessage(key=KEY, request_uuid=request))
+    page.flush()
+
+
 async def _shown(page: viser.ClientHandle) -> None:
     """Until the page has shown what it was sent."""
     request, answered = uuid.uuid4().hex, asyncio.Event()
@@ -53,8 +59,7 @@ async def _shown(page: viser.ClientHandle) -> None:
     connection = page._websock_connection
     connection.register_handler(wire.LocalStorageGetItemResponseMessage, receive)
     try:
-        connection.queue_message(wire.LocalStorageGetItemRequestMessage(key=KEY, request_uuid=request))
-        page.flush()
+        ask_page(page, request)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(answered.wait(), ANSWER_LIMIT_S)
     finally:

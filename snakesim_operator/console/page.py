@@ -7,12 +7,12 @@ before (`pacing`), so a slow browser gets fewer frames, and never makes the loop
 import contextlib
 import threading
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 
 import viser
 
-from snakesim_hal.errors import SnakesimError
 from snakesim_hal.wire.messages import ControlSettings, Description
 from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.console import stage, texts
@@ -20,6 +20,7 @@ from snakesim_operator.console.charts import JointCharts
 from snakesim_operator.console.commissioning import Commissioning
 from snakesim_operator.console.controls import KEYS, Controls, add_appearance, name_of, set_appearance
 from snakesim_operator.console.drawing import Surroundings, draw
+from snakesim_operator.console.message_age import PageAction
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.own_sensors import OwnSensors
 from snakesim_operator.console.pictures import picture
@@ -30,6 +31,8 @@ from snakesim_operator.console.stage import Stage
 from snakesim_operator.console.token import ControlToken
 
 TEXT_EVERY, CHARTS_EVERY, PICTURES_EVERY = 6, 5, 6  # frames
+ASK_EVERY = 3  # frames between two questions to the page in control: ten a second
+PANEL_PX = 460  # wide enough for all tabs in one line
 VIEW_RAD = 0.75  # vertical angle of view
 LEGEND = (
     ("obstacle", stage.PEG),
@@ -80,18 +83,17 @@ class Page:
         gui = self._server.gui
         set_appearance(gui, dark=False)
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(420)
+        gui.main_panel.set_width(PANEL_PX)
         self._header = gui.add_html(texts.header(None), order=0)
         if self._operations is not None:
-            stop = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
-            stop.on_click(lambda event: self._estop(event.client_id))
+            # The stop, and what moves the robot while it is held, are acted on where messages are received.
             admit = self._server.admission.admit
-            admit(stop)
-            key = admit(gui.add_command("Emergency stop", hotkey="escape"))
-            key.on_trigger(lambda event: self._estop(event.client_id))
+            button = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
+            admit(button, act=self._estop)
+            admit(gui.add_command("Emergency stop", hotkey="escape"), act=self._estop)
             for what, hotkey in KEYS.items():
-                drive = admit(gui.add_command(f"Drive: {what.lower()}", hotkey=hotkey))
-                drive.on_trigger(partial(self._press, what))
+                command = gui.add_command(f"Drive: {what.lower()}", hotkey=hotkey)
+                admit(command, act=partial(self._press, what))
             self._control_folder = gui.add_folder("Control", order=2)
         tabs = gui.add_tab_group(order=4)
         with tabs.add_tab("Joints"):
@@ -176,28 +178,39 @@ class Page:
             if client.client_id in self._server.get_clients():
                 raise
 
+    def _ask_for_age(self) -> None:
+        """Ask the page in control the next question by which the age of what it sends is known."""
+        holder, moment = self._token.holder, self._moment
+        if holder is None:
+            return
+        time_s = None if moment is None else moment.time_s
+        self._server.ask_for_age(holder, None if time_s is None else round(time_s * 1e9))
+
     def _control_changed(self) -> None:
+        self._ask_for_age()  # before the page shows what it may press now
         with self._lock:
             everybody = list(self._controls.values())
         for controls in everybody:
             with self._of_who_is_there(controls.client):
                 controls.show()
 
-    def _estop(self, viewer: int | None) -> None:
+    def _estop(self, viewer: int, _action: PageAction) -> None:
+        """Stop the robot, however old the press is. A page that cannot draw the scene has no controls, but may stop."""
         assert self._operations is not None
-        with self._lock:
-            controls = None if viewer is None else self._controls.get(viewer)
+        stopped = self._operations.stop.request(name_of(viewer))
+        controls = self._controls.get(viewer)  # without the lock: whoever holds it may wait for this thread
         if controls is not None:
-            controls.estop()
-        else:
-            with contextlib.suppress(SnakesimError):  # the log has it
-                self._operations.estop(name_of(viewer))
+            stopped.add_done_callback(partial(self._show_stop, controls))
 
-    def _press(self, key: str, event: viser.CommandEvent) -> None:
-        with self._lock:
-            controls = None if event.client_id is None else self._controls.get(event.client_id)
+    def _show_stop(self, controls: Controls, stopped: "Future[str]") -> None:
+        with self._of_who_is_there(controls.client):
+            error = stopped.exception()
+            controls.tell("Emergency stop", str(error) if error else stopped.result(), bad=error is not None)
+
+    def _press(self, key: str, viewer: int, action: PageAction) -> None:
+        controls = self._controls.get(viewer)  # as above
         if controls is not None:
-            controls.press(key)
+            controls.press(key, action)
 
     def recall(self, before: Iterable[RobotSnapshot]) -> None:
         """The next snapshot is not the one after this: the trail starts over, charts begin with those before it."""
@@ -219,32 +232,38 @@ class Page:
         """Show a snapshot; None: there is no robot yet."""
         before, self._moment = self._moment, snapshot
         self._frames += 1
+        if self._frames % ASK_EVERY == 0:
+            self._ask_for_age()
         if self._commissioning is not None:
             self._commissioning.turn(snapshot)
         if snapshot is not None:
-            if self._stage is None or before is None or before.robot.layout != snapshot.robot.layout:
-                self._meet(snapshot.robot)
-            if before is None or before.robot is not snapshot.robot:
-                self._control_changed()  # a simulator has controls of its own
-            drawing = draw(snapshot, self._around)
-            assert self._stage is not None and self._charts is not None
-            if drawing is not None:
-                with self._server.atomic():
-                    self._stage.show(drawing)
-            self._charts.take(snapshot)
-            if self._own_sensors is not None:
-                self._own_sensors.take(snapshot)
-            if self._frames % CHARTS_EVERY == 1:
-                self._charts.show(snapshot)
-                self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
-                if self._own_sensors is not None:
-                    self._own_sensors.show(snapshot)
-            if self._frames % PICTURES_EVERY == 1:
-                self._show_pictures(snapshot)
-            if snapshot.settings is not None and (before is None or snapshot.settings != before.settings):
-                self._show_settings(snapshot.settings)
+            self._show_robot(before, snapshot)
         if self._frames % TEXT_EVERY == 1 or _what(before) != _what(snapshot):
             self._show_texts(snapshot)
+
+    def _show_robot(self, before: RobotSnapshot | None, snapshot: RobotSnapshot) -> None:
+        """Show the scene at once, and charts, images and settings when they are due."""
+        if self._stage is None or before is None or before.robot.layout != snapshot.robot.layout:
+            self._meet(snapshot.robot)
+        if before is None or before.robot is not snapshot.robot:
+            self._control_changed()  # a simulator has controls of its own
+        drawing = draw(snapshot, self._around)
+        assert self._stage is not None and self._charts is not None
+        if drawing is not None:
+            with self._server.atomic():
+                self._stage.show(drawing)
+        self._charts.take(snapshot)
+        if self._own_sensors is not None:
+            self._own_sensors.take(snapshot)
+        if self._frames % CHARTS_EVERY == 1:
+            self._charts.show(snapshot)
+            self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
+            if self._own_sensors is not None:
+                self._own_sensors.show(snapshot)
+        if self._frames % PICTURES_EVERY == 1:
+            self._show_pictures(snapshot)
+        if snapshot.settings is not None and (before is None or snapshot.settings != before.settings):
+            self._show_settings(snapshot.settings)
 
     def _meet(self, robot: Description) -> None:
         """Another robot: scene and charts start over."""
@@ -287,7 +306,7 @@ class Page:
             self._header.content = texts.header(snapshot, recorded=self._recorded)
             return
         holder = self._token.holder
-        viewers = len(self._server.get_clients())
+        viewers = self._server.viewers()
         control = f"{name_of(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
         if dropped := self._server.admission.dropped.total():
             control += f"; {dropped} message{'' if dropped == 1 else 's'} of browsers dropped"

@@ -8,6 +8,8 @@ import dataclasses
 import io
 import logging
 import socket
+import time
+import uuid
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
@@ -22,8 +24,8 @@ from websockets.http11 import Request, Response
 
 from snakesim_operator.console.admission import Admission
 from snakesim_operator.console.browser import MOST_BYTES, Browser
-from snakesim_operator.console.front import Front, HandedOn
-from snakesim_operator.console.pacing import pace
+from snakesim_operator.console.front import Front, HandedOn, StopPath
+from snakesim_operator.console.pacing import ask_page, pace
 from snakesim_operator.console_port import LOOPBACK, address_of
 from snakesim_operator.page_origin import why_refused
 
@@ -39,6 +41,12 @@ STATE_IN_SIGHT = (  # of `texts.header`: what is below is scrolled behind it
     b"<style>div:has(> [data-robot]) {position: sticky; top: 0; z-index: 5; background: var(--mantine-color-body);"
     b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important; min-width: 0}"
     b' @media (max-width: 480px) {div[style*="width: 20em"] {width: 100% !important}}</style>'  # a phone's panel
+)
+TABS_IN_ONE_LINE = (  # on a phone they wrap; viser's tabs have no class, but a style of their own
+    b"<style>@media (min-width: 481px) {"
+    b'div[style*="background-size: 100% 2.4em"] {flex-wrap: nowrap !important; overflow-x: auto !important}'
+    b' div[style*="padding: 0px 0.9em"][style*="max-width: 14em"] {padding: 0 0.3em !important; flex-shrink: 0}'
+    b"}</style>"
 )
 # A button that was held is let go when its page loses the keyboard, or is hidden: the finger may come up elsewhere.
 HOLD_ENDS = b"""<script>(() => {
@@ -63,6 +71,7 @@ class PageServer(viser.ViserServer):
         super().__init__(*arguments, **more)
         self._browsers: WeakValueDictionary[int, Browser] = WeakValueDictionary()
         self._websock_server.on_client_connect(self._number)
+        self._websock_server.on_client_disconnect(self._forget)
 
     def _number(self, viewer: Any) -> None:
         """viser has numbered a viewer: until then nothing that its browser says is passed on."""
@@ -70,12 +79,31 @@ class PageServer(viser.ViserServer):
         browser.viewer = viewer.client_id
         self._browsers[viewer.client_id] = browser
 
+    def _forget(self, viewer: Any) -> None:
+        self._browsers.pop(viewer.client_id, None)
+
     def prefers_dark(self, viewer: int) -> bool:
         """Whether a viewer's browser or system is set to dark pages, as it said when it connected."""
         browser = self._browsers.get(viewer)
         if browser is None or browser.request is None:
             return False
         return DARK in "; ".join(browser.request.headers.get_all("Cookie")).split("; ")
+
+    def viewers(self) -> int:
+        """Return how many pages are open, also of those that cannot draw the scene."""
+        return len(self._browsers)
+
+    def ask_for_age(self, viewer: int, robot_ns: int | None) -> None:
+        """Ask a viewer's page the next question by which the age of its messages is known.
+
+        robot_ns: the robot's time now, if it is known.
+        """
+        browser, page = self._browsers.get(viewer), self.get_clients().get(viewer)
+        if browser is None or page is None or not browser.age.may_ask():
+            return
+        question = uuid.uuid4().hex
+        browser.age.ask(question, time.monotonic(), robot_ns)
+        ask_page(page, question)
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refused."""
@@ -86,20 +114,23 @@ class PageServer(viser.ViserServer):
 def page_server(
     listening: socket.socket,
     report: Callable[[str], None] = lambda _: None,
-    stop: Callable[[], str] | None = None,
+    stop: StopPath | None = None,
     more: More = lambda _: None,
 ) -> Iterator[tuple[PageServer, str]]:
     """The server on a socket of `port.open_port`, and its address.
 
-    report: told what was refused, once of each kind; stop: of the pages' second stop, None for a recording;
-    more: answers requests for pages beside the console's, None: it has none there.
+    Args:
+        listening: Where browsers connect.
+        report: Called with what was refused, once of each kind.
+        stop: Stops the robot for the pages' backup stop; None for a recording.
+        more: Answers requests for pages beside the console's; returns None for one that it does not have.
     """
     admission, handed_on = Admission(report), HandedOn(listening.getsockname())
     with _on_our_terms(handed_on, admission, stop is not None, more), contextlib.redirect_stdout(io.StringIO()):
         server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)  # prints a banner
     server.admission = admission
     pace(server)
-    with Front(listening, handed_on, stop, lambda why: admission.drop(None, "another origin", why)):
+    with Front(listening, handed_on, stop, lambda kind, why: admission.drop(None, kind, why)):
         try:
             yield server, address_of(listening)
         finally:
@@ -162,7 +193,7 @@ def _checked(answer: Answer, admission: Admission, stops: bool, more: More) -> A
             return answer(connection, request)
         page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression
         assert page is not None
-        return _with((SECOND_STOP + HOLD_ENDS if stops else b"") + PREFERENCE + STATE_IN_SIGHT, page)
+        return _with((SECOND_STOP + HOLD_ENDS if stops else b"") + PREFERENCE + STATE_IN_SIGHT + TABS_IN_ONE_LINE, page)
 
     return check
 

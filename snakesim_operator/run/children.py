@@ -6,13 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from snakesim_hal import arithmetic
+from snakesim_hal.workers import start_worker
 
 STOP_LIMIT_S = 5.0
 LINES_SHOWN, LAST_BYTES = 15, 16384
@@ -25,8 +25,7 @@ class ProcessOutput:
     def __init__(self, pipe: int, keep: Callable[[bytes], object]) -> None:
         self._pipe, self._keep = pipe, keep
         self._last = b""
-        self._thread = threading.Thread(target=self._listen, name="words", daemon=True)
-        self._thread.start()
+        self._thread = start_worker("words", self._listen)
 
     def last(self) -> list[str]:
         """The last lines of its stdout and stderr, once it has ended."""

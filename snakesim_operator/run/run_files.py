@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.workers import start_worker
 
 MEMORY_BYTES = 8 * 2**20
 FILE_BYTES = 64 * 2**20  # of a log: a part that floods does not fill the disk
@@ -51,8 +52,7 @@ class RunFiles:
         self._handles: dict[str, int] = {}
         self._closing = False
         self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._work, name="files", daemon=True)
-        self._thread.start()
+        self._thread = start_worker("files", self._work, on_error=self._drop_task)
 
     def append(self, name: str, content: bytes) -> None:
         """Append to a file. With too much pending data, or in the file, it is lost."""
@@ -130,6 +130,15 @@ class RunFiles:
                 self._changed.notify_all()
         for handle in self._handles.values():
             os.close(handle)
+
+    def _drop_task(self, error: Exception) -> None:
+        """Drop the task whose attempt raised what no disk raises: it would be raised again, and hold up the others."""
+        with self._changed:
+            if self._tasks:
+                task = self._tasks.popleft()
+                self._waiting_bytes -= len(task.content)
+                self._lost = self._lost or f"{self.folder}: {task.name} was not written: {error}"
+            self._changed.notify_all()
 
     def _attempt(self, task: _Task) -> str:
         """Carry out a task; the unwritten rest of an append stays in it. Returns the error, or an empty text."""

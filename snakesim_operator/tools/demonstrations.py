@@ -50,9 +50,11 @@ class _Keyboard:
         threading.Thread(target=self._read, args=(lines,), daemon=True).start()
 
     def _read(self, lines: Iterator[str]) -> None:
-        for line in lines:
-            self._queue.put(line.strip().lower())
-        self._queue.put(None)
+        try:
+            for line in lines:
+                self._queue.put(line.strip().lower())
+        finally:  # also after bytes that are no text: whoever waits for a line must not wait for ever
+            self._queue.put(None)
 
     def interrupt(self) -> None:
         """As the end of the input."""

@@ -22,7 +22,7 @@ def ask_network(link: Link, limit_s: float) -> list[StopResult]:
     while True:
         try:
             with open_session(link, CONNECT_S) as session:
-                return _ask(session, link, limit_s)
+                return ask_session(session, link, limit_s)
         except NotConnectedError:
             if time.monotonic() > deadline or not _anybody(link):
                 return []
@@ -38,7 +38,8 @@ def _anybody(link: Link) -> bool:
         return False
 
 
-def _ask(session: Session, link: Link, limit_s: float) -> list[StopResult]:
+def ask_session(session: Session, link: Link, limit_s: float) -> list[StopResult]:
+    """Query all hosts over an open session; what it subscribes to stays subscribed until that session is closed."""
     names = [link.namespace] if link.namespace is not None else robots_on(session)
     prefix = "" if link.namespace is not None else "**/"
     answers: dict[str, list[Answer]] = {}

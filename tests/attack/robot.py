@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,9 +78,9 @@ def joined(run: Run) -> Stranger:
 
 
 @contextmanager
-def standing(home: Path, *arguments: str, name: str = "run") -> Iterator[Robot]:
-    """A robot of its own, armed."""
-    with running(home, *(arguments or STANDING), name=name) as run, joined(run) as operator:
+def standing(home: Path, *arguments: str, name: str = "run", inside: Sequence[str] = ()) -> Iterator[Robot]:
+    """A robot of its own, armed. inside: a prefix that runs it somewhere else."""
+    with running(home, *(arguments or STANDING), name=name, inside=inside) as run, joined(run) as operator:
         operator.recover()
         yield Robot(run, operator)
 
@@ -88,9 +88,10 @@ def standing(home: Path, *arguments: str, name: str = "run") -> Iterator[Robot]:
 class Victim:
     """One robot for many attacks: brought back after each, and replaced when it does not come back."""
 
-    def __init__(self, home: Path, *more: str) -> None:
-        """more: arguments of the run, beside those of a robot that stands still."""
+    def __init__(self, home: Path, *more: str, inside: Sequence[str] = ()) -> None:
+        """more: arguments of the run, beside those of a robot that stands still; inside: a prefix of its command."""
         self._home, self._arguments, self._stack = home, (*STANDING, *more), ExitStack()
+        self._inside = inside
         self._robot: Robot | None = None
         self._number = 0
 
@@ -105,7 +106,7 @@ class Victim:
         self._number += 1
         home = self._home / str(self._number)
         home.mkdir()
-        self._robot = self._stack.enter_context(standing(home, *self._arguments))
+        self._robot = self._stack.enter_context(standing(home, *self._arguments, inside=self._inside))
         return self._robot
 
     def close(self) -> None:

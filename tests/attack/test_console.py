@@ -1,4 +1,4 @@
-"""C1 to C7: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
+"""C1 to C8: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
 
 import socket
 import threading
@@ -13,6 +13,7 @@ from websockets.exceptions import InvalidStatus
 
 from tests.attack.command import address
 from tests.attack.effort import Record, effort
+from tests.attack.means.floods import half_sent
 from tests.attack.means.page import CAMERA, STOP, Page, ask, flood
 from tests.attack.robot import Robot, Victim
 from tests.harness.processes import processes_of
@@ -20,13 +21,15 @@ from tests.harness.wait import wait_until
 
 STOP_S = 60.0  # from a click to the stop; far above what it takes
 FLOOD_S = float(effort(2, 20))
+FILES = 1024  # that each process of the robot may open
+FLOODED_STOP_S = 5.0  # what is promised for a stop while requests flood the console; it takes some 0.02 s
 MOST_MB = 80.0  # that a flood may cost the console
 REFUSED = ("http://evil.example", "null", "http://localhost:9", "http://127.0.0.1:9", "file://", "https://localhost")
 
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Victim]:
-    kept = Victim(tmp_path_factory.mktemp("shown"), "--console")
+    kept = Victim(tmp_path_factory.mktemp("shown"), "--console", inside=("prlimit", f"--nofile={FILES}:{FILES}"))
     yield kept
     kept.close()
 
@@ -208,4 +211,32 @@ def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, rec
         assert answers[0][0] == 200 and "planar13: stopped" in answers[0][1]
     record_property("stopped after", f"{1000 * took_s:.0f} ms from POST /stop")
     assert 'id = "second-stop"' in ask(at, "GET", "/")[1] and ask(at, "GET", "/")[0] == 200
+    robot.unharmed(health)
+
+
+def test_c8_half_sent_requests_of_several_processes_cost_nobody_the_stop(
+    robot: Robot, at: str, record_property: Record
+) -> None:
+    """With more of them than the console may open files, by all of its stops, during the flood and after it."""
+    health = robot.health()
+    with Page(at) as page, Page(at, draws=False) as without_scene:
+        ways: dict[str, Callable[[], object]] = {
+            "the page's button": lambda: page.click(STOP),
+            "the button of a page without WebGL": lambda: without_scene.click(STOP),
+            "POST /stop": lambda: ask(at, "POST", Origin=at),
+        }
+        page.find(STOP)
+        without_scene.find(STOP)
+        with half_sent(at, count=2000, processes=3):
+            for name, act in ways.items():
+                took_s = stops(robot, act)
+                record_property(f"stopped in the flood by {name}", f"after {1000 * took_s:.0f} ms")
+                assert took_s < FLOODED_STOP_S, name
+                robot.operator.recover()
+            wait_until(lambda: ask(at, "GET") == (200, "ready"), "a second stop that has tested itself", 10.0)
+        for name, act in ways.items():
+            assert stops(robot, act) < FLOODED_STOP_S, name
+            robot.operator.recover()
+        with Page(at) as late:
+            late.find(STOP)
     robot.unharmed(health)

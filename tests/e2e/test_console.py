@@ -21,6 +21,7 @@ from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, running
 from tests.harness.processes import nothing_left, processes_of
 from tests.harness.wait import wait_until
+from tests.unit.operator.console.rig import ReadyStop
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
@@ -72,7 +73,7 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
 
 def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
-    with page_server(open_port(None), stop=lambda: "stopped") as (server, address), chromium() as browser:
+    with page_server(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, None, Log(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
@@ -91,7 +92,7 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
 
 def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_the_panel() -> None:
     config = load("triplet").config
-    with page_server(open_port(None), stop=lambda: "stopped") as (server, address), chromium() as browser:
+    with page_server(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, None, Log(), recorded="a run").show(expected_of(config))
         page = browser.open(address, 400, 800, 0.5)
         page.wait_for("planar13")

@@ -14,6 +14,7 @@ from tests.e2e.test_checked import home
 from tests.e2e.test_console_keys import LIMIT_S, until
 from tests.e2e.test_jog import BACKEND, stopped, told
 from tests.e2e.test_jog import home as bench
+from tests.harness.stalling_relay import StallingRelay
 from tests.viewer import Viewer, viewing
 from tests.whole.command import snakesim
 
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.e2e
 REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
 RUN = (*REAL, "--stay", "--duration", "36000", "--console", "--no-record")
 FORWARDS, HOLD_HZ = "Hold: forwards (+)", 20.0
+HELD_IN_STALL, LIFTED_S = 40, 0.6  # messages, and more than a held button may be old
 __all__ = ["bench", "home"]
 
 
@@ -63,7 +65,8 @@ def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench:
 
 
 async def commission(address: str, home: Path, endpoint: str) -> None:
-    async with viewing(address) as socket:
+    host_name, _, port = address.removeprefix("http://").rpartition(":")
+    async with StallingRelay(host_name, int(port)) as relay, viewing(f"http://127.0.0.1:{relay.port}") as socket:
         viewer = Viewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
@@ -83,7 +86,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         assert robot(home).joint_table[0].drive.zero_rad == pytest.approx(0.0, abs=1e-3)
 
         await viewer.choose("Step", "jog")
-        while not await moved_and_stood(viewer, home):
+        while not await moved_and_stood(viewer, relay, home):
             why = snakesim("status", "--endpoint", endpoint, cwd=home).out
             assert "lease of control expired" in why, why  # this computer was busy for longer than a lease
             assert snakesim("clear", "--endpoint", endpoint, cwd=home).code == 0
@@ -101,8 +104,8 @@ async def armed(viewer: Viewer, home: Path) -> None:
     await until(lambda: told(home)["lifecycle"] != "disarmed", "armed")
 
 
-async def moved_and_stood(viewer: Viewer, home: Path) -> bool:
-    """Hold the button, let it go, end the step; False when the robot was stopped meanwhile."""
+async def moved_and_stood(viewer: Viewer, relay: StallingRelay, home: Path) -> bool:
+    """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
     await armed(viewer, home)
     await until(lambda: stopped(home) or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
     before = told(home)["target"][1]
@@ -116,6 +119,16 @@ async def moved_and_stood(viewer: Viewer, home: Path) -> bool:
     if stopped(home):
         return False
     assert told(home)["target"][1] == half["target"][1]
+    relay.stall()
+    for _ in range(HELD_IN_STALL):
+        await viewer.say(held)
+        await asyncio.sleep(1 / HOLD_HZ)
+    await asyncio.sleep(LIFTED_S)  # the finger is lifted, and only then does the network recover
+    relay.go_on()
+    await ticks(home, 50)
+    if stopped(home):
+        return False
+    assert told(home)["target"][1] == half["target"][1], "moved by what was held before the finger was lifted"
     await viewer.click("End step")
     await until(lambda: viewer.shows("<div>done"), "its end")
     await until(lambda: told(home)["lifecycle"] == "disarmed", "a robot without current")

@@ -40,6 +40,23 @@ def flood(
         yield started
 
 
+@contextmanager
+def half_sent(console: str, count: int, processes: int) -> Iterator[None]:
+    """Half-sent HTTP requests at a console, so many of each process, held open for as long as the context lives."""
+    host, port = address(console.replace("http://", "tcp/"))
+    command = [sys.executable, "-m", "tests.attack.means.half_sent", host, str(port), str(count)]
+    with contextlib.ExitStack() as stack:
+        started: list[subprocess.Popen[bytes]] = []
+        for _ in range(processes):
+            process = subprocess.Popen(command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            started.append(stack.enter_context(process))
+            stack.callback(process.kill)
+        for process in started:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith(b"ready")
+        yield
+
+
 def end(process: subprocess.Popen[bytes]) -> None:
     """At once; what it had on the network goes with it."""
     process.kill()

@@ -33,8 +33,11 @@ STOP = "EMERGENCY STOP  (Esc)"
 class Page:
     """One viewer. A context manager."""
 
-    def __init__(self, address: str, origin: str | None = None) -> None:
-        """address: http://...; origin: of the page. Raises InvalidStatus when it is refused."""
+    def __init__(self, address: str, origin: str | None = None, *, draws: bool = True) -> None:
+        """address: http://...; origin: of the page. Raises InvalidStatus when it is refused.
+
+        draws: whether it has a scene; one without WebGL does not say where its camera is.
+        """
         self._socket = connect(
             address.replace("http", "ws"),
             origin=None if origin is None else Origin(origin),
@@ -48,7 +51,8 @@ class Page:
         self.closed_by: int | None = None
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.say(CAMERA)
+        if draws:
+            self.say(CAMERA)
 
     def __enter__(self) -> "Page":
         return self
