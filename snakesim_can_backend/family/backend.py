@@ -44,7 +44,9 @@ class CanDriveBackend(FamilyBackend):
 
     Settings: ClassVar[type[Any]]  # `CanDriveSettings`
     a_drive: ClassVar[str]  # what the family calls one, in the plural
+    first_id: ClassVar[int] = 0
     last_id: ClassVar[int]
+    reserved_ids: ClassVar[str]  # what the ids beyond these are, for a message
     traffic: ClassVar[Traffic]
     # (joints of the family, settings, joints of the bus, wire, readings, and the kit's arguments by name)
     drives: ClassVar[Callable[..., CanDrives]]
@@ -71,9 +73,10 @@ class CanDriveBackend(FamilyBackend):
         for channel in settings.channels:
             check_channel(channel, fd=settings.fd_rate is not None)
         for joint in joints:
-            if joint.id > cls.last_id:
+            if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
-                    f"{who(config, joint)}: `id` = {joint.id}; {cls.a_drive} have ids of 0 to {cls.last_id}"
+                    f"{who(config, joint)}: `id` = {joint.id}, and {cls.a_drive} have ids of {cls.first_id} to "
+                    f"{cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as `id` of the joint"
                 )
             cls.check_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.every_ticks

@@ -94,7 +94,7 @@ class Axes(CanDrives):
                 if values[4:6] == FIRMWARE:  # 0.5 would take the question for a new node id
                     self._ask(i, Message.ADDRESS)
             case Message.ADDRESS:
-                readings.identified(i, serial=f"{int.from_bytes(values[1], 'little'):012X}")
+                self.note_serial(i, f"{int.from_bytes(values[1], 'little'):012X}")
             case _:
                 pass
 
@@ -117,8 +117,8 @@ class Axes(CanDrives):
         return self._ask(i, Message.MOTION, Message.CURRENT)
 
     def ask_health(self, i: int) -> None:
-        """Three questions."""
-        self._ask(i, Message.SUPPLY, Message.TEMPERATURE, Message.ERROR)
+        """Supply, temperatures and errors; and the serial number, to notice a second axis of its id."""
+        self._ask(i, Message.SUPPLY, Message.TEMPERATURE, Message.ERROR, Message.ADDRESS)
 
     def set_point(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
         """An input; before it limits, after it gains and mode, if they change."""

@@ -23,8 +23,9 @@ class OdriveBackend(CanDriveBackend):
 
     Settings, drives, twin = OdriveSettings, Axes, OdriveTwin
     name, a_drive, last_id, says_every_s = "odrive", "axes", LAST_NODE, HEARTBEAT_US * 1e-6
-    # A tick is two questions, two answers and an input; of one axis three questions more. Then heartbeats.
-    traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
+    reserved_ids = "63 is the broadcast address"
+    # A tick is two questions, two answers and an input; of one axis four questions more. Then heartbeats.
+    traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 0, 8, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
 
     @classmethod
     def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:

@@ -18,6 +18,7 @@ HEARTBEAT_US = 100_000.0
 COUNTS = 16384  # of the encoder, a turn
 VERSION = (2, 4, 4, 58, 0, 6, 11, 0)
 FIRST_SERIAL = 0x3855_0000_0001
+OTHER_SERIAL = 0x0000_0100_0000  # the difference of a second axis with the same id
 MODES = {Control.TORQUE: Mode.TORQUE, Control.VELOCITY: Mode.VELOCITY, Control.POSITION: Mode.POSITION}
 
 
@@ -52,6 +53,14 @@ class OdriveTwin(CanTwin):
     def addressee(self, frame: Frame) -> int:
         """Its node."""
         return parted(frame)[0]
+
+    def of_second(self, frame: Frame) -> Frame:
+        """Its own serial number in the address."""
+        if parted(frame)[1] != Message.ADDRESS or not frame.data:
+            return frame
+        node, serial, connection = PAYLOADS[Message.ADDRESS].unpack(frame.data)
+        other = int.from_bytes(serial, "little") ^ OTHER_SERIAL
+        return write(node, Message.ADDRESS, node, other.to_bytes(6, "little"), connection)
 
     def restart(self, i: int) -> None:
         """Settings are lost."""
