@@ -81,6 +81,19 @@ class CanDrives(ABC):
     def identify(self, i: int) -> None:
         """Ask for firmware and state."""
 
+    def identified(self, i: int) -> bool:
+        """Whether a drive has said all that the bring-up asks it for."""
+        return bool(self.firmware[i])
+
+    def begin_anew(self) -> None:
+        """Forget what drives said before, as a bring-up begins."""
+        self.firmware = [()] * len(self.nodes)
+        self._serials = [[] for _ in self.nodes]
+
+    @abstractmethod
+    def give_back(self, i: int) -> None:
+        """At the end: write back settings of a drive that this driver has changed, and that the next one reads."""
+
     @abstractmethod
     def unfit(self, i: int) -> str:
         """Why a drive that said its firmware cannot be used; empty if it can."""
@@ -118,9 +131,8 @@ class CanDrives(ABC):
     def bring_up(self) -> None:
         """Firmware, then settings; every drive is idle, and stays so."""
         everybody = range(len(self.nodes))
-        self.firmware = [()] * len(self.nodes)
-        self._serials = [[] for _ in everybody]
-        self._await(lambda i: bool(self.firmware[i]), self.identify)
+        self.begin_anew()
+        self._await(self.identified, self.identify)
         self._listen_on()
         wrong = [f"  {self.following.drives[i].who} {why}" for i in everybody for why in self._objections(i)]
         if self._others:
@@ -209,6 +221,7 @@ class CanDrives(ABC):
         for i in range(len(self.nodes)) if self._ours else ():
             try:
                 self.tell(i, "idle")
+                self.give_back(i)
             except BackendError:
                 continue
         try:

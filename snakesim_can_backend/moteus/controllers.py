@@ -147,6 +147,9 @@ class Controllers(CanDrives):
     def forgive(self, i: int) -> None:
         """Nothing: an expired watchdog ends when it is told to be idle."""
 
+    def give_back(self, i: int) -> None:
+        """Nothing: limits are part of each command."""
+
     def clear_errors(self, i: int) -> None:
         """Stopped: it clears faults, too."""
         self._send(i, part(WRITE, INT8, Register.MODE, Mode.STOPPED))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from snakesim_hal.errors import BackendError
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.packets import Packet
+from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
@@ -18,6 +18,7 @@ GARBLED = (
     "a second servo has its id, or the line is disturbed; give each servo its own id, one after the other alone on the "
     "bus, and check cables and terminators"
 )
+TORQUE_AT_START = 0x01
 READS = 3  # to tell a second servo from a single disturbance
 MEASURED = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos differ: position, voltage, temperature
 KEPT = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}  # written only where it differs: it wears out
@@ -106,6 +107,16 @@ def _unfit(servo: Servo, said: Packet | None, kept: Packet | None, settings: Dyn
         return (
             f"has drive mode {drive_mode} and homing offset {offset}; both must be 0, as direction and zero are those "
             f"of the robot file (`sign`, `zero_rad`)"
+        )
+    if (secondary_id := kept.data[at.SECONDARY_ID]) <= LAST_ID:
+        return (
+            f"has the secondary id {secondary_id} (register {at.SECONDARY_ID}), and would take the set-points of that "
+            f"id, too: set it to 255, which is off"
+        )
+    if kept.data[at.STARTUP] & TORQUE_AT_START:
+        return (
+            f"has startup configuration {kept.data[at.STARTUP]} (register {at.STARTUP}): it switches its torque on "
+            f"when it starts, before the driver has found it. Clear bit 0"
         )
     servo.unit_nm = current_a * servo.constant
     (servo.most_current,) = _unpacked("<H", kept, at.CURRENT_LIMIT)

@@ -26,6 +26,7 @@ from snakesim_serial_backend.wire import Pty
 MODEL, FIRMWARE = 1120, 46  # XM540-W270
 CURRENT_A = 0.00269
 MOST_CURRENT = 2047
+PWM_LIMIT, MOST_PWM = 36, 885
 FACTORY_DELAY = 250  # of an answer, in 2 us
 ELSEWHERE_COUNTS = 1000  # how far from a servo a second one with its id is
 SHUTDOWN, SHUTDOWN_BY = 63, 0x34  # overload, electrical shock, overheating
@@ -81,6 +82,8 @@ class DynamixelTwin(DriveTwin):
             servo.put("H", at.MODEL, MODEL)
             servo.table[6], servo.table[7], servo.table[8] = FIRMWARE, joint.id, at.RATE[baud]
             servo.table[at.DELAY], servo.table[at.OPERATING_MODE], servo.table[13] = FACTORY_DELAY, 3, 2
+            servo.table[at.SECONDARY_ID] = 255
+            servo.put("H", PWM_LIMIT, MOST_PWM)
             servo.table[31], servo.table[SHUTDOWN] = 80, SHUTDOWN_BY
             servo.put("H", at.LEAST_VOLTAGE, round(joint.limits.least_voltage_v / at.VOLTS))
             servo.put("H", at.CURRENT_LIMIT, MOST_CURRENT)

@@ -174,6 +174,8 @@ def test_a_joint_that_was_lost_while_armed_is_left_alone_until_it_is_used_again(
 def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_one_begins_anew(
     robot: Robot,
 ) -> None:
+    """With the joint's own torque limit: a lower one that an ODrive has kept is in odrive/test_limits.py."""
+    robot.limit_nm = robot.config.robot.limits.torque_nm
     robot.run(20, "armed")
     robot.backend._clock.robot_ns += 190_000_000
     robot.twin()

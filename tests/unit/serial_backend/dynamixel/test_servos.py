@@ -113,6 +113,25 @@ def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_sta
         assert expected in words, words
 
 
+@pytest.mark.parametrize(
+    ("register", "value", "words"),
+    [
+        (at.SECONDARY_ID, 1, r"has the secondary id 1 \(register 12\), .*: set it to 255, which is off"),
+        (
+            at.STARTUP,
+            3,
+            r"has startup configuration 3 \(register 60\): it switches its torque on when it starts, .*bit 0",
+        ),
+    ],
+)
+def test_a_servo_that_would_move_by_what_is_not_its_own_is_refused(
+    robot: Robot, register: int, value: int, words: str
+) -> None:
+    robot.twin.servos[2].table[register] = value
+    with pytest.raises(BackendError, match=rf"(?s)nothing was enabled.*joint_3 .*{words}"):
+        drives_of(robot.backend).bring_up()
+
+
 def test_a_servo_outside_of_its_travel_is_refused() -> None:
     elsewhere = DynamixelSettings(plant="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
     with pytest.raises(BackendError, match=r"joint_1 .*: woke up at .* rad, which no number of whole turns"):
