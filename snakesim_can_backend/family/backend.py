@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
-from snakesim_can_backend.bus.adapter import check_channel, is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import VirtualWire, Wire, virtual_channel
 from snakesim_can_backend.bus.load import mbit, worst_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
@@ -70,8 +70,7 @@ class CanDriveBackend(FamilyBackend):
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
         """Channels, ids, load, and what the family adds."""
-        for channel in settings.channels:
-            check_channel(channel, fd=settings.fd_rate is not None)
+        check_channels(settings.channels, fd=settings.fd_rate is not None)
         for joint in joints:
             if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
