@@ -1,6 +1,7 @@
 """`snakesim can`: bus load of a configuration, modules that answer on a bus, a log replayed, the expanded DBC file."""
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from math import ceil
 from pathlib import Path
@@ -22,10 +23,11 @@ from snakesim_can_backend.bus.load import (
     reports_of,
     what_fits,
 )
+from snakesim_can_backend.bus.read_log import BusLog
 from snakesim_can_backend.bus.strangers import Stranger, strangers
 from snakesim_can_backend.driver.bring_up import Bus, Identity, find
 from snakesim_can_backend.driver.modules import answer_limit_s
-from snakesim_can_backend.driver.offline import Replay, against_record, messages
+from snakesim_can_backend.driver.offline import Replay, against_record
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
@@ -33,6 +35,7 @@ from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.arguments import number
 from snakesim_hal.drivers.mounting import Mounting
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
@@ -42,6 +45,7 @@ from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.terminal import aligned, say
 
 OK, FAILED = 0, 1
+MODULES = "can"  # the backend of joint modules
 LISTEN_S = 0.3  # for others on a bus; most devices say something five times a second or more
 MAX_RATE_HZ = 5000  # of a scenario
 COLUMNS = (
@@ -222,15 +226,24 @@ def _row(identity: Identity, reading: Reading) -> dict[str, str]:
 
 def _replay(arguments: argparse.Namespace) -> int:
     loaded = load_scenario(str(arguments.run / "config.json"), [])
+    if loaded.config.backend != MODULES:
+        raise ConfigError(
+            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim can replay` reads "
+            f"the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run"
+        )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)
     mounting, limit_s = Mounting(loaded.config.robot.joint_table), answer_limit_s(loaded.config, settings)
     done = Replay(mounting, reports_of(loaded.config, settings), limit_s)
-    done.take(messages(arguments.log))
+    log = BusLog(arguments.log)
+    done.take(log)
     if not done.joints:
-        say(f"{arguments.log}: {done.frames} frames, and no Sync among them: the log of another bus")
+        found = f"{done.frames} frames, and no Sync among them: the log of another bus"
+        say(f"{arguments.log}: {found}{looks(done.foreign)}")
         return FAILED
     say(f"{arguments.log}: {done.frames} frames, {len(done.joints)} Syncs")
+    for line in log.report():
+        say(f"  {line}")
     for name, silent in zip(layout.joints, done.silent, strict=True):
         if silent:
             say(f"  {name} did not answer {silent} Syncs in time")
@@ -242,6 +255,16 @@ def _replay(arguments: argparse.Namespace) -> int:
         return FAILED
     say(f"joint states of {verdict.compared} ticks are those of the record, to the bit")
     return OK
+
+
+def looks(foreign: Counter[str]) -> str:
+    """Return whose the frames look like that are none of joint modules; empty if that is not known."""
+    kinds: Counter[str] = Counter()
+    for looks_as, count in foreign.items():
+        kinds[looks_as.partition(" of node")[0].removeprefix("as ")] += count
+    del kinds[""]
+    [(kind, count)] = kinds.most_common(1) or [("", 0)]
+    return f"; {count} frames look like {kind}" if count else ""
 
 
 # --- expand ------------------------------------------------------------------------------------------------

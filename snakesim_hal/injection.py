@@ -93,9 +93,9 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
         "counter": Kind("joint states with a wrong count", ("module",)),
         "checksum": Kind("joint states with a wrong checksum", ("module",)),
         "duplicate": Kind(
-            "a second module with the same node id is on the bus",
+            "a second module or drive with the same id is on the bus",
             ("module",),
-            in_module="a second module with the same node id and another serial is on the bus",
+            in_module="a second module or drive with the same id and another serial number is on the bus",
         ),
         "overheat": Kind(
             "its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given", ("module",)

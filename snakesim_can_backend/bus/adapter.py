@@ -6,9 +6,13 @@ kernel interface has that of `ip link`. A bus of CAN FD has a second bit rate, f
 with ids of 11 or 29 bits.
 """
 
+import contextlib
 import math
+import os
+import socket
+import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import can
@@ -21,6 +25,36 @@ from snakesim_hal.errors import BackendError, ConfigError, did_you_mean
 
 LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
 FD = ("socketcan", "kvaser", *LOCAL)
+GROUPS_ARE_SEPARATE = sys.platform == "linux"
+IP_MULTICAST_ALL, IPV6_MULTICAST_ALL = 49, 29  # linux/in.h, linux/in6.h
+# A library that is missing or too old makes python-can's interfaces raise any of these.
+LIBRARY_ERRORS = (ImportError, TypeError, NameError, AttributeError, NotImplementedError)
+SERIAL_PORT = "a serial port, such as /dev/ttyACM0: see `snakesim doctor`"
+OF_KERNEL = "with the kernel's own driver the adapter is an interface such as can0"
+WINDOWS = "Windows, and its vendor's driver"
+NEEDS = {
+    "canalystii": "the Python package canalystii",
+    "cantact": "the Python package cantact",
+    "etas": WINDOWS,
+    "gs_usb": f"the Python packages gs_usb and pyusb; {OF_KERNEL}",
+    "iscan": WINDOWS,
+    "ixxat": WINDOWS,
+    "kvaser": f"Kvaser's library canlib; {OF_KERNEL}",
+    "neousys": "the library of Neousys, libwdt_dio",
+    "neovi": "the Python packages python-ics and filelock",
+    "nican": WINDOWS,
+    "nixnet": WINDOWS,
+    "pcan": f"PEAK's library PCANBasic; {OF_KERNEL}",
+    "robotell": SERIAL_PORT,
+    "seeedstudio": SERIAL_PORT,
+    "serial": SERIAL_PORT,
+    "slcan": SERIAL_PORT,
+    "socketcan": "an interface of the kernel, such as can0",
+    "socketcand": "a host and a port, which a channel cannot say; use another interface",
+    "systec": WINDOWS,
+    "usb2can": WINDOWS,
+    "vector": WINDOWS,
+}
 POLL_S = 0.0005  # of an adapter that cannot be waited for
 
 
@@ -47,6 +81,23 @@ def check_channel(channel: str, *, fd: bool = False) -> None:
         )
     if interface == "socketcan":
         check_interface(name)
+
+
+def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
+    """Check every channel of a robot, and that each is another bus. Raises ConfigError."""
+    first: dict[tuple[str, str], str] = {}
+    for channel in channels:
+        check_channel(channel, fd=fd)
+        bus = _parted(channel)
+        if bus in first:
+            raise ConfigError(f"channels: {first[bus]!r} and {channel!r} are the same bus; name each bus once")
+        first[bus] = channel
+    groups = [channel for channel in channels if _parted(channel)[0] == "udp_multicast"]
+    if len(groups) > 1 and not GROUPS_ARE_SEPARATE:
+        raise ConfigError(
+            f"channels: {', '.join(groups)} share one UDP port, and only Linux keeps their groups apart: name one of "
+            f"them"
+        )
 
 
 def is_emulated(channel: str) -> bool:
@@ -82,9 +133,29 @@ def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> c
     if fd and "bitrate" in settings:
         settings["data_bitrate"] = data_bit_rate
     try:
-        return can.Bus(interface=interface, channel=name, **settings)
-    except (*IO_ERRORS, ImportError, TypeError) as error:  # the last two: of a library that is missing, or too old
-        raise BackendError(f"{channel}: cannot be opened: {error}") from error
+        bus = can.Bus(interface=interface, channel=name, **settings)
+    except (*IO_ERRORS, *LIBRARY_ERRORS) as error:
+        needs = f"; {interface} needs {NEEDS[interface]}" if interface in NEEDS else ""
+        why = "its library is missing" if isinstance(error, NameError | AttributeError) else str(error)
+        raise BackendError(f"{channel}: cannot be opened: {why}{needs}") from error
+    if interface == "udp_multicast":
+        hear_own_group(bus)
+    return bus
+
+
+def hear_own_group(bus: can.BusABC) -> None:
+    """Receive what is sent to the group of this bus, and to no other one.
+
+    All such buses share one port. By default the kernel gives a socket the datagrams of every group that any socket of
+    the computer has joined.
+    """
+    with socket.socket(fileno=os.dup(bus.fileno())) as own:
+        if own.family == socket.AF_INET:
+            level, option = socket.IPPROTO_IP, IP_MULTICAST_ALL
+        else:
+            level, option = socket.IPPROTO_IPV6, IPV6_MULTICAST_ALL
+        with contextlib.suppress(OSError):  # not on Linux: `check_channels` refuses a second bus
+            own.setsockopt(level, option, 0)
 
 
 class AdapterWire:

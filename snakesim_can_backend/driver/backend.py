@@ -1,6 +1,6 @@
 """The backend `can`: joint modules as a family of the driver kit, with sensors of their own."""
 
-from snakesim_can_backend.bus.adapter import check_channel
+from snakesim_can_backend.bus.adapter import check_channels
 from snakesim_can_backend.bus.load import check_load, reports_of
 from snakesim_can_backend.driver.modules import Modules
 from snakesim_can_backend.driver.own_twins import check_faults, check_twins
@@ -40,8 +40,7 @@ class CanBackend(DriveBackend):
         check_pose(config, settings.pose_listen)
         check_twins(config, settings)
         check_faults(config, settings)
-        for channel in settings.channels:
-            check_channel(channel)
+        check_channels(settings.channels)
         return ("realtime",) if settings.twins_run == "none" else ("lockstep", "realtime")
 
     def __init__(self, config: RunConfig, settings: CanSettings) -> None:

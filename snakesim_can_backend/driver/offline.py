@@ -4,23 +4,25 @@ A tick begins at its Sync. Its sample is taken when all awaited modules have ans
 been waited for. Frames that were received together have one time in the log, and are read together here.
 """
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
 
 import can
 import numpy as np
 
 from snakesim_can_backend.bus.load import Reports
+from snakesim_can_backend.bus.strangers import is_ours, whose
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import contacts_due, joint_values
+from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, opcode_of
 from snakesim_hal.arrays import Floats
 from snakesim_hal.drivers.mounting import Mounting
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.record.black_box import Layout
 
+SYNC_BYTES = codec()[Opcode.SYNC].length
 BRING_UP_SYNCS = 64  # before the first tick, at most
 VALUES = ("angle_rad", "velocity_rad_s", "torque_nm")
 
@@ -33,6 +35,7 @@ class Replay:
         self._mounting = mounting
         self.reading = Reading(len(mounting.sign))
         self.frames = 0
+        self.foreign: Counter[str] = Counter()  # frames that are none of the protocol, by whose they look like
         self.joints: list[Floats] = []  # by Sync: angle, velocity and torque, (3, n_joints)
         self.silent = [0] * len(mounting.sign)  # Syncs that a joint did not answer in time
         self._reports, self._answer_limit_s = reports, answer_limit_s
@@ -45,40 +48,33 @@ class Replay:
                 self._sample()
             for message in together:
                 self.frames += 1
+                self.foreign[whose(message)] += not is_ours(message)
                 if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
                     self._take(Frame(message.arbitration_id, bytes(message.data)), time_s)
             if self._open_until_s is not None and self.reading.complete:
                 self._sample()
-        if self._open_until_s is not None:
-            self._sample()
+        # The log may end in the middle of a tick: what is missing of the last Sync's answers is not known.
 
     def _take(self, frame: Frame, time_s: float) -> None:
         opcode = opcode_of(frame.id)
         if opcode not in FROM_HOST:
             self.reading.take(frame)
-        elif opcode == Opcode.SYNC and frame.data[:1] != bytes([self.reading.sync & 0xFF]):  # not one of another bus
-            if self._open_until_s is not None:
-                self._sample()
-            number = self.reading.sync + 1
-            self.reading.begin(number, contacts=contacts_due(self._reports, number), tail=self._reports.tail)
-            self._open_until_s = time_s + self._answer_limit_s
+            return
+        if opcode != Opcode.SYNC or len(frame.data) != SYNC_BYTES:
+            return
+        if frame.data[0] == self.reading.sync & 0xFF:  # the same Sync, on another bus
+            return
+        if self._open_until_s is not None:
+            self._sample()
+        number = self.reading.sync + 1
+        self.reading.begin(number, contacts=contacts_due(self._reports, number), tail=self._reports.tail)
+        self._open_until_s = time_s + self._answer_limit_s
 
     def _sample(self) -> None:
         self.joints.append(joint_values(self.reading, self._mounting))
         for joint, module in enumerate(self.reading.modules):
             self.silent[joint] += module.sync != self.reading.sync
         self._open_until_s = None
-
-
-def messages(path: Path) -> Iterator[can.Message]:
-    """Every frame of a log: `.log` of candump, `.asc`, `.blf`. Raises ConfigError."""
-    try:
-        with can.LogReader(path) as log:
-            yield from log
-    except Exception as error:  # noqa: BLE001 - a damaged file makes python-can's readers raise almost anything
-        raise ConfigError(
-            f"{path} cannot be read as a log of a CAN bus (.log, .asc, .blf): {str(error)[:200]}"
-        ) from None
 
 
 @dataclass(frozen=True)

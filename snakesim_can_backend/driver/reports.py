@@ -15,6 +15,8 @@ from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import (
     COUNTS,
     FROM_HOST,
+    MAX_UPTIME_MS,
+    UPTIME_RANGE_MS,
     Action,
     Frame,
     LastStop,
@@ -256,7 +258,7 @@ class Reading:
         goes_on = 0 <= uptime_ms - module.uptime_ms < ONE_CLOCK_MS
         if module.went_back and goes_on and uptime_ms < module.uptime_before_ms:
             module.restarts += 1
-        module.went_back = uptime_ms < module.uptime_ms
+        module.went_back = uptime_ms < module.uptime_ms and not has_wrapped(module.uptime_ms, uptime_ms)
         module.uptime_before_ms, module.uptime_ms = module.uptime_ms, uptime_ms
         module.heartbeat_sync = self.sync
         module.faults = sum(bit << i for i, bit in enumerate(bits))
@@ -275,3 +277,15 @@ class Reading:
     def _take_health(self, module: Module, frame: Frame) -> None:
         self._health[module.node - 1] = self._read_health(frame.data)
         module.health_sync = self.sync
+
+
+def has_wrapped(before_ms: int, now_ms: int) -> bool:
+    """Return whether an uptime went on from 0 because its 32 bits were full, after 49.7 days.
+
+    The protocol forbids that, but a firmware that does so must not stop the robot: such a module goes on, and a restart
+    of it in that third of a second would show in its state. An uptime at the end of its range has stayed there, as the
+    protocol demands; from there a lower one is a restart.
+    """
+    if before_ms >= MAX_UPTIME_MS:
+        return False
+    return (now_ms - before_ms) % UPTIME_RANGE_MS < ONE_CLOCK_MS

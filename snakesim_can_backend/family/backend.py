@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
-from snakesim_can_backend.bus.adapter import check_channel, is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import VirtualWire, Wire, virtual_channel
 from snakesim_can_backend.bus.load import mbit, worst_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
@@ -44,7 +44,9 @@ class CanDriveBackend(FamilyBackend):
 
     Settings: ClassVar[type[Any]]  # `CanDriveSettings`
     a_drive: ClassVar[str]  # what the family calls one, in the plural
+    first_id: ClassVar[int] = 0
     last_id: ClassVar[int]
+    reserved_ids: ClassVar[str]  # what the ids beyond these are, for a message
     traffic: ClassVar[Traffic]
     # (joints of the family, settings, joints of the bus, wire, readings, and the kit's arguments by name)
     drives: ClassVar[Callable[..., CanDrives]]
@@ -68,12 +70,12 @@ class CanDriveBackend(FamilyBackend):
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
         """Channels, ids, load, and what the family adds."""
-        for channel in settings.channels:
-            check_channel(channel, fd=settings.fd_rate is not None)
+        check_channels(settings.channels, fd=settings.fd_rate is not None)
         for joint in joints:
-            if joint.id > cls.last_id:
+            if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
-                    f"{who(config, joint)}: `id` = {joint.id}; {cls.a_drive} have ids of 0 to {cls.last_id}"
+                    f"{who(config, joint)}: `id` = {joint.id}, and {cls.a_drive} have ids of {cls.first_id} to "
+                    f"{cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as `id` of the joint"
                 )
             cls.check_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.every_ticks

@@ -7,7 +7,7 @@ from functools import partial
 
 import msgspec
 
-from snakesim_can_backend.bus.adapter import is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.family.backend import CanDriveBackend
@@ -51,6 +51,7 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
     for channel in settings.channels:
         if not is_emulated(channel):
             raise ConfigError(f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous")
+    check_channels(settings.channels, fd=settings.fd_rate is not None)
     config = msgspec.structs.replace(config, pace="realtime")
     wires = [open_wire(channel, None, settings.bit_rate, settings.fd_rate) for channel in settings.channels]
     twin = backend.twin_on(config, settings, wires, Clock(config), arguments.pose)

@@ -7,7 +7,7 @@ import struct
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_into, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
@@ -23,6 +23,7 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
 ASK_EVERY_S = 0.1  # in bring-up
+LISTEN_ON_S = 0.06  # after the last drive has answered: a second one with its id may answer later
 STRANGER_FRAMES = 3
 HOST = -1  # sender of a frame that only a host sends
 
@@ -55,6 +56,7 @@ class CanDrives(ABC):
         who = [f"{j.name} (node {j.id} on {wire.channel})" for j in joints]
         self.following = Following(who, says_every_ns, clock_ns)
         self.firmware: list[tuple[int, ...]] = [()] * len(joints)  # as drives say in bring-up
+        self._serials: list[list[str]] = [[] for _ in joints]  # that answer by a joint's id; the first is its own
         self._at = {node: i for i, node in enumerate(self.nodes)}
         self._answer_s, self._bring_up_s = answer_s, bring_up_s
         self._turn = 0  # whose health is asked for next
@@ -78,6 +80,19 @@ class CanDrives(ABC):
     @abstractmethod
     def identify(self, i: int) -> None:
         """Ask for firmware and state."""
+
+    def identified(self, i: int) -> bool:
+        """Whether a drive has said all that the bring-up asks it for."""
+        return bool(self.firmware[i])
+
+    def begin_anew(self) -> None:
+        """Forget what drives said before, as a bring-up begins."""
+        self.firmware = [()] * len(self.nodes)
+        self._serials = [[] for _ in self.nodes]
+
+    @abstractmethod
+    def give_back(self, i: int) -> None:
+        """At the end: write back settings of a drive that this driver has changed, and that the next one reads."""
 
     @abstractmethod
     def unfit(self, i: int) -> str:
@@ -116,9 +131,10 @@ class CanDrives(ABC):
     def bring_up(self) -> None:
         """Firmware, then settings; every drive is idle, and stays so."""
         everybody = range(len(self.nodes))
-        self._await(lambda i: bool(self.firmware[i]), self.identify)
-        reasons = [self.unfit(i) if self.firmware[i] else self.unheard for i in everybody]
-        wrong = [f"  {self.following.drives[i].who} {why}" for i, why in enumerate(reasons) if why]
+        self.begin_anew()
+        self._await(self.identified, self.identify)
+        self._listen_on()
+        wrong = [f"  {self.following.drives[i].who} {why}" for i in everybody for why in self._objections(i)]
         if self._others:
             raise BackendError("another program commands drives on this bus; end it first. Nothing was sent")
         if wrong:
@@ -136,6 +152,24 @@ class CanDrives(ABC):
             self.ask_health(i)
         self._receive()
         self._strangers.clear()
+
+    def _objections(self, i: int) -> Iterator[str]:
+        """Why the robot cannot be used with what answers by the id of a joint."""
+        if not self.firmware[i]:
+            yield self.unheard
+        elif why := self.unfit(i):
+            yield why
+        if len(self._serials[i]) > 1:
+            yield f"answers with {len(self._serials[i])} serial numbers, {self._both(i)}: give each drive its own id"
+
+    def _both(self, i: int) -> str:
+        return " and ".join(self._serials[i])
+
+    def note_serial(self, i: int, serial: str) -> None:
+        """Remember a serial number that answers by the id of a joint: two are two drives with one id."""
+        if serial not in self._serials[i]:
+            self._serials[i].append(serial)
+        self.readings.identified(i, serial=self._serials[i][0])
 
     def read(self) -> None:
         """Ask, and wait for those who answered lately."""
@@ -168,6 +202,7 @@ class CanDrives(ABC):
     def clear(self, joints: frozenset[int]) -> None:
         """Errors, and what a restart has lost; what a drive says of errors from now on is of after the clear."""
         self.following.forgive(joints)
+        self._serials = [serials[:1] for serials in self._serials]  # whether a second drive is still there
         for i in sorted(joints):
             self.clear_errors(i)
             self.set_up(i)
@@ -186,6 +221,7 @@ class CanDrives(ABC):
         for i in range(len(self.nodes)) if self._ours else ():
             try:
                 self.tell(i, "idle")
+                self.give_back(i)
             except BackendError:
                 continue
         try:
@@ -206,6 +242,10 @@ class CanDrives(ABC):
         for node, frames in self._strangers.items():
             if frames >= STRANGER_FRAMES:
                 found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
+        for i, serials in enumerate(self._serials):
+            if len(serials) > 1:  # it concerns all: nothing is known of where which of the two is
+                cause = f"{self.following.drives[i].who} is duplicated: serial numbers {self._both(i)} answer; "
+                found.append(Finding("duplicate_node", cause + "give each drive its own id", i))
         return [*found, *self.following.findings()]
 
     def take(self, frame: Frame) -> None:
@@ -225,6 +265,13 @@ class CanDrives(ABC):
     def _receive(self) -> None:
         for frame in self.wire.receive():
             self.take(frame)
+
+    def _listen_on(self) -> None:
+        """Receive for a while; not from emulated drives in this process once they have nothing more to say."""
+        end = time.monotonic() + LISTEN_ON_S
+        while (left_s := end - time.monotonic()) > 0 and wait([self.wire], left_s):
+            self._receive()
+        self._receive()
 
     def _await(self, done: Callable[[int], bool], ask: Callable[[int], object]) -> None:
         end, ask_at = time.monotonic() + self._bring_up_s, 0.0

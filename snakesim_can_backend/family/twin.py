@@ -1,8 +1,10 @@
 """Emulated drives of a family, at the other end of their buses, on a body that a plant moves."""
 
+import contextlib
 import struct
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
@@ -12,6 +14,8 @@ from snakesim_hal.drivers.twin_body import DriveTwin, TwinBody
 
 class CanTwin(DriveTwin):
     """All drives of a family on CAN."""
+
+    everybody: ClassVar[int] = -1  # the address of frames that every drive takes; -1: there is none
 
     def __init__(
         self, settings: DriveSettings, body: TwinBody, wires: Sequence[Wire], clock_ns: Callable[[], int]
@@ -39,16 +43,31 @@ class CanTwin(DriveTwin):
     def _act(self) -> None:
         for wire in self._ends:
             for frame in wire.receive():
-                i = self._at.get((id(wire), self.addressee(frame)))
-                if i is None or self.body.deaf(i):
-                    continue
-                try:
-                    self.take(i, frame)
-                except (ValueError, LookupError, struct.error):
-                    continue
+                for i in self._addressees(wire, frame):
+                    if self.body.deaf(i):
+                        continue
+                    with contextlib.suppress(ValueError, LookupError, struct.error):
+                        self.take(i, frame)
         self.body.advance_to((self._clock_ns() - self._start_ns) / 1000)
+
+    @abstractmethod
+    def of_second(self, frame: Frame) -> Frame:
+        """What a second drive with the same id sends beside a frame of the first one.
+
+        It gets the same commands, so only its serial number is its own.
+        """
+
+    def _addressees(self, wire: Wire, frame: Frame) -> list[int]:
+        node = self.addressee(frame)
+        if node == self.everybody:
+            return [i for i, one in enumerate(self.wires) if one is wire]
+        i = self._at.get((id(wire), node))
+        return [] if i is None else [i]
 
     def say(self, i: int, frame: Frame) -> None:
         """A frame of a drive, unless it is silent."""
-        if not self.body.silent(i):
-            self.wires[i].send(frame)
+        if self.body.silent(i):
+            return
+        self.wires[i].send(frame)
+        if self.body.is_doubled(i):
+            self.wires[i].send(self.of_second(frame))

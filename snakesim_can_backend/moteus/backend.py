@@ -9,9 +9,8 @@ from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSetting
 from snakesim_can_backend.family.command import run
 from snakesim_can_backend.family.traffic import Traffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
-from snakesim_can_backend.moteus.protocol import HOST_ID, LAST_ID
+from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_can_backend.moteus.twin import MoteusTwin
-from snakesim_hal.drivers.drive_settings import who
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -38,16 +37,11 @@ class MoteusBackend(CanDriveBackend):
     """A `snakesim_hal.backend.Backend` on moteus controllers, real or emulated."""
 
     Settings, drives, twin = MoteusSettings, Controllers, MoteusTwin
-    name, a_drive, last_id = "moteus", "controllers", LAST_ID
+    name, a_drive, first_id, last_id = "moteus", "controllers", HOST_ID + 1, LAST_ID
+    reserved_ids = f"{HOST_ID} is the host's, {BROADCAST_ID} the broadcast address"
     says_every_s = 0.05  # it says so whenever it is asked; but it takes a while to get ready
-    traffic = Traffic((5, 24, 48), (6, 24))  # question, answer, command; of one controller, its health
-
-    @classmethod
-    def check_joint(cls, config: RunConfig, settings: MoteusSettings, joint: Joint) -> None:
-        """Raise ConfigError for joints that no controller can be."""
-        if joint.id == HOST_ID:
-            where = who(config, joint)
-            raise ConfigError(f"{where}: `id` = {HOST_ID} is the host's; controllers have ids of 1 to {LAST_ID}")
+    # Question, answer and command; of one controller two questions more: its health, and its serial number.
+    traffic = Traffic((5, 24, 48), (6, 24, 3, 16))
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:

@@ -41,6 +41,8 @@ HEALTH = (
     part(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
     part(READ, FLOAT, Register.VOLTAGE, count=2),
 )
+SERIAL_WORDS = 3
+SERIAL = part(READ, INT32, Register.SERIAL, count=SERIAL_WORDS)
 
 
 class Controllers(CanDrives):
@@ -86,10 +88,14 @@ class Controllers(CanDrives):
             self.readings.warmed(i, said[Register.MOTOR_TEMPERATURE], said[Register.BOARD_TEMPERATURE])
         if Register.MAP_VERSION in said:
             self.firmware[i], self._home[i] = (int(said[Register.MAP_VERSION]),), int(said[Register.HOME_STATE])
+        if Register.SERIAL in said:
+            words = [int(said[Register.SERIAL + k]) & 0xFFFF_FFFF for k in range(SERIAL_WORDS)]
+            self.note_serial(i, "".join(f"{word:08X}" for word in reversed(words)))
 
     def identify(self, i: int) -> None:
-        """Version of its registers, reference of its position, mode."""
+        """Version of its registers, reference of its position, serial number, mode."""
         self._send(i, *IDENTITY, reply=True)
+        self._send(i, SERIAL, reply=True)
         self.ask(i)
 
     def unfit(self, i: int) -> str:
@@ -105,8 +111,9 @@ class Controllers(CanDrives):
         return self._send(i, *MOTION, reply=True)
 
     def ask_health(self, i: int) -> None:
-        """Power, temperatures, voltage."""
+        """Power, temperatures and voltage; and the serial number, to notice a second controller of its id."""
         self._send(i, *HEALTH, reply=True)
+        self._send(i, SERIAL, reply=True)
 
     def set_point(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """A command, which would also start it: so none to one that was restarted, or may be restarting."""
@@ -139,6 +146,9 @@ class Controllers(CanDrives):
 
     def forgive(self, i: int) -> None:
         """Nothing: an expired watchdog ends when it is told to be idle."""
+
+    def give_back(self, i: int) -> None:
+        """Nothing: limits are part of each command."""
 
     def clear_errors(self, i: int) -> None:
         """Stopped: it clears faults, too."""

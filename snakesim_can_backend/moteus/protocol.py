@@ -12,7 +12,8 @@ from typing import NamedTuple
 from snakesim_can_backend.protocol.definitions import Frame
 
 HOST_ID = 0
-LAST_ID = 127
+LAST_ID = 126
+BROADCAST_ID = 127  # every controller takes its frames
 REPLY_WANTED = 0x8000
 REGISTER_MAP = 5  # the version that this file is of
 WRITE, READ, REPLY, NOTHING = 0x00, 0x10, 0x20, 0x50  # high bits of a part
@@ -37,6 +38,7 @@ class Register(IntEnum):
     COMMAND = 0x020  # position, velocity, feed-forward torque, kp scale, kd scale, maximum torque; NaN: where it is
     WATCHDOG = 0x027  # s; then limits of velocity and acceleration, below 0: none
     MAP_VERSION = 0x102
+    SERIAL = 0x120  # three words of 32 bits, the lowest one first
 
 
 class Mode(IntEnum):

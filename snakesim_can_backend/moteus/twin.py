@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_can_backend.family.twin import CanTwin
-from snakesim_can_backend.moteus.controllers import TURN, configured
+from snakesim_can_backend.moteus.controllers import SERIAL_WORDS, TURN, configured
 from snakesim_can_backend.moteus.protocol import (
+    BROADCAST_ID,
     FLOAT,
     REGISTER_MAP,
     REPLY,
@@ -32,6 +33,8 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode as JointMode
 
 OVER_TEMPERATURE = 38
+OTHER_WORDS = 0x65115510, 0x30333636  # of all serial numbers, above the one that counts
+OTHER_SERIAL = 0x01_0000  # the difference of a second controller with the same id
 ROTOR = 1  # home state
 DEFAULTS = {0x20: 0.0, 0x21: 0.0, 0x22: 0.0, 0x23: 1.0, 0x24: 1.0, 0x25: math.nan, 0x27: 0.0}  # of a command
 STEPS = {  # an integer's unit, of 8, 16 and 32 bits; of the others 1
@@ -64,9 +67,21 @@ class MoteusTwin(CanTwin):
         self.controllers = [Controller(joint.id) for joint in body.joints]
         self._kp, self._kd = configured(everybody, settings)
 
+    everybody = BROADCAST_ID
+
     def addressee(self, frame: Frame) -> int:
         """Its destination."""
         return addresses(frame)[1]
+
+    def of_second(self, frame: Frame) -> Frame:
+        """Its own serial number, where the frame has one."""
+        answers: list[bytes] = []
+        for said in parts(frame.data):
+            values = list(said.values)
+            if said.register == Register.SERIAL:
+                values[0] = int(values[0]) ^ OTHER_SERIAL
+            answers.append(part(said.kind, said.type, said.register, *values))
+        return framed(*addresses(frame), *answers)
 
     def restart(self, i: int) -> None:
         """Stopped, and without a command."""
@@ -106,6 +121,8 @@ class MoteusTwin(CanTwin):
         angle, velocity, torque = self.body.shaft(i)
         motor_c, board_c = self.body.temperatures(i)
         voltage_v, current_a = self.body.supply(i)
+        if register - Register.SERIAL in range(SERIAL_WORDS):
+            return (i + 1, *OTHER_WORDS)[register - Register.SERIAL]
         known = {
             Register.MODE: self.controllers[i].mode,
             Register.POSITION: angle / TURN,

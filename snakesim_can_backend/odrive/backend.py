@@ -1,21 +1,46 @@
 """The backend `odrive`, and `snakesim odrives`, which emulates axes as a process."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+from msgspec import Meta
 
 from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.family.command import run
 from snakesim_can_backend.family.traffic import Traffic
-from snakesim_can_backend.odrive.axes import Axes
+from snakesim_can_backend.odrive.axes import READING, TWIN_CONSTANT, UNKNOWN_MAX_CURRENT_A, Axes, needed_current_a
+from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.twin import HEARTBEAT_US, OdriveTwin
 from snakesim_hal.drivers.drive_settings import who
+from snakesim_hal.drivers.mounted import Mounted
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
+Amperes = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "A"})]
+Seconds = Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})]
+TurnsPerSecond = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "turns/s"})]
+
+
+class MountedAxis(Mounted, frozen=True, kw_only=True):
+    """How an emulated axis is mounted and configured, where that is not what the robot file needs."""
+
+    current_soft_max_a: Amperes | None = None
+    watchdog_timeout_s: Seconds | None = None  # 0: its watchdog is off
+    vel_limit_turns_s: TurnsPerSecond | None = None
+
 
 class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
     """The scenario's `[backends.odrive]` section. `watchdog_s` is what the axes have in `watchdog_timeout`."""
+
+    # Files flat_endpoints.json that ODrive publishes with each firmware: one for each firmware and hardware on the bus.
+    # With them the driver reads watchdog, current and speed limits of every axis at the start. Empty: they are unknown.
+    endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
+    # The driver never sets a higher current limit. Default: what each axis is configured for; 1 A where it is unknown.
+    max_current_a: Amperes | None = None
+    mounted: Mapping[str, MountedAxis] = {}  # of emulated axes: joint -> how it is mounted and configured in truth
 
 
 class OdriveBackend(CanDriveBackend):
@@ -23,8 +48,9 @@ class OdriveBackend(CanDriveBackend):
 
     Settings, drives, twin = OdriveSettings, Axes, OdriveTwin
     name, a_drive, last_id, says_every_s = "odrive", "axes", LAST_NODE, HEARTBEAT_US * 1e-6
-    # A tick is two questions, two answers and an input; of one axis three questions more. Then heartbeats.
-    traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
+    reserved_ids = "63 is the broadcast address"
+    # A tick is two questions, two answers and an input; of one axis four questions more. Then heartbeats.
+    traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 0, 8, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
 
     @classmethod
     def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
@@ -37,6 +63,35 @@ class OdriveBackend(CanDriveBackend):
                 f"{where}: `torque_constant_nm_per_a` is not given, and ODrives measure and limit amperes: take it "
                 f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it"
             )
+        cls.check_current(config, settings, joint)
+
+    @classmethod
+    def check_current(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
+        """Raise ConfigError for a joint that needs more current than the driver may set."""
+        limits_are_read = bool(settings.endpoints) or not cls.real(settings)
+        allowed_a = settings.max_current_a
+        if allowed_a is None:
+            allowed_a = math.inf if limits_are_read else UNKNOWN_MAX_CURRENT_A
+        needed_a = needed_current_a(joint)
+        if needed_a <= allowed_a * (1 + READING):
+            return
+        constant = joint.motor.torque_constant_nm_per_a or TWIN_CONSTANT
+        fix = "raise `backends.odrive.max_current_a`, if the axis is configured for more"
+        if settings.max_current_a is None:
+            fix = (
+                "name the flat_endpoints.json of the axes' firmware in `backends.odrive.endpoints`, so that the driver "
+                "reads what each axis is configured for; or say it in `backends.odrive.max_current_a`"
+            )
+        raise ConfigError(
+            f"{who(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A at "
+            f"{constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`"
+        )
+
+    @classmethod
+    def check_drives(cls, config: RunConfig, settings: OdriveSettings, joints: Sequence[Joint]) -> None:
+        """And the files that say where axes have their settings."""
+        read_all_endpoints(settings.endpoints)
+        super().check_drives(config, settings, joints)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -20,6 +20,8 @@ class Message(IntEnum):
     HEARTBEAT = 0x01
     ESTOP = 0x02
     ERROR = 0x03
+    RX_SDO = 0x04  # a question for a setting, or a new value of one
+    TX_SDO = 0x05  # the answer
     ADDRESS = 0x06
     SET_STATE = 0x07
     MOTION = 0x09
@@ -102,6 +104,8 @@ PAYLOADS = {
     Message.SET_POSITION_GAIN: Struct("<f"),  # (turns/s) / turn
     Message.SET_VELOCITY_GAINS: Struct("<ff"),  # N·m / (turn/s), and of the integral
 }
+READ_SETTING, WRITE_SETTING = 0, 1  # first byte of RxSdo
+SDO_HEAD = Struct("<BHB")  # opcode, or reserved in an answer; endpoint id; reserved. The value follows
 FROM_HOST = frozenset(message for message in Message if message.name.startswith("SET_")) | {
     Message.ESTOP,
     Message.CLEAR_ERRORS,
@@ -116,6 +120,22 @@ def write(node: int, message: Message, *values: float | bytes) -> Frame:
 def ask(node: int, message: Message) -> Frame:
     """The question for a message."""
     return Frame(node << NODE_BITS | message, b"")
+
+
+def read_setting(node: int, endpoint: int) -> Frame:
+    """Return the question for the setting with an endpoint id."""
+    return Frame(node << NODE_BITS | Message.RX_SDO, SDO_HEAD.pack(READ_SETTING, endpoint, 0))
+
+
+def say_setting(node: int, endpoint: int, value: bytes) -> Frame:
+    """Return an axis' answer to that question."""
+    return Frame(node << NODE_BITS | Message.TX_SDO, SDO_HEAD.pack(0, endpoint, 0) + value)
+
+
+def setting_of(data: bytes) -> tuple[int, bytes]:
+    """Return endpoint id and value of the answer. Raises struct.error."""
+    _, endpoint, _ = SDO_HEAD.unpack_from(data)
+    return endpoint, data[SDO_HEAD.size :]
 
 
 def parted(frame: Frame) -> tuple[int, int]:

@@ -19,6 +19,8 @@ COUNTS = 16  # set-point and state counters have four bits
 MAX_LOST = 2  # set-points that may be missing before one; a count further ahead, or an earlier one, is wrong
 WRONG_COUNTS = 5  # in a row, after which a module stops
 HEARTBEAT_PERIOD_S = 0.1
+UPTIME_RANGE_MS = 1 << 32  # of a heartbeat: 49.7 days
+MAX_UPTIME_MS = UPTIME_RANGE_MS - 1  # where an uptime stays from then on
 HEALTH_PERIOD_S = 0.5
 
 

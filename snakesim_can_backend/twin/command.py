@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing
 
 import msgspec
 
-from snakesim_can_backend.bus.adapter import is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import Wire, wait
 from snakesim_can_backend.bus.load import mbit, shares
 from snakesim_can_backend.protocol.definitions import FROM_HOST
@@ -128,6 +128,7 @@ def _check_channels(channels: Sequence[str], *, on_real_bus: bool) -> None:
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
                 "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus"
             )
+    check_channels(channels)
 
 
 class Loop:

@@ -16,6 +16,7 @@ from snakesim_can_backend.protocol.definitions import (
     HEALTH_PERIOD_S,
     HEARTBEAT_PERIOD_S,
     MAX_LOST,
+    MAX_UPTIME_MS,
     VERSION,
     WRONG_COUNTS,
     Action,
@@ -324,7 +325,7 @@ class Module:
 
     def heartbeat(self, now_us: float) -> Frame:
         """The present heartbeat."""
-        uptime_ms = round(now_us - self._booted_us) // 1000
+        uptime_ms = min(round(now_us - self._booted_us) // 1000, MAX_UPTIME_MS)
         faults = [self.faults >> fault & 1 for fault in ModuleFault]
         state = (self.state, self.demand.mode, self.last_stop, *faults, uptime_ms)
         return write_heartbeat(self.node, state)

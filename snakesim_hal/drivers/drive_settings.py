@@ -1,6 +1,6 @@
 """What the scenario may say about any family of drives, and checks of it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any
 
 from msgspec import Meta
@@ -27,7 +27,7 @@ class BodySettings(FileStruct, frozen=True, kw_only=True):
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None  # of motion capture: HOST:PORT
     plant: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.plants`
     plant_settings: dict[str, Any] = {}
-    mounted: dict[str, Mounted] = {}  # of emulated drives: joint -> how it is mounted in truth
+    mounted: Mapping[str, Mounted] = {}  # of emulated drives: joint -> how it is mounted in truth
 
 
 class DriveSettings(BodySettings, frozen=True, kw_only=True):

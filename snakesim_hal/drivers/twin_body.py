@@ -27,7 +27,7 @@ MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process the drives sk
 BOOT_US = 500_000.0  # in which a drive that restarts says nothing; a guess
 WEAK_V = 12.0  # of a supply that an injected fault lets fall
 POLL_S = 0.001  # of drives in a process of their own
-FAULTS = ("mute", "reboot", "overheat", "undervoltage")  # that can be injected into emulated drives
+FAULTS = ("mute", "reboot", "overheat", "undervoltage", "duplicate")  # that can be injected into emulated drives
 
 
 def make_plant(config: RunConfig, settings: Any, backend: str) -> Plant:
@@ -66,6 +66,7 @@ class Motion:
         self.boots_until_us = [0.0] * len(self.joints)
         self.muted: set[int] = set()
         self.weak: set[int] = set()
+        self.doubled: set[int] = set()
         self.lock = threading.RLock()
         self._step_us, self._steps, self._skipped_us = plant.step_s * 1e6, 0, 0.0
         self._send_pose, self._period_us, self._pose_us = send_pose, config.period_ns / 1000, 0.0
@@ -169,6 +170,10 @@ class TwinBody:
         """Whether a drive hears nothing now: it boots."""
         return self.now_us < self._all.boots_until_us[self._at[i]]
 
+    def is_doubled(self, i: int) -> bool:
+        """Whether a second drive with the id of this one is on its bus."""
+        return self._at[i] in self._all.doubled
+
     def inject(self, injection: Injection, *, begins: bool) -> int | None:
         """Begin or end a fault of a drive: its number if it restarts now. Raises ConfigError."""
         if injection.target_type != "joint" or injection.kind not in FAULTS:
@@ -182,6 +187,8 @@ class TwinBody:
                 (motion.muted.add if begins else motion.muted.discard)(j)
             case "undervoltage":
                 (motion.weak.add if begins else motion.weak.discard)(j)
+            case "duplicate":
+                (motion.doubled.add if begins else motion.doubled.discard)(j)
             case "overheat":
                 self.thermal.inject(j, heat=begins, hold=begins and injection.end_s != math.inf)
             case _:

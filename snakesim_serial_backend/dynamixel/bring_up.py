@@ -6,21 +6,33 @@ from collections.abc import Iterator, Sequence
 
 from snakesim_hal.errors import BackendError
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.packets import Packet
+from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 
 WANTED = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
+# Two servos with one id: their answers follow each other if their return delays differ, and collide if they do not.
+ANSWERS_TWICE = "is duplicated: it answers one question twice; give each servo its own id"
+GARBLED = (
+    "a second servo has its id, or the line is disturbed; give each servo its own id, one after the other alone on the "
+    "bus, and check cables and terminators"
+)
+TORQUE_AT_START = 0x01
+READS = 3  # to tell a second servo from a single disturbance
+MEASURED = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos differ: position, voltage, temperature
 KEPT = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}  # written only where it differs: it wears out
 
 
 def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
     """What every servo measures, and its health. Raises BackendError."""
-    found = _find(servos, settings.bring_up_limit_s)
+    found, objections = _find(servos, settings.bring_up_limit_s)
     wrong: list[str] = []
     for servo in servos:
         said = found.get(servo.name)
+        if why := objections.get(servo.name) or (_shared_id(servo) if said is not None else ""):
+            wrong.append(f"  {servo.who} {why}")
+            continue
         kept = None if said is None else servo.port.read(servo.id, 0, at.KEPT)
         if why := _unfit(servo, said, kept, settings):
             wrong.append(f"  {servo.who} {why}")
@@ -34,14 +46,42 @@ def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -
     return [(_present(servo), _answer(servo, at.TORQUE_ENABLE, at.HEALTH_SIZE)) for servo in servos]
 
 
-def _find(servos: Sequence[Servo], limit_s: float) -> dict[str, Packet]:
-    end, found = time.monotonic() + limit_s, dict[str, Packet]()
+def _find(servos: Sequence[Servo], limit_s: float) -> tuple[dict[str, Packet], dict[str, str]]:
+    """Return what each servo that was found answers to a ping, and objections to those that share an id. By name."""
+    end = time.monotonic() + limit_s
+    found: dict[str, Packet] = {}
+    objections: dict[str, str] = {}
     while True:
         for servo in servos:
-            if servo.name not in found and (said := servo.port.ping(servo.id)) is not None:
-                found[servo.name] = said
+            if servo.name in found:
+                continue
+            answers = servo.port.ping(servo.id)
+            if answers.statuses:
+                found[servo.name] = answers.statuses[0]
+            if len(answers.statuses) > 1:
+                objections[servo.name] = ANSWERS_TWICE
+            elif answers.garbled and not answers.statuses:
+                objections[servo.name] = f"sends garbled bytes in answer to a ping: {GARBLED}"
+            else:
+                objections.pop(servo.name, None)
         if len(found) == len(servos) or time.monotonic() > end:
-            return found
+            return found, objections
+
+
+def _shared_id(servo: Servo) -> str:
+    """Return why another servo seems to have the same id; empty if only one answers.
+
+    A ping does not show it: two servos of one model answer it with the same bytes at the same time.
+    """
+    garbled = 0
+    for _ in range(READS):
+        answers = servo.port.read_alone(servo.id, at.PRESENT, MEASURED)
+        if len(answers.statuses) > 1:
+            return ANSWERS_TWICE
+        if answers.statuses:
+            return ""
+        garbled += answers.garbled
+    return f"sends garbled bytes, in {garbled} of {READS} answers: {GARBLED}" if garbled else ""
 
 
 def _unfit(servo: Servo, said: Packet | None, kept: Packet | None, settings: DynamixelSettings) -> str:
@@ -67,6 +107,16 @@ def _unfit(servo: Servo, said: Packet | None, kept: Packet | None, settings: Dyn
         return (
             f"has drive mode {drive_mode} and homing offset {offset}; both must be 0, as direction and zero are those "
             f"of the robot file (`sign`, `zero_rad`)"
+        )
+    if (secondary_id := kept.data[at.SECONDARY_ID]) <= LAST_ID:
+        return (
+            f"has the secondary id {secondary_id} (register {at.SECONDARY_ID}), and would take the set-points of that "
+            f"id, too: set it to 255, which is off"
+        )
+    if kept.data[at.STARTUP] & TORQUE_AT_START:
+        return (
+            f"has startup configuration {kept.data[at.STARTUP]} (register {at.STARTUP}): it switches its torque on "
+            f"when it starts, before the driver has found it. Clear bit 0"
         )
     servo.unit_nm = current_a * servo.constant
     (servo.most_current,) = _unpacked("<H", kept, at.CURRENT_LIMIT)

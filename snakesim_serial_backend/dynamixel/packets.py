@@ -147,11 +147,10 @@ class Decoder:
             else:
                 self._skip(1)
 
-    def parts(self, size: int) -> list[Packet]:
-        """Of a fast answer that ends early, what is intact, as statuses; the rest is thrown away."""
-        found = list(_parts(bytes(self._bytes), size)) if self._bytes[BEFORE - 3 : BEFORE - 2] == b"\xfe" else []
-        self._bytes.clear()
-        return found
+    @property
+    def garbled(self) -> bool:
+        """Whether bytes have come that are no packet."""
+        return self.skipped > 0 or len(self._bytes) > 0
 
     def _to_header(self) -> None:
         at = self._bytes.find(HEADER)
@@ -187,6 +186,12 @@ def fast_parts(packet: Packet, size: int) -> list[Packet]:
     step = size + 4
     blocks = (packet.parameters[at : at + step] for at in range(0, len(packet.parameters), step))
     return [Packet(block[1], Instruction.STATUS, block[:1] + block[2:-2]) for block in blocks if len(block) == step]
+
+
+def intact_parts(data: bytes, size: int) -> list[Packet]:
+    """Return what is intact of a fast answer that ends early, or is garbled from some servo on, as statuses."""
+    start = data.find(HEADER + bytes([EVERYBODY]))
+    return list(_parts(data[start:], size)) if start >= 0 else []
 
 
 def _parts(packet: bytes, size: int) -> Iterator[Packet]:

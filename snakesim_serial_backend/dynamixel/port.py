@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from snakesim_serial_backend.dynamixel.packets import (
     EVERYBODY,
@@ -11,6 +12,7 @@ from snakesim_serial_backend.dynamixel.packets import (
     Packet,
     encoded,
     fast_parts,
+    intact_parts,
     read_request,
     sync_read_request,
     sync_write,
@@ -21,6 +23,13 @@ CHUNK_BYTES = 64  # that an adapter hands on at once
 SCAN_S = 0.003  # in which each id may answer a ping of everybody
 
 
+class Answers(NamedTuple):
+    """Everything that came after one question to one servo."""
+
+    statuses: list[Packet]  # of that servo; more than one: two servos have its id, and answer one after the other
+    garbled: bool  # bytes came that are no packet: two servos answer at the same time, or the line is disturbed
+
+
 class Port:
     """Asks one thing after another: the bus is half duplex."""
 
@@ -28,10 +37,16 @@ class Port:
         """gap_s: silence after which no more is expected, besides what bytes and adapter take."""
         self.wire, self._gap_s = wire, gap_s
         self.fast = True  # whether its servos know fast sync reads
+        self._heard = bytearray()  # since the newest question
 
-    def ping(self, id_: int) -> Packet | None:
-        """Model (2 bytes) and firmware of a servo; None: it does not answer."""
-        return self._one(id_, encoded(id_, Instruction.PING))
+    def ping(self, id_: int) -> Answers:
+        """Ask a servo for its model (2 bytes) and firmware; listens for a second answer, too."""
+        return self._all_answers(id_, encoded(id_, Instruction.PING))
+
+    def read_alone(self, id_: int, address: int, size: int) -> Answers:
+        """Ask a servo for registers, and listen for a second answer."""
+        answers = self._all_answers(id_, read_request(id_, address, size))
+        return answers._replace(statuses=[one for one in answers.statuses if len(one.data) == size])
 
     def scan(self) -> list[Packet]:
         """All servos that answer a ping of everybody."""
@@ -60,7 +75,7 @@ class Port:
         for packet in self._packets(decoder, request, 1 if self.fast else len(ids), self._gap_s):
             found += fast_parts(packet, size) if packet.id == EVERYBODY else [packet]
         if self.fast and not found:
-            found = decoder.parts(size)
+            found = intact_parts(bytes(self._heard), size)
         return {packet.id: packet for packet in found if packet.id in ids and len(packet.data) == size}
 
     def write_all(self, address: int, each: Sequence[tuple[int, bytes]]) -> None:
@@ -74,10 +89,17 @@ class Port:
         answers = self._packets(Decoder(), request, 1, self._gap_s)
         return next((packet for packet in answers if packet.id == id_), None)
 
+    def _all_answers(self, id_: int, request: bytes) -> Answers:
+        decoder = Decoder()
+        packets = self._packets(decoder, request, 2, self._gap_s)
+        return Answers([packet for packet in packets if packet.id == id_], decoder.garbled)
+
     def _packets(self, decoder: Decoder, request: bytes, answers: int, gap_s: float) -> list[Packet]:
         wire, found = self.wire, list[Packet]()
+        self._heard.clear()
         wire.send(request)
         gap_s += wire.time_s(len(request) + CHUNK_BYTES) + wire.latency_s
         while len(found) < answers and (data := wire.receive(gap_s)):
+            self._heard += data
             found += [packet for packet in decoder.feed(data) if packet.instruction == Instruction.STATUS]
         return found

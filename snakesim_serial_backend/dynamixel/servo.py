@@ -37,6 +37,8 @@ class Servo:
     errors: int = 0
     alert: bool = False  # whether it has errors that it has not named
     booting_ns: int = -1  # since it was told to restart
+    answered_twice: int = 0  # questions in a row
+    garbled: int = 0  # questions in a row that only garbled bytes answered
 
     @property
     def who(self) -> str:

@@ -18,7 +18,7 @@ from snakesim_hal.drivers.twin_body import FAULTS
 from snakesim_hal.injection import Injection
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.bring_up import bring_up
+from snakesim_serial_backend.dynamixel.bring_up import ANSWERS_TWICE, GARBLED, bring_up
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
@@ -28,6 +28,7 @@ from snakesim_serial_backend.wire import is_emulated
 
 BOOTS_WITHIN_NS = 2_000_000_000
 INJECTED = {("bus", "cut"), *(("joint", kind) for kind in FAULTS)}
+IN_A_ROW = 2  # questions answered twice, or in garbled bytes, until that is a fault: before `drive_silent`, after 3
 BUS_CUT = "nothing gets through; check the adapter, its cable and its power"
 
 
@@ -93,9 +94,12 @@ class Servos:
 
     def _ask_lost(self, i: int) -> None:
         servo = self.servos[i]
-        if (answer := servo.port.read(servo.id, at.PRESENT, at.present_form.size)) is not None:
+        answers = servo.port.read_alone(servo.id, at.PRESENT, at.present_form.size)
+        servo.answered_twice = servo.answered_twice + 1 if len(answers.statuses) > 1 else 0
+        servo.garbled = servo.garbled + 1 if answers.garbled and not answers.statuses else 0
+        if len(answers.statuses) == 1:
             self._lost.clear()  # perhaps others are back, too
-            self.hear(i, answer)
+            self.hear(i, answers.statuses[0])
 
     def hear(self, i: int, said: Packet) -> None:
         """What a servo measures."""
@@ -179,6 +183,10 @@ class Servos:
         if error := self._port.wire.error():
             found.append(Finding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
         for i, servo in enumerate(self.servos):
+            if servo.answered_twice >= IN_A_ROW:  # it concerns all: nothing is known of which of the two is where
+                found.append(Finding("duplicate_node", f"{servo.who} {ANSWERS_TWICE}", i))
+            elif servo.garbled >= IN_A_ROW:
+                found.append(Finding("drive_silent", f"{servo.who} sends garbled bytes: {GARBLED}", i, alone=True))
             if servo.errors:
                 cause = f"{servo.who} reports {at.error_names(servo.errors)}; a clear restarts it"
                 found.append(Finding("drive_fault", cause, i, alone=True))

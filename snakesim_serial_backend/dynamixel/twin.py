@@ -26,6 +26,9 @@ from snakesim_serial_backend.wire import Pty
 MODEL, FIRMWARE = 1120, 46  # XM540-W270
 CURRENT_A = 0.00269
 MOST_CURRENT = 2047
+PWM_LIMIT, MOST_PWM = 36, 885
+FACTORY_DELAY = 250  # of an answer, in 2 us
+ELSEWHERE_COUNTS = 1000  # how far from a servo a second one with its id is
 SHUTDOWN, SHUTDOWN_BY = 63, 0x34  # overload, electrical shock, overheating
 MODES = (0, 1, 3, 4, 5, 16)
 WRITABLE = [(7, 14), (20, 64), (64, 70), (76, 120)]  # addresses from, to
@@ -78,13 +81,16 @@ class DynamixelTwin(DriveTwin):
             servo = Servo(bytearray(at.SIZE), port, CURRENT_A * constant)
             servo.put("H", at.MODEL, MODEL)
             servo.table[6], servo.table[7], servo.table[8] = FIRMWARE, joint.id, at.RATE[baud]
-            servo.table[at.DELAY], servo.table[at.OPERATING_MODE], servo.table[13] = 250, 3, 2
+            servo.table[at.DELAY], servo.table[at.OPERATING_MODE], servo.table[13] = FACTORY_DELAY, 3, 2
+            servo.table[at.SECONDARY_ID] = 255
+            servo.put("H", PWM_LIMIT, MOST_PWM)
             servo.table[31], servo.table[SHUTDOWN] = 80, SHUTDOWN_BY
             servo.put("H", at.LEAST_VOLTAGE, round(joint.limits.least_voltage_v / at.VOLTS))
             servo.put("H", at.CURRENT_LIMIT, MOST_CURRENT)
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
         self._decoders = [Decoder() for _ in self._ends]
+        self._delay_of_second = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
         for i in range(len(self.servos)):
             self.restart(i)
 
@@ -128,7 +134,8 @@ class DynamixelTwin(DriveTwin):
             case Instruction.PING:
                 self._answer(i, bytes(self.servos[i].table[:2]) + bytes([self.servos[i].table[6]]))
             case Instruction.READ:
-                self._answer(i, *self._read(i, given))
+                data, refusal = self._read(i, given)
+                self._answer(i, data, refusal, self._read_second(i, given))
             case Instruction.WRITE:
                 self._answer(i, b"", self._write(i, struct.unpack_from("<H", given)[0], given[2:]))
             case Instruction.REBOOT:
@@ -141,21 +148,34 @@ class DynamixelTwin(DriveTwin):
     def _read_all(self, port: Pty, instruction: int, what: bytes, asked: Sequence[int | None]) -> None:
         """In the order of their ids in the packet: each waits for the one before it, for ever."""
         parts: list[tuple[int, int, bytes]] = []
+        seconds: list[tuple[int, int, bytes]] = []  # the same, with what a second servo of an id puts there
         for i in asked:
             if i is None or self.body.silent(i):
                 break
             data, refusal = self._read(i, what)
+            second = self._read_second(i, what)
             if instruction == Instruction.SYNC_READ:
-                self._answer(i, data, refusal)
+                self._answer(i, data, refusal, second)
             else:
                 parts.append((refusal | self._alert(i), self.servos[i].id, data))
+                seconds.append((refusal | self._alert(i), self.servos[i].id, second))
         if parts:
-            port.give(fast_status(parts, len(asked)))
+            port.give(collided(fast_status(parts, len(asked)), fast_status(seconds, len(asked))))
 
-    def _answer(self, i: int, data: bytes, refusal: int = 0) -> None:
-        if not self.body.silent(i):
-            status = bytes([refusal | self._alert(i)]) + data
-            self.servos[i].port.give(encoded(self.servos[i].id, Instruction.STATUS, status))
+    def _answer(self, i: int, data: bytes, refusal: int = 0, second: bytes | None = None) -> None:
+        """Give a servo's status. second: the data of a second servo with its id, where they differ."""
+        if self.body.silent(i):
+            return
+        servo, error = self.servos[i], bytes([refusal | self._alert(i)])
+        status = encoded(servo.id, Instruction.STATUS, error + data)
+        if not self.body.is_doubled(i):
+            servo.port.give(status)
+            return
+        other = encoded(servo.id, Instruction.STATUS, error + (data if second is None else second))
+        if servo.table[at.DELAY] == self._delay_of_second[i]:
+            servo.port.give(collided(status, other))
+        else:
+            servo.port.give(status + other)
 
     def _alert(self, i: int) -> int:
         return ALERT if self.servos[i].table[at.HARDWARE_ERROR] else 0
@@ -166,6 +186,15 @@ class DynamixelTwin(DriveTwin):
             return b"", Refusal.ACCESS
         self._measure(i)
         return bytes(self.servos[i].table[address : address + size]), 0
+
+    def _read_second(self, i: int, what: bytes) -> bytes:
+        """The same registers of a second servo with the id of this one; without one, of the servo itself."""
+        address, size = struct.unpack("<HH", what)
+        table = self.servos[i].table[:]
+        if self.body.is_doubled(i):
+            (counts,) = struct.unpack_from("<i", table, at.PRESENT + 6)
+            struct.pack_into("<i", table, at.PRESENT + 6, counts + ELSEWHERE_COUNTS)
+        return bytes(table[address : address + size])
 
     def _measure(self, i: int) -> None:
         servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self.body.shaft(i)
@@ -187,6 +216,8 @@ class DynamixelTwin(DriveTwin):
         if why := self._refusal(servo, after, address, end):
             return why
         servo.table = after
+        if address <= at.DELAY < end and self.body.is_doubled(i):
+            self._delay_of_second[i] = after[at.DELAY]
         if address <= at.WATCHDOG < end and after[at.WATCHDOG] == 0:
             servo.held_counts = None
         self._drive(i)
@@ -253,3 +284,9 @@ class DynamixelTwin(DriveTwin):
                 if found & SHUTDOWN_BY:
                     servo.table[at.TORQUE_ENABLE] = 0
                     self._drive(i)
+
+
+def collided(one: bytes, other: bytes) -> bytes:
+    """Return what two servos that send at the same time leave on the line: a 0 of either wins."""
+    longest = max(len(one), len(other))
+    return bytes(a & b for a, b in zip(one.ljust(longest, b"\xff"), other.ljust(longest, b"\xff"), strict=True))

@@ -98,6 +98,24 @@ def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpre
         assert found.count("watchdog") == 13 and " armed" not in found, said + found
 
 
+TWO_GROUPS = """
+import time
+from snakesim_can_backend.bus.adapter import open_wire
+from snakesim_can_backend.protocol.definitions import Frame
+wires = [open_wire(f"udp_multicast:239.74.163.{group}") for group in (2, 2, 3)]
+wires[0].send(Frame(0x105, b"12345678"))
+time.sleep(0.2)
+print("received:", [len(wire.receive()) for wire in wires])
+for wire in wires:
+    wire.close()
+"""
+
+
+def test_channels_of_udp_multicast_are_buses_of_their_own(machine: Machine) -> None:
+    """They share a port: without an option of its socket each of them gets the frames of all groups."""
+    assert "received: [0, 1, 0]" in machine.run(sys.executable, "-c", TWO_GROUPS)
+
+
 def test_its_own_modules_move_in_lockstep_as_on_any_bus(machine: Machine, tmp_path: Path) -> None:
     said = run(machine, tmp_path, "--pace", "lockstep", "--duration", "2", "--set", 'backend.twins="process"')
     assert "(exit code 0)" in said, said

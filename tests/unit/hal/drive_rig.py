@@ -20,7 +20,7 @@ class DriveRig:
     def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
         self.config, self.backend = config, backend
         self.tick, self.isolated = 0, frozenset[int]()
-        self.mode, self.target = Mode.POSITION, 0.1
+        self.mode, self.target, self.limit_nm = Mode.POSITION, 0.1, 1.0
         self.joints: JointState | None = None
 
     def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
@@ -30,7 +30,9 @@ class DriveRig:
             self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
             count = len(self.joints.angle_rad)
             modes = [self.mode if lifecycle == "armed" else Mode.PASSIVE] * count
-            self.backend.enact(SetPoints(modes, [self.target] * count, [1.0] * count, self.isolated), lifecycle)
+            self.backend.enact(
+                SetPoints(modes, [self.target] * count, [self.limit_nm] * count, self.isolated), lifecycle
+            )
             self.backend.advance()
             found += self.backend.faults()
             if found and lifecycle in ("armed", "disarmed"):

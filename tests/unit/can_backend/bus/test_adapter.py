@@ -6,11 +6,19 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from snakesim_can_backend.bus.adapter import AdapterWire, check_channel, is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import (
+    NEEDS,
+    AdapterWire,
+    check_channel,
+    check_channels,
+    is_emulated,
+    open_bus,
+    open_wire,
+)
 from snakesim_can_backend.bus.load import Reports, busiest_s, load
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id
 from snakesim_can_backend.twin.bus_time import BusTime
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.errors import BackendError, ConfigError, SnakesimError
 
 STATE = Frame(frame_id(Opcode.JOINT_STATE, 3), bytes(8))
 
@@ -66,6 +74,28 @@ def test_a_wrong_channel_is_wrong_input(channel: str, why: str) -> None:
 def test_an_adapter_that_is_not_there_is_named() -> None:
     with pytest.raises(BackendError, match="slcan:/dev/none: cannot be opened: "):
         open_wire("slcan:/dev/none")
+
+
+# Left out: those that are there without an adapter, and one that would connect to a network.
+@pytest.mark.parametrize("interface", sorted(can.VALID_INTERFACES - {"virtual", "udp_multicast"}))
+@pytest.mark.parametrize("data_bit_rate", [None, 5_000_000])
+def test_an_interface_whose_library_or_adapter_is_missing_is_an_error_with_the_way_out(
+    interface: str, data_bit_rate: int | None
+) -> None:
+    """Each of python-can's interfaces fails in its own way, one of them by a NameError."""
+    with pytest.raises(SnakesimError) as raised:
+        open_bus(f"{interface}:/dev/none", 1_000_000, data_bit_rate)
+    words = str(raised.value)
+    assert words.startswith(f"{interface}:/dev/none: cannot be opened: ") and NEEDS[interface] in words
+    assert "Traceback" not in words and len(words) < 700, words
+
+
+def test_a_bus_is_named_once() -> None:
+    with pytest.raises(
+        ConfigError, match=r"channels: 'virtual:a' and 'virtual:a' are the same bus; name each bus once"
+    ):
+        check_channels(["virtual:a", "virtual:b", "virtual:a"])
+    check_channels(["virtual:a", "virtual:b"])
 
 
 def test_modules_are_emulated_where_no_real_ones_can_be() -> None:

@@ -53,11 +53,16 @@ def test_an_imus_halves_are_of_one_sync() -> None:
 # --- heartbeats --------------------------------------------------------------------------------------------
 
 
+MAX_UPTIME_S = 4294967.295  # the end of the signal's range
+
 UPTIMES = {  # s, and how many restarts they are by then
     "back, and on from there: a restart": [(5.0, 0), (5.1, 0), (5.1, 0), (0.1, 0), (0.2, 1), (0.3, 1)],
     "and the next restart": [(5.0, 0), (0.1, 0), (0.2, 1), (0.3, 1), (0.1, 1), (0.1, 2), (0.2, 2)],
     "two clocks in turn: two modules": [(start_s + 0.1 * i, 0) for i in range(20) for start_s in (50.0, 0.0)],
     "one that comes late": [(5.0, 0), (5.2, 0), (5.1, 0), (5.3, 0), (5.4, 0)],
+    "49.7 days, at the end of the range": [(MAX_UPTIME_S - 0.05, 0), *[(MAX_UPTIME_S, 0)] * 4],
+    "49.7 days, and a restart": [*[(MAX_UPTIME_S, 0)] * 2, (0.1, 0), (0.2, 1), (0.3, 1)],
+    "49.7 days, in firmware that wraps": [(MAX_UPTIME_S - 0.05, 0), (0.05, 0), (0.15, 0), (0.25, 0)],
 }
 
 

@@ -37,6 +37,8 @@ class Family:
     settings: Callable[[Any, int], object]  # that the drive of a joint of a twin has in force
     expired: tuple[str, str]  # the fault of an expired watchdog, and what its cause says
     overheated: str
+    serial: str = ""  # of the drive with this number
+    firmware: str = ""
     unheard: str = ""
     too_fast_hz: float = 0.0
 
@@ -54,6 +56,8 @@ FAMILIES = {
         law_of,
         ("drive_fault", "watchdog_timer_expired"),
         "motor_over_temp",
+        "38550000000{}",
+        "0.6.11",
         "does not say its version: .*another id",
         500,
     ),
@@ -64,6 +68,8 @@ FAMILIES = {
         law_of,
         ("drive_fault", "its watchdog expired"),
         "fault 38, over-temperature",
+        "3033363665115510{:08X}",
+        "",
         "does not say its register map: .*another id",
         2000,
     ),
@@ -109,9 +115,9 @@ def robot(family: Family) -> Iterator[Robot]:
 
 
 def test_the_description_says_which_drives_these_are_where_they_say_it(robot: Robot) -> None:
-    joints, says = robot.backend.describe().joints, isinstance(robot.backend, OdriveBackend)
-    assert [joint.serial for joint in joints] == [f"38550000000{i + 1}" if says else "" for i in range(JOINTS)]
-    assert {joint.firmware for joint in joints} == {"0.6.11" if says else ""}
+    joints = robot.backend.describe().joints
+    assert [joint.serial for joint in joints] == [robot.family.serial.format(i + 1) for i in range(JOINTS)]
+    assert {joint.firmware for joint in joints} == {robot.family.firmware}
 
 
 def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_again_if_it_is_still_there(
@@ -168,6 +174,8 @@ def test_a_joint_that_was_lost_while_armed_is_left_alone_until_it_is_used_again(
 def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_one_begins_anew(
     robot: Robot,
 ) -> None:
+    """With the joint's own torque limit: a lower one that an ODrive has kept is in odrive/test_limits.py."""
+    robot.limit_nm = robot.config.robot.limits.torque_nm
     robot.run(20, "armed")
     robot.backend._clock.robot_ns += 190_000_000
     robot.twin()
@@ -201,6 +209,24 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 
 
 @on_can
+def test_two_drives_of_one_id_stop_the_robot_and_are_refused_at_the_start_with_both_serials(robot: Robot) -> None:
+    robot.run(20, "armed")
+    serials = [joint.serial for joint in robot.backend.describe().joints]
+    assert len(set(serials)) == JOINTS and all(serials)
+    robot.go_wrong("duplicate:joint_2@0-9")
+    [fault] = robot.run(SHOWN, "armed")
+    assert (fault.what, fault.joint, fault.reach) == ("duplicate_node", "joint_2", "robot")
+    assert serials[1] in fault.cause and robot.following() == [False] * JOINTS
+    assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "cleared while it is there"
+    words = rf"(?s)not complete; .*joint_2 \(node 2 on .*\) answers with 2 serial numbers, .*{serials[1]}.* its own id"
+    with pytest.raises(BackendError, match=words):
+        robot.backend._drives.bring_up()
+    robot.go_wrong("duplicate:joint_2@0-9", begins=False)
+    robot.backend._drives.bring_up()
+    assert robot.run(5, "fault") == [] and robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
+
+
+@on_can
 def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> None:
     robot.run(20, "armed")
     channel = drives_of(robot.backend).wire.channel
@@ -231,7 +257,10 @@ def test_a_log_of_the_bus_is_read_by_python_can_as_it_was_sent(family: Family, t
     [
         ({"rate_hz": 0}, "drives at .* Hz need .* at worst-case stuffing"),
         ({"rate_hz": 20}, "`watchdog_s` = 0.1 s at `rate_hz` = 20: one lost set-point"),
-        ({"robot__joints": {"joint_2": {"id": 500}}}, "joint_2: `id` = 500; .* have ids of 0 to"),
+        (
+            {"robot__joints": {"joint_2": {"id": 127}}},
+            "joint_2: `id` = 127, and .* have ids of .* broadcast address",
+        ),
         ({"robot__joints": {"joint_2": {"port": "can7"}}}, "joint_2: `port` = 'can7' is not among"),
     ],
 )

@@ -39,7 +39,7 @@ def test_registers_modes_and_faults_have_their_numbers() -> None:
         "MODE": "MODE", "POSITION": "POSITION", "VELOCITY": "VELOCITY", "TORQUE": "TORQUE", "POWER": "POWER",
         "MOTOR_TEMPERATURE": "MOTOR_TEMPERATURE", "HOME_STATE": "HOME_STATE", "VOLTAGE": "VOLTAGE",
         "BOARD_TEMPERATURE": "TEMPERATURE", "FAULT": "FAULT", "COMMAND": "COMMAND_POSITION",
-        "WATCHDOG": "COMMAND_TIMEOUT", "MAP_VERSION": "REGISTER_MAP_VERSION",
+        "WATCHDOG": "COMMAND_TIMEOUT", "MAP_VERSION": "REGISTER_MAP_VERSION", "SERIAL": "SERIAL_NUMBER",
     }  # fmt: skip
     assert {one.name: moteus.Register[same[one.name]] for one in protocol.Register} == {
         one.name: one.value for one in protocol.Register
@@ -134,6 +134,11 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, "only a stop ends it"
     ask(client.make_stop())
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
+    ask(client.make_position(position=0.1, velocity=0.0))
+    everybody = theirs(127)
+    ours.send(message_of(as_frame(everybody.make_stop(), 127), fd=True))
+    twin()
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, "127 is the broadcast address"
 
 
 def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_file_says() -> None:
@@ -158,9 +163,16 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
     assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5 and joints.valid == [True] * JOINTS
 
 
+@pytest.mark.parametrize("number", [0, 127])
+def test_the_ids_of_the_host_and_of_everybody_are_no_controllers(number: int) -> None:
+    """Their firmware's filters and mjbots' library take 127 for a broadcast: all controllers would follow one joint."""
+    wrong = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
+    words = f"joint_2: `id` = {number}, and controllers have ids of 1 to 126: 0 is the host's, 127 the broadcast"
+    with pytest.raises(ConfigError, match=words):
+        MoteusBackend.check(wrong, MoteusSettings())
+    MoteusBackend.check(config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings())
+
+
 def test_real_controllers_need_to_be_configured_for_the_robot_and_a_reference() -> None:
     with pytest.raises(ConfigError, match=r"needs `servo.pid_position.kp` from .* N·m/turn on, .*say what they have"):
         MoteusBackend.check(CONFIG, MoteusSettings(kp_nm_per_turn=0.01))
-    one_is_the_host = config(backend="moteus", robot__joints={"joint_1": {"id": 0}})
-    with pytest.raises(ConfigError, match="`id` = 0 is the host's"):
-        MoteusBackend.check(one_is_the_host, MoteusSettings())

@@ -173,6 +173,14 @@ def test_a_reboot_forgets_what_was_not_saved():
     assert values[Parameter.STIFFNESS] == 0.0 and values[Parameter.DAMPING] == 2.0
 
 
+def test_the_uptime_of_a_module_stays_at_the_end_of_its_range() -> None:
+    """The protocol forbids a number that wraps around: an uptime of 0 would look like a restart."""
+    module = booted()
+    module._booted_us = -(2**32 - 50) * MS
+    beats = [codec()[Opcode.HEARTBEAT].values(module.heartbeat(at_us).data) for at_us in (0.0, 100 * MS, 500 * MS)]
+    assert [beat["uptime"] for beat in beats] == pytest.approx([4294967.246, 4294967.295, 4294967.295], abs=1e-6)
+
+
 def test_every_sync_is_answered_with_its_own_count():
     module = booted(contact_every=4, imu_every=5, tail=1)
     for count in range(20):

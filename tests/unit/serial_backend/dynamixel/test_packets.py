@@ -15,6 +15,7 @@ from snakesim_serial_backend.dynamixel.packets import (
     encoded,
     fast_parts,
     fast_status,
+    intact_parts,
     sync_read_request,
     sync_write,
 )
@@ -101,9 +102,12 @@ def test_a_fast_answer_is_read_by_the_sdk_and_to_where_it_ends_by_us(parts: list
     (packet,) = Decoder().feed(answer)
     assert packet.id == EVERYBODY
     assert [(one.id, one.data) for one in fast_parts(packet, size)] == [(id_, data) for _, id_, data in parts]
-    decoder = Decoder()
-    assert list(decoder.feed(fast_status(parts, len(parts) + 1) + b"\x00")) == []
-    assert [(one.id, one.data) for one in decoder.parts(size)] == [(id_, data) for _, id_, data in parts]
+    ends_early = fast_status(parts, len(parts) + 1) + b"\x00"
+    assert list(Decoder().feed(ends_early)) == []
+    intact = [(id_, data) for _, id_, data in parts]
+    assert [(one.id, one.data) for one in intact_parts(ends_early, size)] == intact
+    last_is_garbled = answer[:-1] + bytes([answer[-1] ^ 0x10])
+    assert [(one.id, one.data) for one in intact_parts(b"\x00" + last_is_garbled, size)] == intact[:-1]
 
 
 @pytest.mark.parametrize("at", [4, 5, 8, 10, 12])

@@ -4,6 +4,7 @@ Hardware errors, restarts and lost joints are in `tests/unit/can_backend/family/
 """
 
 import math
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -112,6 +113,25 @@ def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_sta
         assert expected in words, words
 
 
+@pytest.mark.parametrize(
+    ("register", "value", "words"),
+    [
+        (at.SECONDARY_ID, 1, r"has the secondary id 1 \(register 12\), .*: set it to 255, which is off"),
+        (
+            at.STARTUP,
+            3,
+            r"has startup configuration 3 \(register 60\): it switches its torque on when it starts, .*bit 0",
+        ),
+    ],
+)
+def test_a_servo_that_would_move_by_what_is_not_its_own_is_refused(
+    robot: Robot, register: int, value: int, words: str
+) -> None:
+    robot.twin.servos[2].table[register] = value
+    with pytest.raises(BackendError, match=rf"(?s)nothing was enabled.*joint_3 .*{words}"):
+        drives_of(robot.backend).bring_up()
+
+
 def test_a_servo_outside_of_its_travel_is_refused() -> None:
     elsewhere = DynamixelSettings(plant="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
     with pytest.raises(BackendError, match=r"joint_1 .*: woke up at .* rad, which no number of whole turns"):
@@ -132,3 +152,41 @@ def test_what_servos_cannot_do_is_refused_before_the_start(dotted: dict[str, Any
     config = run_config(**{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
     with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
         DynamixelBackend.check(config, DynamixelSettings())
+
+
+SAME_DELAY, OTHER_DELAY = 250, 0  # of an answer, us / 2: a servo as delivered has 250
+
+
+@pytest.mark.parametrize(
+    ("delay", "words"),
+    [
+        (OTHER_DELAY, "is duplicated: it answers one question twice; give each servo its own id"),
+        (SAME_DELAY, "sends garbled bytes, in 3 of 3 answers: a second servo has its id, or the line is disturbed"),
+    ],
+    ids=["one after the other", "at the same time"],
+)
+def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int, words: str) -> None:
+    """They have no serial numbers. With one return delay their answers collide, with two they follow each other."""
+    robot.go_wrong("duplicate:joint_2@0-9")
+    robot.twin.servos[1].table[at.DELAY] = delay
+    with pytest.raises(BackendError, match=rf"(?s)not complete; .*joint_2 \(id 2 on .*\) {words}"):
+        drives_of(robot.backend).bring_up()
+    robot.go_wrong("duplicate:joint_2@0-9", begins=False)
+    drives_of(robot.backend).bring_up()
+
+
+@pytest.mark.parametrize(
+    ("delay", "what", "words"),
+    [
+        (OTHER_DELAY, "duplicate_node", "joint_2 .* is duplicated: it answers one question twice"),
+        (SAME_DELAY, "drive_silent", "joint_2 .* sends garbled bytes: a second servo has its id, or the line is dist"),
+    ],
+    ids=["one after the other", "at the same time"],
+)
+def test_a_second_servo_with_the_id_of_one_stops_the_robot(robot: Robot, delay: int, what: str, words: str) -> None:
+    robot.run(20, "armed")
+    robot.twin.servos[1].table[at.DELAY] = delay
+    robot.go_wrong("duplicate:joint_2@0-9")
+    fault = robot.run(NOTICED, "armed")[0]
+    assert (fault.what, fault.joint) == (what, "joint_2") and re.search(words, fault.cause), fault
+    assert fault.reach == ("robot" if what == "duplicate_node" else "joint")

@@ -1,0 +1,91 @@
+"""Which settings of an axis the driver reads, and where: ids of RxSdo and TxSdo differ with firmware and hardware.
+
+ODrive publishes the ids with each firmware, in a file `flat_endpoints.json`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from struct import Struct
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.textfiles import read_text
+
+
+class Setting(StrEnum):
+    """Settings of an axis, by their paths in `odrivetool`."""
+
+    WATCHDOG_ENABLED = "axis0.config.enable_watchdog"
+    WATCHDOG_TIMEOUT = "axis0.config.watchdog_timeout"  # s
+    CURRENT = "axis0.config.motor.current_soft_max"  # A
+    SPEED = "axis0.controller.config.vel_limit"  # turns/s
+
+
+TYPES = {
+    Setting.WATCHDOG_ENABLED: "bool",
+    Setting.WATCHDOG_TIMEOUT: "float",
+    Setting.CURRENT: "float",
+    Setting.SPEED: "float",
+}
+FORMATS = {"bool": Struct("<?"), "float": Struct("<f")}
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Endpoint ids of one firmware on one hardware."""
+
+    firmware: str  # such as 0.6.11
+    hardware: str  # such as 4.4.58
+    ids: Mapping[Setting, int]
+
+    def setting_at(self, endpoint: int) -> Setting | None:
+        """Return the setting with this endpoint id; None: it is none of those."""
+        return next((setting for setting, number in self.ids.items() if number == endpoint), None)
+
+
+# Of emulated axes. The numbers are their own: no firmware of ODrive has them.
+EMULATED = Endpoints("0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(Setting)})
+
+
+class _Endpoint(msgspec.Struct):
+    type: str
+    id: int = -1
+
+
+class _File(msgspec.Struct):
+    fw_version: str
+    hw_version: str
+    endpoints: dict[str, _Endpoint]
+
+
+def read_all_endpoints(paths: Sequence[str]) -> list[Endpoints]:
+    """Read the files that the scenario names. Raises ConfigError."""
+    return [read_endpoints(path) for path in paths]
+
+
+def read_endpoints(path: str) -> Endpoints:
+    """Read a `flat_endpoints.json`. Raises ConfigError."""
+    where = "`backends.odrive.endpoints`"
+    advice = "take the flat_endpoints.json that ODrive publishes with the axes' firmware"
+    try:
+        file = msgspec.json.decode(read_text(Path(path)), type=_File)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}; {advice}") from None
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ConfigError(f"{where}: {path}: {error}; {advice}") from None
+    ids: dict[Setting, int] = {}
+    for setting in Setting:
+        endpoint = file.endpoints.get(setting)
+        if endpoint is None or not 0 <= endpoint.id <= 0xFFFF:
+            raise ConfigError(f"{where}: {path} has no endpoint {setting} with an id of 0 to 65535; {advice}")
+        if endpoint.type != TYPES[setting]:
+            raise ConfigError(
+                f"{where}: {path}: {setting} has the type {endpoint.type!r}, and this driver needs {TYPES[setting]!r}; "
+                f"{advice}"
+            )
+        ids[setting] = endpoint.id
+    firmware = file.fw_version.partition("-")[0]  # a release may have a suffix, which axes do not say
+    return Endpoints(firmware, file.hw_version, ids)

@@ -1,0 +1,228 @@
+"""What axes are configured for: read at the start by RxSdo and TxSdo, held against the robot file, never raised."""
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from snakesim_can_backend.family.drives import CanDrives
+from snakesim_can_backend.odrive.backend import MountedAxis, OdriveBackend, OdriveSettings
+from snakesim_can_backend.odrive.endpoints import EMULATED, Setting, read_endpoints
+from snakesim_can_backend.odrive.protocol import Message, parted, read_setting, setting_of
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.model.scenario import RunConfig
+from tests.unit.hal.drive_rig import DriveRig, drives_of
+from tests.unit.hal.rig import run_config
+
+JOINTS = 3
+TORQUE_NM, CONSTANT = 7.0, 0.03
+NEEDED_A = TORQUE_NM / CONSTANT  # 233 A
+REAL = ["slcan:/dev/none"]  # a bus that may have real axes
+
+
+class Robot(DriveRig):
+    """A robot on emulated axes, and every frame that its driver sends after the start."""
+
+    def __init__(self, **settings: Any) -> None:
+        config = self.configuration()
+        fixed: dict[str, Any] = {"plant": "inertia", "bring_up_limit_s": 0.3}
+        super().__init__(config, OdriveBackend(config, OdriveSettings(**fixed | settings)))
+        self.sent: list[Frame] = []
+        send = self.drives.wire.send
+        self.drives.wire.send = lambda frame: self.sent.append(frame) or send(frame)
+
+    @staticmethod
+    def configuration() -> RunConfig:
+        return run_config(
+            backend="odrive",
+            rate_hz=100,
+            robot__chain__modules=JOINTS,
+            robot__limits__torque_nm=TORQUE_NM,
+            robot__motor__torque_constant_nm_per_a=CONSTANT,
+        )
+
+    @property
+    def drives(self) -> Any:
+        return drives_of(self.backend)
+
+    def currents_a(self, joint: int) -> list[float]:
+        """Current limits that the driver has sent to an axis."""
+        limits = [frame for frame in self.sent if parted(frame) == (joint + 1, Message.SET_LIMITS)]
+        return [struct.unpack("<ff", frame.data)[1] for frame in limits]
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    one = Robot()
+    yield one
+    one.backend.close()
+
+
+def endpoints_file(path: Path, **changed: Any) -> str:
+    """A file as ODrive publishes one, of the emulated axes' firmware, with ids of its own."""
+    types = {Setting.WATCHDOG_ENABLED: "bool"}
+    endpoints: dict[str, Any] = {
+        setting: {"id": 300 + i, "type": types.get(setting, "float")} for i, setting in enumerate(Setting)
+    }
+    content = {
+        "fw_version": "0.6.11-1",
+        "hw_version": "4.4.58",
+        "endpoints": endpoints | {"reboot": {"type": "function"}},
+    }
+    path.write_text(json.dumps(content | changed), encoding="utf-8")
+    return str(path)
+
+
+# --- current -------------------------------------------------------------------------------------------------
+
+
+def test_arming_never_raises_the_current_limit_that_an_axis_is_configured_for(robot: Robot) -> None:
+    axis = robot.drives._twin.axes[1]
+    assert axis.current_soft_max_a == pytest.approx(NEEDED_A)
+    robot.run(5, "disarmed")
+    robot.run(30, "armed")
+    assert robot.currents_a(1) and max(robot.currents_a(1)) == pytest.approx(1.0 / CONSTANT), "the set-point's 1 N·m"
+    axis.current_soft_max_a = 10.0  # configured anew, behind the driver's back: the next start reads it
+    with pytest.raises(BackendError, match="joint_2"):
+        robot.backend._drives.bring_up()
+
+
+@pytest.mark.parametrize("configured_a", [10.0, 0.5 * NEEDED_A])
+def test_a_joint_whose_torque_needs_more_than_its_axis_is_configured_for_is_refused(configured_a: float) -> None:
+    words = (
+        rf"joint_2 \(node 2 on .*\) has a current limit \(`current_soft_max`\) of {configured_a:.4g} A, which is "
+        rf"{configured_a * CONSTANT:.3g} N·m, and its joint may ask for 7 N·m: raise the one, or lower `torque_nm`"
+    )
+    with pytest.raises(BackendError, match=f"(?s)nothing was enabled.*{words}"):
+        Robot(mounted={"joint_2": MountedAxis(current_soft_max_a=configured_a)})
+
+
+def test_a_lower_limit_is_given_back_when_the_axis_is_idle_and_named_where_a_killed_driver_has_left_it(
+    robot: Robot,
+) -> None:
+    """The next start reads it, and cannot know who has set it."""
+    robot.run(5, "disarmed")
+    robot.run(30, "armed")
+    axes = robot.drives._twin.axes
+    assert axes[0].current_soft_max_a == pytest.approx(1.0 / CONSTANT)
+    robot.run(30, "disarmed")
+    assert axes[0].current_soft_max_a == pytest.approx(NEEDED_A)
+    robot.run(30, "armed")
+    robot.backend._clock.robot_ns += 190_000_000  # the driver is gone, and the watchdogs stop the axes
+    with pytest.raises(BackendError, match=r"joint_1 .* If a driver was killed, .* lower limit: restart the axis"):
+        robot.backend._drives.bring_up()
+    for i in range(JOINTS):
+        robot.drives._twin.restart(i)
+    robot.backend._drives.bring_up()
+
+
+def test_a_joint_that_needs_more_than_the_driver_may_set_is_refused_before_the_start() -> None:
+    """Of real axes without a file of endpoints that is 1 A: whatever the motor is, it stands it."""
+    config = Robot.configuration()
+    words = r"joint_1: its `torque_nm` of 7 N·m needs 233.3 A at 0.03 N·m/A, .* no more than 1 A: .*endpoints"
+    with pytest.raises(ConfigError, match=words):
+        OdriveBackend.check(config, OdriveSettings(channels=REAL))
+    with pytest.raises(ConfigError, match=r"no more than 200 A: raise `backends.odrive.max_current_a`"):
+        OdriveBackend.check(config, OdriveSettings(max_current_a=200.0))
+    OdriveBackend.check(config, OdriveSettings(channels=REAL, max_current_a=240.0))
+
+
+@pytest.mark.parametrize(("max_current_a", "most_a"), [(None, 1.0), (200.0, 200.0)])
+def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are_unknown(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, max_current_a: float | None, most_a: float
+) -> None:
+    made = CanDrives.__init__
+
+    def as_if_real(drives: Any, *rest: Any, **kit: Any) -> None:
+        made(drives, *rest, **kit | {"emulated": False})
+
+    monkeypatch.setattr(CanDrives, "__init__", as_if_real)
+    monkeypatch.setattr(OdriveBackend, "check_current", lambda *_: None)
+    robot = Robot(max_current_a=max_current_a)
+    robot.limit_nm = TORQUE_NM
+    robot.run(20, "armed")
+    robot.backend.close()
+    assert max(robot.currents_a(0)) == pytest.approx(most_a)
+    assert f"limits of these axes are unknown: the driver sets no more than {most_a:g} A" in caplog.text
+
+
+# --- watchdog and speed --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mounted", "words"),
+    [
+        (MountedAxis(watchdog_timeout_s=0.0), r"has its watchdog off: set `enable_watchdog` = True and .* = 0.1"),
+        (MountedAxis(watchdog_timeout_s=1.0), r"has a watchdog of 1 s, and `backends.odrive.watchdog_s` says 0.1 s"),
+        (
+            MountedAxis(vel_limit_turns_s=0.5),
+            r"has a speed limit \(`vel_limit`\) of 0.5 turns/s, .* at 0.7958",
+        ),
+    ],
+    ids=["no watchdog", "another watchdog", "slower"],
+)
+def test_watchdog_and_speed_of_an_axis_are_as_the_robot_needs_them_or_it_is_refused(
+    mounted: MountedAxis, words: str
+) -> None:
+    with pytest.raises(BackendError, match=rf"(?s)nothing was enabled.*joint_3 \(node 3 on .*\) {words}"):
+        Robot(mounted={"joint_3": mounted})
+
+
+# --- endpoints -----------------------------------------------------------------------------------------------
+
+
+def test_ids_come_from_the_file_of_the_firmware(tmp_path: Path) -> None:
+    path = endpoints_file(tmp_path / "flat_endpoints.json")
+    assert read_endpoints(path).ids[Setting.CURRENT] != EMULATED.ids[Setting.CURRENT]
+    with pytest.raises(BackendError, match=r"joint_2 .* has a current limit"):
+        Robot(endpoints=[path], mounted={"joint_2": MountedAxis(current_soft_max_a=10.0)})
+    Robot(endpoints=[path]).backend.close()
+
+
+def test_a_file_of_another_firmware_is_refused(tmp_path: Path) -> None:
+    path = endpoints_file(tmp_path / "flat_endpoints.json", fw_version="0.6.10")
+    words = (
+        r"joint_1 .* has firmware 0.6.11 on hardware 4.4.58, and `backends.odrive.endpoints` names files of 0.6.10 on"
+    )
+    with pytest.raises(BackendError, match=words):
+        Robot(endpoints=[path])
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"endpoints": {}}, "has no endpoint axis0.config.enable_watchdog"),
+        (
+            {"endpoints": {s: {"id": 1, "type": "uint8"} for s in Setting}},
+            "enable_watchdog has the type 'uint8', and this driver needs 'bool'",
+        ),
+        ({"endpoints": []}, r"flat_endpoints.json: .*`\$.endpoints`"),
+        ({"fw_version": 6}, r"flat_endpoints.json: .*`\$.fw_version`"),
+    ],
+)
+def test_a_file_that_is_none_of_odrives_is_refused_before_the_start(
+    tmp_path: Path, changed: dict[str, Any], words: str
+) -> None:
+    path = endpoints_file(tmp_path / "flat_endpoints.json", **changed)
+    with pytest.raises(ConfigError, match=words):
+        OdriveBackend.check(run_config(backend="odrive"), OdriveSettings(endpoints=[path]))
+    with pytest.raises(ConfigError, match=r"`backends.odrive.endpoints`: .*nothing.json"):
+        OdriveBackend.check(run_config(backend="odrive"), OdriveSettings(endpoints=[str(tmp_path / "nothing.json")]))
+
+
+def test_an_axis_that_does_not_say_what_it_is_configured_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("snakesim_can_backend.odrive.twin.OdriveTwin._answer_setting", lambda *_: None)
+    with pytest.raises(BackendError, match=r"joint_1 .* does not say `axis0.config.enable_watchdog`"):
+        Robot()
+
+
+def test_questions_and_answers_are_those_of_odrives_examples() -> None:
+    """Their form is `<BHB` and the value: opcode, endpoint, reserved; `can_param_access.py` of ODriveResources."""
+    assert read_setting(3, 271) == Frame(3 << 5 | 0x04, struct.pack("<BHB", 0, 271, 0))
+    assert setting_of(struct.pack("<BHBf", 0, 271, 0, 12.5)) == (271, struct.pack("<f", 12.5))
+    with pytest.raises(struct.error):
+        setting_of(b"\0\1")
