@@ -1,21 +1,32 @@
 """Atomic file writes: a file is complete, or absent."""
 
 import contextlib
+import errno
 import os
+import stat
 from pathlib import Path
 
 PARTIAL = ".partial"
 
 
 def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Replace a file atomically. Raises OSError; then the earlier file is unchanged.
+    """Replace a file atomically, and keep its permissions. Raises OSError; then the earlier file is unchanged.
 
-    durable: return only when it is on the disk, and survives a loss of power.
+    A symbolic link at `path` is replaced, not followed: this is for files of this program, whose folder another user
+    may write to. For a file that belongs to the user there is `write_through`.
+
+    Args:
+        path: the file; its folder exists.
+        content: what the file contains afterwards.
+        durable: return only when it is on the disk, and survives a loss of power.
     """
     partial = path.with_name(path.name + PARTIAL)
     try:
         partial.unlink(missing_ok=True)
         with partial.open("xb") as file:  # not through a link
+            permissions = _permissions(path)
+            if permissions is not None:
+                os.fchmod(file.fileno(), permissions)
             file.write(content)
             if durable:
                 file.flush()
@@ -27,6 +38,28 @@ def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
         raise
     if durable:
         sync_folder(path.parent)
+
+
+def write_through(path: Path, content: bytes, *, durable: bool = False) -> None:
+    """Replace a file of the user atomically; where `path` is a symbolic link, the file that it leads to.
+
+    The link stays, and the file keeps its permissions. Raises OSError; then the earlier file is unchanged.
+    """
+    target = path
+    if path.is_symlink():
+        target = path.resolve(strict=True)  # a link to nowhere is a mistake of the user, not a wish for a new file
+        if not target.is_file():
+            raise OSError(errno.EINVAL, "its symbolic link does not lead to a file", str(path))
+    write_whole(target, content, durable=durable)
+
+
+def _permissions(path: Path) -> int | None:
+    """Return the permissions of a regular file; None without one."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return None
+    return stat.S_IMODE(mode) if stat.S_ISREG(mode) else None
 
 
 def sync_folder(folder: Path) -> None:

@@ -16,7 +16,7 @@ from snakesim_hal.model.files import decode, find, read_part
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_text
-from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.model.whole_file import write_through, write_whole
 from snakesim_hal.process import user_name
 
 
@@ -70,11 +70,17 @@ def write_checked(path: Path, checked: Checked) -> None:
 
 
 def _replace(path: Path, document: tomlkit.TOMLDocument) -> None:
-    candidate = path.with_name(f".{path.name}")  # checked before it takes the file's place; beside it, as for `extends`
-    write_whole(candidate, tomlkit.dumps(document).encode())
+    """Write a robot file once its new content has been read as one. Raises ConfigError; then nothing changed."""
+    content = tomlkit.dumps(document).encode()
+    candidate = path.with_name(f".{path.name}")  # beside it, as `extends` may name a file from there
     try:
+        write_whole(candidate, content)
         decode(read_part(str(candidate), "robots"), RobotFile)
-        candidate.replace(path)
+        write_through(path, content, durable=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be written: {error.strerror}; it is as it was. Correct that, and repeat the command"
+        ) from None
     finally:
         candidate.unlink(missing_ok=True)
 

@@ -1,12 +1,14 @@
-"""Whether a robot file is the one that a host was started with."""
+"""A robot file that is compared with that of a host, and changed in place."""
 
+import stat
 from pathlib import Path
 
 import pytest
 
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.robot import RobotFile, with_modes
-from snakesim_operator.commissioning.robot_edit import joints_on_drives
+from snakesim_operator.commissioning.robot_edit import change_joints, joints_on_drives
 
 
 @pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])
@@ -18,3 +20,24 @@ def test_drives_without_a_mode_that_the_file_names_are_of_the_same_robot(
     running = with_modes(decode(read_part(str(path), "robots"), RobotFile), ("position", "torque")).joint_table
     path.write_text(path.read_text() + changed)
     assert ([joint.drive for joint in joints_on_drives(path, running)] == [joint.drive for joint in running]) is same
+
+
+def test_a_change_follows_a_symbolic_link_and_keeps_link_permissions_and_text(tmp_path: Path) -> None:
+    (tmp_path / "robots.git").mkdir()
+    real, link = tmp_path / "robots.git" / "snake.toml", tmp_path / "snake.toml"
+    real.write_text('extends = "planar13" # ours\nname = "snake"\n')
+    real.chmod(0o640)
+    link.symlink_to(real)
+    change_joints(link, {"joint_1": {"zero_rad": 0.25}}, "straight pose")
+    assert link.is_symlink() and "zero_rad = 0.25" in real.read_text() and "# ours" in real.read_text()
+    assert stat.S_IMODE(real.stat().st_mode) == 0o640
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["robots.git", "snake.toml", "snake.toml"]
+
+
+def test_a_change_that_is_not_valid_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "snake.toml"
+    path.write_text('extends = "planar13"\nname = "snake"\n')
+    before = path.read_bytes()
+    with pytest.raises(ConfigError, match="gear"):
+        change_joints(path, {"joint_1": {"gear": -1.0}}, "by mistake")
+    assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
