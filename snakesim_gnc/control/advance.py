@@ -3,10 +3,9 @@
 import math
 from collections import deque
 
+from snakesim_hal.model.locomotion import WINDOW_S
 from snakesim_hal.wire.quantities import Vector
 
-WINDOW_S = 1.0
-MOVING_M = 0.005  # in a whole window: less counts as standing still
 SMOOTHED_S = 0.1  # time constant: filters the noise of the pose
 
 

@@ -1,6 +1,6 @@
 """The four states of the paper's Figure 6, as one pure function."""
 
-from snakesim_gnc.control.advance import MOVING_M, WINDOW_S
+from snakesim_hal.model.locomotion import MOVING_M, STANDING_STILL
 from snakesim_hal.wire.messages import LocomotionState
 
 PUSH_POINTS_NEEDED = 3
@@ -42,5 +42,5 @@ def locomotion_state(
     if advanced_m is None:
         return "NotLocomoting", "the motion of the body is not measured"
     if advanced_m < MOVING_M:
-        return "NotLocomoting", still or f"standing still: less than {MOVING_M * 1e3:g} mm in {WINDOW_S:g} s"
+        return "NotLocomoting", still or STANDING_STILL
     return "Locomoting", "pushing" if usable_push_points is not None else "moving"

@@ -148,6 +148,8 @@ def _why(outcome: Outcome) -> str:
     far = f"{way:.2f} m" if isinstance(way, float) else "unknown"
     of = f" of {goal:g} m" if isinstance(goal, float) else ""
     state, reason = numbers.get("last_state"), numbers.get("last_reason")
+    if state is None:  # the pose is unknown, and with it the motion
+        state, reason = numbers.get("reported_state"), numbers.get("reported_reason")
     last = f"{state}: {reason}" if reason else state
     ended = "" if numbers.get("ended") == "complete" else f"; {numbers.get('ended')}"
     ended += "; given up: no advance for too long" if numbers.get(GAVE_UP) else ""

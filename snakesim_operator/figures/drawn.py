@@ -17,7 +17,7 @@ from snakesim_operator.figures.paper import figures
 from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import zero_s
+from snakesim_operator.results.time_axis import zero_s
 
 FORMATS = (".pdf", ".svg", ".png")
 AXES_IN = 1.5  # height of a pair of axes

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 
 from snakesim_hal.arrays import Floats
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import zero_s
+from snakesim_operator.results.time_axis import zero_s
 
 STYLE: Any = {
     "font.size": 8.0,

@@ -18,18 +18,13 @@ from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.figures.lines import Floats, over_time
+from snakesim_operator.results.propulsion import Propulsion, propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
-from snakesim_operator.results.report.timeline import (
-    Propulsion,
-    commanded_torque_nm,
-    end_s,
-    most_used_joints,
-    propulsion_intervals,
-    reference_rad,
-)
+from snakesim_operator.results.report.timeline import commanded_torque_nm, most_used_joints, reference_rad
 from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.time_axis import end_s
 
 MOMENTS = 4
 ARROW_M = 0.25  # of the strongest force

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import nodes_w
+from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.results.record import RunRecord
 
 SAMPLE_S = 0.1
-STOOD_M, STOOD_S = 0.02, 1.0  # it stands while the body's centre has moved less than this within this time
 LASTING_S = 0.5  # noise may take it back over the line
 GIVE_UP_M = 0.03  # a run that does not come on so far within a given time has got stuck
 MIN_DISTANCE_M = 0.1  # below it, energy per metre says nothing
@@ -68,8 +68,13 @@ class Advance:
             case WaypointGoal() as goal:
                 return np.maximum.accumulate(self._past_points(goal))
             case None:
-                forward = self.head_w[0] - self.centre_w[0]
-                return self._projected(float(np.arctan2(forward[1], forward[0])))
+                return self.along_heading_m
+
+    @cached_property
+    def along_heading_m(self) -> Floats:
+        """(m,) the largest advance of the body so far along its first heading, from its centre to its head."""
+        forward = self.head_w[0] - self.centre_w[0]
+        return self._projected(float(np.arctan2(forward[1], forward[0])))
 
     @cached_property
     def crossed_s(self) -> float | None:
@@ -96,12 +101,12 @@ class Advance:
     @property
     def stalled_s(self) -> float:
         """For how long it stood until then."""
-        within = max(round(STOOD_S / SAMPLE_S), 1)
+        within = max(round(WINDOW_S / SAMPLE_S), 1)
         if len(self.time_s) <= within:
             return 0.0
         moved = np.hypot(*(self.centre_w[within:] - self.centre_w[:-within]).T)
         lasts = np.diff(self.time_s)[within - 1 :]
-        stood = (moved < STOOD_M) & (self.time_s[within:] <= self.until_s)
+        stood = (moved < MOVING_M) & (self.time_s[within:] <= self.until_s)
         return float(lasts[stood].sum())
 
     def _projected(self, heading_rad: float) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_operator.results.advance import MIN_DISTANCE_M, Advance, energy_j_per_m
+from snakesim_operator.results.advance import MIN_DISTANCE_M, Advance, energy_j, energy_j_per_m
 from snakesim_operator.results.form_closure import contacts_beside, form_closure_margin
 from snakesim_operator.results.record import RunRecord
 
@@ -44,6 +44,55 @@ class Effort:
             form_closure=_form_closure(record, advance),
             planning_share=_planning_share(record, advance),
         )
+
+
+@dataclass(frozen=True)
+class Directions:
+    """A whole run along two directions: the first heading of the body, and its net displacement.
+
+    None: unknown, or over too short a distance to say.
+
+    A body that travels sideways goes far, and hardly along its heading.
+    """
+
+    heading_advance_m: float | None = None
+    heading_energy_j_per_m: float | None = None
+    heading_body_lengths_s: float | None = None
+    heading_cost_of_transport: float | None = None
+    displacement_energy_j_per_m: float | None = None
+    displacement_body_lengths_s: float | None = None
+    displacement_cost_of_transport: float | None = None
+
+    @staticmethod
+    def of(
+        record: RunRecord, advance: Advance | None, net_m: float | None, known_s: float, *, has_power: bool
+    ) -> "Directions":
+        """net_m: the net displacement, within known_s. has_power: torques and speeds are known."""
+        if advance is None or net_m is None or known_s <= 0:
+            return Directions()
+        links = record.description.links
+        length_m = sum(link.length_m for link in links)
+        weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in links)
+        used_j = energy_j(record) if has_power else None
+        heading_m = float(advance.along_heading_m[-1])
+        heading_j_per_m = _over(used_j, heading_m)
+        displacement_j_per_m = _over(used_j, net_m)
+        return Directions(
+            heading_advance_m=heading_m,
+            heading_energy_j_per_m=heading_j_per_m,
+            heading_body_lengths_s=heading_m / known_s / length_m,
+            heading_cost_of_transport=None if heading_j_per_m is None else heading_j_per_m / weight_n,
+            displacement_energy_j_per_m=displacement_j_per_m,
+            displacement_body_lengths_s=net_m / known_s / length_m,
+            displacement_cost_of_transport=None if displacement_j_per_m is None else displacement_j_per_m / weight_n,
+        )
+
+
+def _over(used_j: float | None, distance_m: float) -> float | None:
+    """Energy per metre; None when it is unknown, and over a distance that is too short to say."""
+    if used_j is None or distance_m < MIN_DISTANCE_M:
+        return None
+    return used_j / distance_m
 
 
 def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:

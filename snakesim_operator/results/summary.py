@@ -8,15 +8,17 @@ import numpy as np
 from msgspec import Meta
 
 from snakesim_hal.arithmetic import foreign
-from snakesim_hal.wire.messages import Fault, Mode, Pace, Timing
+from snakesim_hal.model.locomotion import STANDING_STILL
+from snakesim_hal.wire.messages import ControlState, Fault, Mode, Pace, Timing
 from snakesim_operator.results.advance import Advance, body_centre_w, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.came_true import came_true
-from snakesim_operator.results.effort import Effort
+from snakesim_operator.results.effort import Directions, Effort
 from snakesim_operator.results.estimates import Estimates
+from snakesim_operator.results.motion import Motion, motion_of
+from snakesim_operator.results.propulsion import count_hand_overs, propulsion_periods
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
-TOLD_FOR_S = 0.5  # control publishes its state twenty times a second: after a longer silence it is unknown
 
 
 def _number(unit: str, about: str) -> Meta:
@@ -67,13 +69,23 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     reckoned_off_m: Annotated[
         float | None, _number("m", "the reckoned pose from the measured one, at most; null: one of them is unknown")
     ] = None
-    locomoting_fraction: Annotated[float | None, _number("1", "share of the time in state Locomoting")]
+    locomoting_fraction: Annotated[
+        float | None,
+        _number("1", "share of the time in which the centre of mass moved 2 cm or more within a second, as measured"),
+    ]
     propulsion_joints: Annotated[
         list[str] | None, Meta(description="one at a time, in order of use; null: control reported nothing")
     ]
+    hand_overs: Annotated[
+        int | None, Meta(description="how often propulsion passed from one joint to another; null: as above")
+    ] = None
     jammed: Annotated[bool, Meta(description="whether the controller reported a jam at any time")]
-    last_state: str | None
-    last_reason: str | None
+    last_state: Annotated[str | None, Meta(description="at the end, by the measured motion; null: the pose is unknown")]
+    last_reason: Annotated[
+        str | None, Meta(description="why, as control reported it if its state agrees with the motion")
+    ]
+    reported_state: Annotated[str | None, Meta(description="the last one that control reported")] = None
+    reported_reason: Annotated[str | None, Meta(description="the reason that control reported with it")] = None
     peak_joint_torque_nm: Annotated[float | None, _number("N·m", "largest torque of any joint")]
     torque_saturated_fraction: Annotated[float | None, _number("1", "ticks with a joint at its torque limit")]
     peak_contact_force_n: Annotated[
@@ -104,7 +116,29 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     energy_j_per_m: Annotated[float | None, _number("J/m", "energy until then over the advance")] = None
     stalled_s: Annotated[
-        float | None, _number("s", "time until then in which the centre of mass moved less than 2 cm within a second")
+        float | None,
+        _number(
+            "s",
+            "time until then in which the centre of mass moved less than 2 cm within the last second, so that it "
+            "counts from a second after the body came to rest",
+        ),
+    ] = None
+    heading_advance_m: Annotated[float | None, _number("m", "largest advance along the body's first heading")] = None
+    heading_energy_j_per_m: Annotated[float | None, _number("J/m", "energy of the run over that")] = None
+    heading_body_lengths_s: Annotated[
+        float | None, _number("1/s", "that advance in lengths of the body over the time of the run")
+    ] = None
+    heading_cost_of_transport: Annotated[
+        float | None, _number("1", "energy of the run over weight times that advance")
+    ] = None
+    displacement_energy_j_per_m: Annotated[
+        float | None, _number("J/m", "energy of the run over `net_displacement_m`, whatever the body's heading")
+    ] = None
+    displacement_body_lengths_s: Annotated[
+        float | None, _number("1/s", "`net_displacement_m` in lengths of the body over the time of the run")
+    ] = None
+    displacement_cost_of_transport: Annotated[
+        float | None, _number("1", "energy of the run over weight times `net_displacement_m`")
     ] = None
     body_lengths_s: Annotated[float | None, _number("1/s", "`advance_m_s` in lengths of the body")] = None
     cost_of_transport: Annotated[float | None, _number("1", "energy until then over weight times advance")] = None
@@ -165,7 +199,11 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     moved_m = path_m if path_m is not None else net_m
     has_contacts = record.feels_contacts and count > 0
     last = record.control[-1] if record.control else None
-    limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
+    motion = motion_of(record)
+    last_state, last_reason = last_state_of(motion, last)
+    propelled = propulsion_periods(record) if record.control else None
+    joints = record.description.joints
+    limits = np.array([joint.torque_limit_nm for joint in joints])
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
     advance, forces = Advance.of(record), came_true(record.control)
     return RunSummary(
@@ -188,11 +226,14 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         net_displacement_m=net_m,
         **vars(Estimates.of(record)),
         mean_speed_m_s=moved_m / known_s if moved_m is not None else None,
-        locomoting_fraction=_locomoting_fraction(record),
-        propulsion_joints=propulsion_sequence(record) if record.control else None,
+        locomoting_fraction=motion.moving_fraction if motion else None,
+        propulsion_joints=None if propelled is None else [joints[one.joint].name for one in propelled],
+        hand_overs=None if propelled is None else count_hand_overs(propelled),
         jammed=any(state.jammed for state in record.control),
-        last_state=last.state if last else None,
-        last_reason=last.reason if last else None,
+        last_state=last_state,
+        last_reason=last_reason,
+        reported_state=last.state if last else None,
+        reported_reason=last.reason if last else None,
         peak_joint_torque_nm=largest(np.abs(record.torque_nm)),
         torque_saturated_fraction=float((np.abs(record.torque_nm) >= SATURATED_FROM * limits).any(axis=1).mean())
         if count
@@ -212,6 +253,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         energy_j_per_m=energy_j_per_m(record, advance) if advance and has_power else None,
         stalled_s=advance.stalled_s if advance else None,
         **vars(Effort.of(record, advance, has_power=has_power)),
+        **vars(Directions.of(record, advance, net_m, known_s, has_power=has_power)),
         state_to_command_us=host.state_to_command_us,
         tick_times=host.tick_times,
         too_slow=[f"control: {last.too_slow}"] if last and last.too_slow else [],
@@ -229,14 +271,16 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     )
 
 
-def propulsion_sequence(record: RunRecord) -> list[str]:
-    """Joints that propelled, in order, each listed again when it takes over again."""
-    names: list[str] = []
-    for state in record.control:
-        joint = state.propulsion_joint
-        if joint is not None and (not names or names[-1] != joint):
-            names.append(joint)
-    return names
+def last_state_of(motion: Motion | None, reported: ControlState | None) -> tuple[str | None, str | None]:
+    """State and reason at the end, by the measured motion. What control reported counts where the two agree."""
+    if motion is None:
+        return None, None
+    if motion.final_stop is None:
+        agrees = reported is not None and reported.state == "Locomoting"
+        return "Locomoting", reported.reason if reported and agrees else "moving"
+    if reported is not None and reported.state != "Locomoting":
+        return reported.state, reported.reason
+    return "NotLocomoting", STANDING_STILL
 
 
 def arc_position_m(record: RunRecord, row: int) -> float | None:
@@ -266,14 +310,3 @@ def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
     start, end = arc_position_m(record, row), arc_position_m(record, last_row)
     known_s = (last_row - row + 1) * record.config.period_ns * 1e-9
     return (None if start is None or end is None else end - start), net, known_s
-
-
-def _locomoting_fraction(record: RunRecord) -> float | None:
-    """A state holds until the next one, but at most for TOLD_FOR_S."""
-    if not record.control or len(record.time_s) == 0:
-        return None
-    begin, end = float(record.time_s[0]), float(record.time_s[-1])
-    stamps = [min(max(state.stamp_ns * 1e-9, begin), end) for state in record.control] + [end]
-    held_s = [min(stamps[i + 1] - stamps[i], TOLD_FOR_S) for i in range(len(record.control))]
-    moving = sum(held for held, state in zip(held_s, record.control, strict=True) if state.state == "Locomoting")
-    return moving / (end - begin) if end > begin else None

@@ -19,12 +19,13 @@ from snakesim_operator.robots.urdf_sensors import gazebo_lines
 GEOMETRY = ("name", "chain", "module", "links")  # what links, joints and the robot's own name say
 AXES = {"yaw": "0 0 1", "pitch": "0 1 0"}
 COLOUR = "0.87 0.45 0.12 1"
+LOOK = f'<material name="orange"><color rgba="{COLOUR}"/></material>'
 
 
 def urdf_of(robot: RobotFile) -> str:
     """The text of the URDF."""
     lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(robot.name)}>"]
-    lines += ['  <material name="orange">', f'    <color rgba="{COLOUR}"/>', "  </material>"]
+    lines.append(f"  {LOOK}")
     links = robot.links or [
         Link(length_m=length, mass_kg=mass)
         for length, mass in zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)
@@ -34,10 +35,15 @@ def urdf_of(robot: RobotFile) -> str:
             lines += _joint(robot, i, links[i - 1].length_m)
         lines += _link(i, link, robot.module.radius_m)
     lines += gazebo_lines(robot)
-    rest = {key: value for key, value in msgspec.to_builtins(robot).items() if key not in GEOMETRY}
-    for key, value in _by_section(rest):
+    for key, value in values_beside_urdf(robot).items():
         lines.append(f"  <snakesim key={quoteattr(key)} value={quoteattr(json.dumps(value, ensure_ascii=False))}/>")
     return "\n".join([*lines, "</robot>", ""])
+
+
+def values_beside_urdf(robot: RobotFile) -> dict[str, Any]:
+    """What URDF has no words for, and what it has words for and only some readers take; by dotted key."""
+    rest = {key: value for key, value in msgspec.to_builtins(robot).items() if key not in GEOMETRY}
+    return dict(_by_section(rest))
 
 
 def _by_section(values: dict[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,6 +1,7 @@
 """URDF of a robot from its description on the network: links as capsules, joints with axes and limits.
 
-It is what RViz draws and what planners read. The robot file, which knows meshes and sensors, may be on another machine.
+It is what RViz draws and what planners read. The robot file, which knows meshes, sensors, inertia and friction, may be
+on another machine; a comment in the document says what is missing.
 """
 
 import math
@@ -9,11 +10,16 @@ from xml.etree import ElementTree
 from snakesim_hal.wire.messages import Description, JointDescription, LinkDescription
 
 AXES = {"yaw": "0 0 1", "pitch": "0 1 0"}
+LOSSES = (
+    " The description on the network has neither inertia nor friction: each link has the inertia of a solid cylinder, "
+    "and no joint has dynamics. `snakesim robot export` writes both, from the robot file. "
+)
 
 
 def urdf_of(robot: Description, prefix: str = "") -> str:
     """The document. prefix: before the names of links, as in the frames."""
     root = ElementTree.Element("robot", name=robot.robot)
+    root.append(ElementTree.Comment(LOSSES))
     ElementTree.SubElement(root, "link", name=f"{prefix}base_link")
     _joint(root, "base", "fixed", f"{prefix}base_link", prefix + robot.links[0].name, 0.0)
     for link in robot.links:

@@ -26,6 +26,7 @@ from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
 
 JOINTS_SHOWN = 8
+ANOTHER_WAY = 0.2  # of the energy per metre: a larger difference shows that the body travelled sideways
 DONE, FAILED, INTERRUPTED = 0, 1, 130
 
 
@@ -84,7 +85,7 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
         return ["nothing was recorded"], ""
     try:
         record, summary = leave(files, files.folder, ending, outcome)
-        _print_summary(summary)
+        print_summary(summary)
     except ConfigError as error:
         _print_host(host)
         return [*unwritten(host), str(error)], ""
@@ -150,7 +151,9 @@ def _came_true(summary: RunSummary) -> str:
     return f"measured: {correlation}, median error {100 * error:.0f} %, {100 * empty:.0f} % of push-points empty"
 
 
-def _print_summary(summary: RunSummary) -> None:
+def print_summary(summary: RunSummary) -> None:
+    """Print the numbers of a run, one line each."""
+
     def number(value: float | None, unit: str, digits: int = 2) -> str:
         return "unknown" if value is None else f"{value:.{digits}f} {unit}"
 
@@ -162,16 +165,14 @@ def _print_summary(summary: RunSummary) -> None:
             f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({number(summary.real_time_factor, 'x', 1)})",
         ),
         *([("goal", f"{summary.goal_m:g} m, reached after {summary.crossed_s:.1f} s")] if summary.crossed_s else []),
-        (
-            "locomoting",
-            "unknown" if summary.locomoting_fraction is None else f"{100 * summary.locomoting_fraction:.0f} %",
-        ),
-        ("propulsion joints", _in_short(summary.propulsion_joints)),
+        ("locomoting", _share_of_time(summary.locomoting_fraction)),
+        ("propulsion joints", _in_short(summary)),
         ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
-        ("energy per metre", number(summary.energy_j_per_m, "J/m", 1)),
+        ("energy per metre", _energy_per_metre(summary)),
         ("contact over 50 ms", number(summary.peak_contact_force_n, "N", 1)),
         *([("solved forces", words)] if (words := _came_true(summary)) else []),
         ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
+        *_last_report(summary),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
     ]
     rows += [("too slow", words) for words in summary.too_slow]
@@ -192,9 +193,35 @@ def _print_summary(summary: RunSummary) -> None:
         say(f"  {name:<22}{value}")
 
 
-def _in_short(joints: Sequence[str] | None) -> str:
+def _share_of_time(share: float | None) -> str:
+    return "unknown" if share is None else f"{100 * share:.0f} % of the time"
+
+
+def _last_report(summary: RunSummary) -> list[tuple[str, str]]:
+    """What control reported last, where that is not what was measured."""
+    reported = summary.reported_state, summary.reported_reason
+    if summary.reported_state is None or reported == (summary.last_state, summary.last_reason):
+        return []
+    return [("control reported", f"{summary.reported_state}: {summary.reported_reason}")]
+
+
+def _energy_per_metre(summary: RunSummary) -> str:
+    """Towards the goal; without one along the first heading, and along the displacement where that is another way."""
+    along = summary.energy_j_per_m
+    displaced = summary.displacement_energy_j_per_m
+    shown = "unknown" if along is None else f"{along:.1f} J/m"
+    if summary.goal_m is not None or displaced is None:
+        return shown
+    if along is not None and abs(displaced - along) <= ANOTHER_WAY * along:
+        return shown
+    heading = "too little advance along the first heading" if along is None else f"{shown} along the first heading"
+    return f"{displaced:.1f} J/m along its displacement, {heading}"
+
+
+def _in_short(summary: RunSummary) -> str:
+    joints = summary.propulsion_joints
     if joints is None:
         return "unknown"
     if len(joints) <= JOINTS_SHOWN:
         return " -> ".join(joints) or "no joint alone"
-    return f"{' -> '.join(joints[:JOINTS_SHOWN])} -> ... ({len(joints)} hand-overs in all)"
+    return f"{' -> '.join(joints[:JOINTS_SHOWN])} -> ... ({summary.hand_overs} hand-overs in all)"

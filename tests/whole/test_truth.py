@@ -27,15 +27,15 @@ def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_p
     (tmp_path / "still.py").write_text(STILL)
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
     assert ended.code == 0 and summary.locomoting_fraction == 0.0
-    assert (summary.last_state, summary.last_reason) == ("NotLocomoting", "standing still: less than 5 mm in 1 s")
+    assert (summary.last_state, summary.last_reason) == ("NotLocomoting", "standing still: less than 20 mm in 1 s")
     assert "locomoting            0 %" in ended.out
-    assert "Did not locomote: standing still: less than 5 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
+    assert "Did not locomote: standing still: less than 20 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
 
 
 def test_a_snake_that_moves_locomotes_from_when_it_is_seen_to_move(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
     assert ended.code == 0 and summary.path_distance_m is not None and summary.path_distance_m > 0.5
-    assert summary.locomoting_fraction is not None and 0.85 < summary.locomoting_fraction < 1.0
+    assert summary.locomoting_fraction is not None and summary.locomoting_fraction > 0.95
     states = [state.state for state in RunRecord.load(tmp_path / "run").control if state.state != "Idle"]
     assert states[0] == "NotLocomoting" and states[-1] == "Locomoting"
 

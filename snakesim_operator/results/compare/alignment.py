@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import zero_s
+from snakesim_operator.results.time_axis import zero_s
 
 SAME_INSTANT_S = 1e-6
 

@@ -14,8 +14,9 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, identity
+from snakesim_operator.results.propulsion import Propulsion, propulsion_periods
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import Propulsion, Series, distance, hand_overs, reported_distance
+from snakesim_operator.results.report.timeline import Series, distance, reported_distance
 
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
 NAMED = 12  # hand-overs, one after the other
@@ -273,7 +274,7 @@ def _unreported(a: RunRecord, b: RunRecord) -> str:
 
 def _hand_overs(record: RunRecord, until_s: float) -> list[Propulsion]:
     """Within the common time."""
-    return [one for one in hand_overs(record) if one.start_s <= until_s + SAME_INSTANT_S]
+    return [one for one in propulsion_periods(record) if one.start_s <= until_s + SAME_INSTANT_S]
 
 
 def _parted(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:

@@ -4,12 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from snakesim_operator.results.motion import motion_of
+from snakesim_operator.results.propulsion import propulsion_periods
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unfelt
-from snakesim_operator.results.report.timeline import end_s, hand_overs, jam_bands
+from snakesim_operator.results.report.timeline import jam_bands
 from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
-from snakesim_operator.results.summary import RunSummary, distance_m
+from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.results.time_axis import end_s
 
 HAND_OVERS_DRAWN, HAND_OVERS_LISTED = 4, 8
 SETTLED_S = 0.6  # so soon after a hand-over the forces are drawn that belong to it
@@ -32,7 +35,7 @@ def events(record: RunRecord, summary: RunSummary) -> list[Event]:
         return []
     names = [joint.name for joint in record.description.joints]
     found = [Event(0.0, "Start")]
-    for i, one in enumerate(hand_overs(record)):
+    for i, one in enumerate(propulsion_periods(record)):
         words = f"Hand-over to {names[one.joint]}" if i else f"{names[one.joint]} begins to propel"
         found.append(Event(one.start_s, words, one.joint))
     forces = record.contact_peak_n
@@ -41,8 +44,8 @@ def events(record: RunRecord, summary: RunSummary) -> list[Event]:
         at_s = float(record.time_s[row] - record.time_s[0])
         found.append(Event(at_s, f"Largest contact force over 50 ms, {forces[row]:.0f} N"))
     found += [Event(band.start_s, "Jam") for band in jam_bands(record)[:1]]
-    moved_m = distance_m(summary)
-    stop = stop_of(record, abs(moved_m)) if moved_m else None
+    motion = motion_of(record)
+    stop = stop_of(record, motion) if motion and summary.locomoting_fraction else None
     found.append(Event(end_s(record), "End") if stop is None else Event(stop.at_s, "Stop"))
     return sorted(found, key=lambda one: one.time_s)
 

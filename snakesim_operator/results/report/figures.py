@@ -4,21 +4,22 @@ from typing import Any
 
 import numpy as np
 
+from snakesim_operator.results.motion import MOVING, STANDING, motion_of
 from snakesim_operator.results.page.charts import Bar, Figure, Floats, Line, Mark, bars, joint_map, lines
+from snakesim_operator.results.propulsion import Propulsion
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import (
-    Propulsion,
     Series,
     commanded_torque_nm,
-    end_s,
     in_words,
     jam_bands,
     reference_rad,
     state_bands,
-    zero_s,
 )
 from snakesim_operator.results.summary import SATURATED_FROM, largest
+from snakesim_operator.results.time_axis import end_s, zero_s
 
+MOTION_COLORS = {MOVING: "--locomoting", STANDING: "--notlocomoting"}
 LOWERED = 0.995  # of the joint's limit: a controller's own limit below that is drawn
 
 
@@ -39,8 +40,13 @@ def advance(record: RunRecord, moved: Series) -> Figure:
 
 
 def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
-    """States, jams, and a row for each joint that propelled."""
+    """Measured motion, states that control reported, jams, and a row for each joint that propelled."""
+    motion = motion_of(record)
     drawn = [
+        Bar("motion", span.start_s, span.end_s, span.what, MOTION_COLORS[span.what])
+        for span in (motion.spans if motion else [])
+    ]
+    drawn += [
         Bar("state", band.start_s, band.end_s, in_words(band.what), f"--{band.what.lower()}")
         for band in state_bands(record)
     ]
@@ -48,7 +54,7 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
     names = [joint.name for joint in record.description.joints]
     drawn += [Bar(names[i.joint], i.start_s, i.end_s, f"{i.length_s:.1f} s", colour(i.joint)) for i in intervals]
     propelled = [names[joint] for joint in sorted({one.joint for one in intervals}, reverse=True)]
-    rows = [row for row in ("state", "jam") if any(bar.row == row for bar in drawn)] + propelled
+    rows = [row for row in ("motion", "state", "jam") if any(bar.row == row for bar in drawn)] + propelled
     return bars("States and propulsion joint over time", rows, drawn, end_s(record), faults(record))
 
 

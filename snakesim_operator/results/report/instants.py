@@ -14,7 +14,7 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.came_true import is_felt
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import reported_at_s
+from snakesim_operator.results.time_axis import reported_at_s
 
 NEEDED = 3
 WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous

@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
 from snakesim_operator.results.page.html import render
+from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
@@ -17,19 +18,12 @@ from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
 from snakesim_operator.results.report.pushing import pushing
 from snakesim_operator.results.report.reasons import why_at_limit, why_empty, why_late, why_refused
-from snakesim_operator.results.report.timeline import (
-    distance,
-    end_s,
-    in_words,
-    joined,
-    most_used_joints,
-    propulsion_intervals,
-    zero_s,
-)
+from snakesim_operator.results.report.timeline import distance, in_words, joined, most_used_joints
 from snakesim_operator.results.report.top_view import top_view
 from snakesim_operator.results.report.verdict import verdict
 from snakesim_operator.results.report.view import nodes_xy_w, views
 from snakesim_operator.results.summary import RunSummary, distance_m
+from snakesim_operator.results.time_axis import end_s, zero_s
 
 HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0

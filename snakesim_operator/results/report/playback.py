@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
+from snakesim_operator.results.motion import MOVING, STANDING, Motion, motion_of
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, element, figure
-from snakesim_operator.results.report.timeline import end_s, in_words, zero_s
+from snakesim_operator.results.report.timeline import in_words
 from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view, nodes_xy_w
+from snakesim_operator.results.time_axis import end_s, zero_s
 
 MessageT = TypeVar("MessageT", ControlState, World)
 FRAMES = 300
@@ -53,6 +55,7 @@ def playback(record: RunRecord) -> Playback | None:
     worlds = _latest(record, rows, record.worlds)
     units = _units_per_n(states, worlds)
     view = map_view(record, nodes, units, WIDTH)
+    motion = motion_of(record)
     said: list[str] = []
     maps, map_of = _perceived(record, view, rows)
     paths, path_of = _planned(record, view, rows)
@@ -61,7 +64,7 @@ def playback(record: RunRecord) -> Playback | None:
         joint = state.propulsion_joint if state is not None else None
         solved, kinds = _solved(view, state, world, units)
         felt = _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in _contacts(world)], units)
-        words = f"{in_words(state.state)}: {state.reason}" if state is not None else "the controller says nothing"
+        words = _caption(motion, float(record.time_s[row]) - zero_s(record), state)
         if words not in said:
             said.append(words)
         time_s = float(record.time_s[row]) - zero_s(record)
@@ -80,6 +83,20 @@ def playback(record: RunRecord) -> Playback | None:
     data |= {"maps": maps, "paths": paths}
     with_solved, with_felt = (any(frame[k] for frame in frames) for k in (4, 5))
     return Playback(Markup(picture), data, with_solved, with_felt)
+
+
+def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -> str:
+    """What the body did at a time, as measured, and what control reported then."""
+    reported = "control reported nothing" if state is None else f"{in_words(state.state)}: {state.reason}"
+    if motion is None:
+        return reported
+    if motion.stands_at(time_s):
+        agrees = state is not None and state.state != "Locomoting"
+        return reported if agrees else STANDING
+    agrees = state is not None and state.state == "Locomoting"
+    if agrees or state is None:
+        return reported if agrees else MOVING
+    return f"{MOVING}; control reported {reported}"
 
 
 def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:

@@ -9,9 +9,11 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.map_score import MapScore, score
+from snakesim_operator.results.motion import motion_of
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import end_s, reported_at_s, reported_spans, zero_s
+from snakesim_operator.results.report.timeline import longest_reason, state_bands
+from snakesim_operator.results.time_axis import end_s, reported_at_s, reported_spans, zero_s
 
 MAX_OBSTACLES = 24  # that get a row of their own: those that gave most
 MIN_FORCE_N = 0.5  # a smaller wanted force is none
@@ -22,7 +24,7 @@ MAPS_SCORED = 60
 
 @dataclass(frozen=True)
 class Stop:
-    """It did not locomote for a while, and the controller said why; of several reasons the one that held longest."""
+    """It stood still for a while; why: the reason that control reported for longest, or what was measured."""
 
     start_s: float
     end_s: float
@@ -120,18 +122,14 @@ def _merged(spans: list[tuple[float, float, float]]) -> list[tuple[float, float,
 
 
 def _stops(record: RunRecord) -> list[Stop]:
-    """Every time that it did not locomote for a while."""
-    found: list[Stop] = []
-    reasons: dict[str, float] = {}
-    for since, until, state in reported_spans(record):
-        if state.state == "NotLocomoting":
-            if not reasons:
-                found.append(Stop(since, until, ""))
-            reasons[state.reason] = reasons.get(state.reason, 0.0) + until - since
-            found[-1] = Stop(found[-1].start_s, until, max(reasons, key=lambda why: reasons[why]))
-        else:
-            reasons.clear()
-    return [one for one in found if one.end_s - one.start_s >= STOOD_S]
+    """Every time that the body stood still for a while, by the measured motion; without a pose by what was reported."""
+    motion = motion_of(record)
+    if motion is None:
+        standing = [band for band in state_bands(record) if band.what == "NotLocomoting"]
+    else:
+        standing = motion.standing
+    long = [one for one in standing if one.end_s - one.start_s >= STOOD_S]
+    return [Stop(one.start_s, one.end_s, longest_reason(record, one)) for one in long]
 
 
 def _scored(record: RunRecord) -> tuple[MapScore | None, Figure | None]:

@@ -6,35 +6,17 @@ from functools import lru_cache
 import numpy as np
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.wire.messages import ControlState, Mode
+from snakesim_hal.model.locomotion import STANDING_STILL
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.motion import Motion
+from snakesim_operator.results.propulsion import Propulsion
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.summary import arc_position_m
+from snakesim_operator.results.time_axis import Interval, merge_reports, reported_at_s, reported_spans, zero_s
 
 POSE_SAMPLES = 400
 STATES = {"Locomoting": "moving as meant", "NotLocomoting": "not moving", "Idle": "idle", "PowerOff": "power off"}
-
-
-@dataclass(frozen=True)
-class Interval:
-    """Something that held for a while."""
-
-    start_s: float
-    end_s: float
-    what: str
-
-
-@dataclass(frozen=True)
-class Propulsion:
-    """A joint propelled for a while."""
-
-    start_s: float
-    end_s: float
-    joint: int
-
-    @property
-    def length_s(self) -> float:
-        """How long."""
-        return self.end_s - self.start_s
+MIN_MISMATCH_S = 1.0  # control's own measurement of motion looks back for as long
 
 
 @dataclass(frozen=True)
@@ -51,56 +33,50 @@ def in_words(state: str) -> str:
     return STATES.get(state, state)
 
 
-def zero_s(record: RunRecord) -> float:
-    """The robot's time at the first tick: where every time axis begins."""
-    if len(record.time_s):
-        return float(record.time_s[0])
-    return record.control[0].stamp_ns * 1e-9 if record.control else 0.0
-
-
-def end_s(record: RunRecord) -> float:
-    """The end of the last tick, on the time axis."""
-    if len(record.time_s):
-        return float(record.time_s[-1]) - zero_s(record) + record.config.period_ns * 1e-9
-    return record.control[-1].stamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
-
-
-def reported_at_s(record: RunRecord, state: ControlState) -> float:
-    """When a state was reported, on the time axis and within the run."""
-    return min(max(state.stamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
-
-
-def reported_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
-    """(since, until, state) on the time axis: each state holds until the next is reported."""
-    starts = [reported_at_s(record, state) for state in record.control]
-    return list(zip(starts, [*starts, end_s(record)][1:], record.control, strict=True))
-
-
 def state_bands(record: RunRecord) -> list[Interval]:
-    """Locomotion states; each holds until the next is reported."""
-    return _merged(record, [state.state for state in record.control])
+    """Locomotion states as control reported them; each holds until the next is reported."""
+    return merge_reports(record, [state.state for state in record.control])
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """Control reported for some time that the body did not locomote, and it moved."""
+
+    lasted_s: float
+    since_s: float
+    reason: str  # that was reported for longest
+
+
+def reported_while_moving(record: RunRecord, motion: Motion) -> Mismatch | None:
+    """What control gave as a reason for no motion while the body moved; None when that was short."""
+    lasted_s: dict[str, float] = {}
+    since_s: list[float] = []
+    for since, until, state in reported_spans(record):
+        is_report = state.state == "NotLocomoting" and state.reason != STANDING_STILL
+        if not is_report or until <= since or motion.stands_at((since + until) / 2):
+            continue
+        lasted_s[state.reason] = lasted_s.get(state.reason, 0.0) + until - since
+        since_s.append(since)
+    total_s = sum(lasted_s.values())
+    if total_s < MIN_MISMATCH_S:
+        return None
+    return Mismatch(total_s, since_s[0], max(lasted_s, key=lambda reason: lasted_s[reason]))
+
+
+def longest_reason(record: RunRecord, span: Interval) -> str:
+    """The reason for standing that control reported for longest within a span; without one, what was measured."""
+    lasted_s: dict[str, float] = {}
+    for since, until, state in reported_spans(record):
+        overlap_s = min(until, span.end_s) - max(since, span.start_s)
+        if state.state != "Locomoting" and overlap_s > 0:
+            lasted_s[state.reason] = lasted_s.get(state.reason, 0.0) + overlap_s
+    return max(lasted_s, key=lambda reason: lasted_s[reason], default="") or STANDING_STILL
 
 
 def jam_bands(record: RunRecord) -> list[Interval]:
     """When the controller said that the snake was jammed."""
-    bands = _merged(record, ["jammed" if state.jammed else None for state in record.control])
+    bands = merge_reports(record, ["jammed" if state.jammed else None for state in record.control])
     return [band for band in bands if band.what == "jammed"]
-
-
-def propulsion_intervals(record: RunRecord) -> list[Propulsion]:
-    """Which joint propelled when, in order of time."""
-    joints = {joint.name: i for i, joint in enumerate(record.description.joints)}
-    bands = _merged(record, [state.propulsion_joint for state in record.control])
-    return [Propulsion(b.start_s, b.end_s, joints[b.what]) for b in bands if b.what in joints]
-
-
-def hand_overs(record: RunRecord) -> list[Propulsion]:
-    """Every time that another joint began to propel. One that pauses and goes on is none."""
-    found: list[Propulsion] = []
-    for one in propulsion_intervals(record):
-        if not found or found[-1].joint != one.joint:
-            found.append(one)
-    return found
 
 
 def joined(intervals: list[Propulsion], gap_s: float) -> list[Propulsion]:
@@ -143,7 +119,7 @@ def commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
     return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
 
 
-@lru_cache(maxsize=2)  # verdict, events and chart ask for it
+@lru_cache(maxsize=2)  # the chart and the comparison ask for it
 def distance(record: RunRecord) -> Series | None:
     """Advance since the first tick: along the route, else of the tail as the controller knew it, else as it flies."""
     count = len(record.time_s)
@@ -160,15 +136,6 @@ def distance(record: RunRecord) -> Series | None:
     return reported_distance(record)
 
 
-def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
-    """Since when the body has stayed where it was at the end, on the time axis; None when nobody measured where."""
-    moved = distance(record)
-    if moved is None or not len(moved.value):
-        return None
-    away = np.flatnonzero(np.abs(moved.value - moved.value[-1]) > within_m)
-    return float(moved.time_s[away[-1] + 1]) if len(away) else 0.0
-
-
 def reported_distance(record: RunRecord) -> Series | None:
     """Advance of the tail since the controller first reported its place on the path."""
     states = [state for state in record.control if state.path_s_m is not None]
@@ -177,16 +144,3 @@ def reported_distance(record: RunRecord) -> Series | None:
     along = np.array([state.path_s_m for state in states], dtype=np.float64)
     stamps = np.array([reported_at_s(record, state) for state in states])
     return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
-
-
-def _merged(record: RunRecord, values: list[str | None]) -> list[Interval]:
-    """Equal neighbours become one band; None is left out."""
-    bands: list[Interval] = []
-    for (since, until, _), what in zip(reported_spans(record), values, strict=True):
-        if what is None or until <= since:
-            continue
-        if bands and bands[-1].what == what and bands[-1].end_s >= since:
-            bands[-1] = Interval(bands[-1].start_s, until, what)
-        else:
-            bands.append(Interval(since, until, what))
-    return bands

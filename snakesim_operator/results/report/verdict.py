@@ -3,21 +3,17 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_operator.results.ended import COMPLETE, UNKNOWN
+from snakesim_operator.results.motion import Motion, motion_of
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import (
-    came_to_rest_s,
-    end_s,
-    propulsion_intervals,
-    reported_at_s,
-    state_bands,
-)
-from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
+from snakesim_operator.results.report.timeline import longest_reason, reported_while_moving
+from snakesim_operator.results.summary import RunSummary, estimates_of
+from snakesim_operator.results.time_axis import end_s, reported_at_s
 
 MOVED_M = 0.02  # less than this is no locomotion
 MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
-RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arrived, but for who moves to the last,
-REST_SHARE, REST_S = 0.1, 5.0  # which differs from a rest by how long it takes: a tenth of the run, or so many seconds
+MIN_PUSH_N = 0.5  # a smaller measured force is no push
 POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
 SHOWN_HANDOVERS = 8
 Kind = Literal["good", "poor", "bad"]
@@ -51,26 +47,64 @@ def _verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         said = _control_said(record, at_s)
         before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
         return Verdict("bad", f"{what}{said} Before that: {before}.")
+    motion = motion_of(record)
+    if motion is None:
+        rest = f"{_handed_over(record, summary)}{_trouble(summary)}.{_ending(summary.ended)}"
+        return Verdict("poor", f"{moved}; {rest}")
+    return _verdict_of_motion(record, summary, motion, moved)
+
+
+def _verdict_of_motion(record: RunRecord, summary: RunSummary, motion: Motion, moved: str) -> Verdict:
+    """Of a run without a fault, whose pose is known: by the measured motion, and beside it what control reported."""
     trouble = _trouble(summary)
     ending = _ending(summary.ended)
-    distance = distance_m(summary)
-    if distance is None:
-        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{trouble}.{ending}")
-    if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
-        why = summary.last_reason or "the controller gave no reason"
-        if summary.last_state == "Locomoting":
-            why = "the snake stayed where it was, although its controller reported Locomoting"
+    handed_over = _handed_over(record, summary) or _pushed_off(record)
+    if _did_not_locomote(summary):
         kind = "Jammed" if summary.jammed else "Did not locomote"
+        why = summary.last_reason or STANDING_STILL
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {trouble}.{ending}")
-    stop = stop_of(record, abs(distance))
-    stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
-    if stop is not None and not stop.on_purpose and (summary.jammed or stop.share > POOR_SHARE):
+    stop = stop_of(record, motion)
+    stood = 1.0 - motion.moving_fraction
+    if stop is not None and not stop.on_purpose and (summary.jammed or stood > POOR_SHARE):
         kind = "Jammed" if summary.jammed else "Stopped"
         said = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why.removeprefix('jammed: ')}"
-        return Verdict("poor", f"{said} {moved}; {_handed_over(record, summary)}{trouble}.{ending}")
+        return Verdict("poor", f"{said} {moved}; {handed_over}{trouble}.{ending}")
     jam = "it jammed on the way; " if summary.jammed else ""
-    good: Kind = "poor" if ending or distance < 0 else "good"
-    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{trouble}.{stopped}{ending}")
+    until_end = ", and was still moving at the end" if stop is None and not ending else ""
+    stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
+    contradiction = _reported_while_moving(record, motion)
+    backward = (summary.path_distance_m or 0.0) < 0
+    good: Kind = "poor" if ending or backward else "good"
+    return Verdict(good, f"{moved}{until_end}; {handed_over}{jam}{trouble}.{stopped}{contradiction}{ending}")
+
+
+def _did_not_locomote(summary: RunSummary) -> bool:
+    """Whether it never moved, or only to and fro by next to nothing."""
+    if summary.locomoting_fraction == 0:
+        return True
+    distances = [abs(one) for one in (summary.path_distance_m, summary.net_displacement_m) if one is not None]
+    return max(distances, default=0.0) < MOVED_M
+
+
+def _reported_while_moving(record: RunRecord, motion: Motion) -> str:
+    """What control reported of standing while the body moved, as its report."""
+    found = reported_while_moving(record, motion)
+    if found is None:
+        return ""
+    reason = found.reason.strip().rstrip(".;")
+    return f' For {found.lasted_s:.1f} s of its motion control reported "{reason}".'
+
+
+def _pushed_off(record: RunRecord) -> str:
+    """How many obstacles it pushed off, of those that its controller chose and where a contact was measured."""
+    obstacles: set[str] = set()
+    for state in record.control:
+        for point, measured_n in zip(state.push_points, state.felt_force_n, strict=False):
+            if point.obstacle is not None and measured_n is not None and measured_n >= MIN_PUSH_N:
+                obstacles.add(point.obstacle)
+    if not obstacles:
+        return ""
+    return f"pushed off {len(obstacles)} {'obstacle' if len(obstacles) == 1 else 'obstacles'}; "
 
 
 def _ending(ended: str) -> str:
@@ -116,9 +150,8 @@ def _handed_over(record: RunRecord, summary: RunSummary) -> str:
         return f"{names[0]} propelled throughout; "
     if len(names) <= SHOWN_HANDOVERS:
         return f"propulsion handed over {' → '.join(names)}; "
-    distinct = len({one.joint for one in propulsion_intervals(record)})
     shown = " → ".join([*names[:4], "…", names[-1]])
-    return f"propulsion handed over {len(names) - 1} times among {distinct} joints ({shown}); "
+    return f"propulsion handed over {summary.hand_overs} times among {len(set(names))} joints ({shown}); "
 
 
 def _control_said(record: RunRecord, at_s: float) -> str:
@@ -132,23 +165,21 @@ class Stop:
     """The end of locomotion, before that of the run."""
 
     at_s: float
-    share: float  # of the run that it stood still for then
     why: str
     on_purpose: bool
 
 
-def stop_of(record: RunRecord, moved_m: float) -> Stop | None:
-    """When and why it came to rest, by what control reported and by what was measured; None when it did not."""
-    bands, end = state_bands(record), end_s(record)
-    at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
-    rest_s = came_to_rest_s(record, min(MOVED_M, RESTING_SHARE * moved_m))
-    if rest_s is not None and at_s - rest_s > max(MIN_STOP_S, min(REST_SHARE * end, REST_S)):
-        at_s = rest_s
-    if end - at_s < MIN_STOP_S:
+def stop_of(record: RunRecord, motion: Motion) -> Stop | None:
+    """When the body came to rest for the rest of the run, as measured, and why, as far as control reported it.
+
+    None when it moved to the end, or stood for so short a time that it is not worth a word.
+    """
+    stop = motion.final_stop
+    if stop is None or motion.end_s - stop.start_s < MIN_STOP_S:
         return None
-    after = [state for state in record.control if reported_at_s(record, state) >= at_s and state.state != "Locomoting"]
-    why = after[0].reason if after else "its controller reported Locomoting all the same"
-    return Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
+    reported = [state for state in record.control if reported_at_s(record, state) >= stop.start_s]
+    on_purpose = bool(reported) and reported[-1].state == "Idle"
+    return Stop(stop.start_s, _sentence(longest_reason(record, stop)), on_purpose)
 
 
 def _sentence(words: str) -> str:

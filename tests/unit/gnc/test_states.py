@@ -17,7 +17,7 @@ READY = {"usable_push_points": 3, "advanced_m": 0.1}
         ({"usable_push_points": 2}, "NotLocomoting", "2 usable push-points, 3 are needed"),
         ({"usable_push_points": 0, "obstacle": "lost"}, "NotLocomoting", "lost"),
         ({"obstacle": "jammed: x"}, "NotLocomoting", "jammed: x"),
-        ({"advanced_m": 0.004}, "NotLocomoting", "standing still: less than 5 mm in 1 s"),
+        ({"advanced_m": 0.004}, "NotLocomoting", "standing still: less than 20 mm in 1 s"),
         ({"advanced_m": 0.004, "usable_push_points": None}, "NotLocomoting", "standing still"),
         ({"advanced_m": 0.004, "still": "contacts lost"}, "NotLocomoting", "contacts lost"),
         ({"still": "contacts lost"}, "Locomoting", "pushing"),

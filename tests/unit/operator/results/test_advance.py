@@ -1,11 +1,13 @@
 """What the summary tells of a mission's goal: measured on runs whose end is known from elsewhere."""
 
+import dataclasses
 from functools import cache
 
 import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import Override, load
+from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import Result, simulate
 
 HEADING = {"kind": "heading", "distance_m": 0.3}
@@ -93,3 +95,23 @@ def test_a_run_may_end_at_its_goal_with_the_same_numbers() -> None:
     assert short.summary.ended == "complete" and len(short.record.time_s) < len(whole.record.time_s)
     for name in ("crossed_s", "advance_m", "energy_j_per_m", "stalled_s"):
         assert getattr(short.summary, name) == getattr(whole.summary, name), name
+
+
+def test_a_body_that_travels_sideways_has_its_metrics_along_both_directions() -> None:
+    """Along its first heading it hardly advances, and per metre of that its energy says nothing."""
+    straight = ran("path_following")
+    record = straight.record
+    turned = record.position_w[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]  # as if it had gone to its left, by a quarter of a turn
+    sideways = summarise(dataclasses.replace(record, position_w=turned), "complete")
+    assert sideways.net_displacement_m == pytest.approx(straight.summary.net_displacement_m, rel=0.1)
+    assert sideways.heading_advance_m is not None and sideways.heading_advance_m < 0.1
+    assert sideways.heading_energy_j_per_m is None
+    assert sideways.displacement_energy_j_per_m == pytest.approx(
+        (straight.summary.energy_j or 0.0) / (sideways.net_displacement_m or 1.0)
+    )
+    length_m = sum(link.length_m for link in record.description.links)
+    expected = (sideways.net_displacement_m or 0.0) / 2.5 / length_m
+    assert sideways.displacement_body_lengths_s == pytest.approx(expected, rel=0.02)
+    ahead = straight.summary
+    assert ahead.heading_energy_j_per_m == pytest.approx(ahead.displacement_energy_j_per_m, rel=0.02)
+    assert ahead.heading_body_lengths_s == pytest.approx(ahead.displacement_body_lengths_s, rel=0.02)

@@ -13,6 +13,7 @@ from snakesim_operator.run.in_process import simulate
 from tests.unit.operator.results.recorded import Reader, changed
 
 SECONDS = 1.5
+MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 
 
 @pytest.fixture(scope="module")
@@ -36,17 +37,17 @@ def test_every_obstacle_that_was_pushed_has_a_row(record: RunRecord) -> None:
     assert set(reported.obstacles["data"][0]["y"]) == pushed and len(pushed) >= 3
 
 
-def test_a_stop_has_the_reason_that_held_longest(record: RunRecord) -> None:
-    reasons = {0.2: "contacts lost", 0.4: "jam", 1.0: "jam"}
+def test_a_stop_is_measured_and_has_the_reason_that_was_reported_longest(record: RunRecord) -> None:
     control = [
-        msgspec.structs.replace(one, state="NotLocomoting", reason=next(w for t, w in reasons.items() if at_s <= t))
-        if (at_s := one.stamp_ns * 1e-9) <= 1.0
-        else msgspec.structs.replace(one, state="Locomoting")
-        for one in record.control
+        msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost" if k < 4 else "jam")
+        for k, one in enumerate(record.control)
     ]
     reported = pushing(changed(record, control=control))
+    assert reported is not None and not reported.stops, "it moves, whatever is reported"
+    held = {name: getattr(record, name)[:1].repeat(len(record.time_s), axis=0) for name in MOVING}
+    reported = pushing(changed(record, control=control, **held))
     assert reported is not None and [one.why for one in reported.stops] == ["jam"]
-    assert reported.stops[0].end_s - reported.stops[0].start_s == pytest.approx(1.0, abs=0.11)
+    assert reported.stops[0].end_s - reported.stops[0].start_s == pytest.approx(SECONDS, abs=0.11)
 
 
 def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:

@@ -14,13 +14,14 @@ import pytest
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
+from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, events
 from snakesim_operator.results.report.instants import balanced_instants
 from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
-from snakesim_operator.results.report.timeline import propulsion_intervals, reference_rad, state_bands
+from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.summary import RunSummary, summarise
 from tests.unit.operator.results.recorded import LOST, SECONDS, Reader, changed, read
@@ -44,7 +45,7 @@ def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
         "joint_6 → joint_5 → joint_4; no fault, 2 commands refused (stale)."
     )
     assert said in page.text
-    assert f"Locomotion ended at 6.1 s of 10.0 s: {LOST}; no three push-points on alternating sides." in page.text
+    assert f"Locomotion ended at 6.3 s of 10.0 s: {LOST}; no three push-points on alternating sides." in page.text
 
 
 def test_what_is_red_says_why(record: RunRecord) -> None:

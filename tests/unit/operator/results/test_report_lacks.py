@@ -13,9 +13,9 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scenario import Start
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
+from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report.timeline import propulsion_intervals
 from snakesim_operator.results.report.verdict import Verdict, verdict
 from snakesim_operator.results.summary import summarise
 from tests.unit.operator.results.recorded import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
@@ -127,7 +127,7 @@ def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) ->
         for state in record.control
     ]
     page = read(changed(record, control=stuck))
-    assert "Jammed at 6.1 s of 10.0 s: wedged. Moved 0.62 m along the path" in page.text
+    assert "Jammed at 6.3 s of 10.0 s: wedged. Moved 0.62 m along the path" in page.text
 
 
 def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
@@ -151,7 +151,7 @@ def test_a_run_that_stood_still_for_most_of_its_time_is_no_good_one(record: RunR
     assert lost.kind == "poor"
     assert lost.words.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST}. Moved 0.")
     late = judged(stopped_at(record, 5.5, state="NotLocomoting", reason=LOST))
-    assert late.kind == "good" and f"Locomotion ended at 5.5 s of 10.0 s: {LOST}" in late.words
+    assert late.kind == "good" and f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.words
 
 
 def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -> None:
@@ -159,9 +159,11 @@ def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -
     stuck = stopped_at(record, 6.0, state="NotLocomoting", reason="jammed: wedged", jammed=True)
     trying = [*stuck.control[:-1], msgspec.structs.replace(stuck.control[-1], state="Locomoting", reason="pushing")]
     found = judged(changed(stuck, control=trying))
-    assert found.kind == "poor" and found.words.startswith("Jammed at 5.9 s of 10.0 s: wedged. Moved")
+    assert found.kind == "poor" and found.words.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
     claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
-    assert claims.kind == "poor" and "its controller reported Locomoting all the same" in claims.words
+    assert claims.kind == "poor"
+    assert claims.words.startswith("Stopped at 4.0 s of 10.0 s: standing still: less than 20 mm in 1 s. Moved 0.")
+    assert "reported" not in claims.words, "`pushing` is what control measured, not a report of the controller"
 
 
 def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecord) -> None:
@@ -169,19 +171,51 @@ def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecor
     assert rests.kind == "good" and "Locomotion ended at 4.0 s" in rests.words
 
 
-def test_who_says_nothing_more_is_not_known_to_move(record: RunRecord) -> None:
+def test_whether_it_moved_is_measured_whatever_control_reported(record: RunRecord) -> None:
+    """State and share of time are the same for a controller that reports nothing, falls silent, or claims to stand."""
+    whole = summarise(record, "complete")
+    assert whole.locomoting_fraction == pytest.approx(0.63, abs=0.01)
     silent = [state for state in record.control if state.stamp_ns < (ARMED_S + 4.0) * 1e9]
-    assert silent[-1].state == "Locomoting"
-    reported = summarise(changed(record, control=silent), "complete").locomoting_fraction
-    whole = summarise(record, "complete").locomoting_fraction
-    assert reported == pytest.approx((4.0 - 0.26 + 0.5) / 10.0, abs=0.06) and whole == pytest.approx(0.585, abs=0.01)
+    claims = [msgspec.structs.replace(one, state="NotLocomoting", reason="lost") for one in record.control]
+    for control in (silent, [], claims):
+        reported = summarise(changed(record, control=control), "complete")
+        assert reported.locomoting_fraction == whole.locomoting_fraction
+        assert reported.last_state == "NotLocomoting"
+    moving = summarise(changed(record, control=[]), "complete")
+    assert (moving.last_reason, moving.reported_state) == ("standing still: less than 20 mm in 1 s", None)
 
 
 def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
-    found = judged(stopped_at(record, 0.0, state="Locomoting", reason="moving"))
-    assert (
-        "Did not locomote: the snake stayed where it was, although its controller reported Locomoting." in found.words
-    )
+    stands = stopped_at(record, 0.0, state="Locomoting", reason="moving")
+    found = judged(stands)
+    assert "Did not locomote: standing still: less than 20 mm in 1 s." in found.words
+    reported = summarise(stands, "complete")
+    assert (reported.last_state, reported.reported_state) == ("NotLocomoting", "Locomoting")
+    assert reported.locomoting_fraction == 0 and reported.stalled_s == pytest.approx(9.0, abs=0.2)
+
+
+def test_a_controller_that_says_it_stands_and_moves(record: RunRecord) -> None:
+    """The verdict is that of the motion; what control reported is beside it, as a report."""
+    since_ns = (ARMED_S + 2.2) * 1e9
+    lost = [
+        msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost") if one.stamp_ns > since_ns else one
+        for one in record.control
+    ]
+    found = judged(changed(record, control=lost))
+    assert found.kind == "good" and found.words.startswith("Moved 0.62 m along the path in 10.0 s;")
+    assert "Locomotion ended at 6.3 s of 10.0 s: contacts lost." in found.words
+    said = re.search(r'For (\d\.\d) s of its motion control reported "contacts lost"\.', found.words)
+    assert said is not None and float(said[1]) == pytest.approx(6.3 - 2.2, abs=0.15)
+
+
+def test_a_run_that_moves_to_its_end_says_so(record: RunRecord) -> None:
+    rows = slice(0, 500)
+    fields = [field.name for field in dataclasses.fields(record)]
+    short = {name: getattr(record, name)[rows] for name in fields if isinstance(getattr(record, name), np.ndarray)}
+    cut = changed(record, **short, control=[one for one in record.control if one.stamp_ns < (ARMED_S + 5.0) * 1e9])
+    found = judged(cut)
+    assert found.kind == "good" and "along the path in 10.0 s, and was still moving at the end;" in found.words
+    assert summarise(cut, "complete").locomoting_fraction == 1.0
 
 
 def test_text_from_outside_is_escaped(record: RunRecord) -> None:

@@ -230,7 +230,7 @@ def test_a_urdf_that_is_no_snake_is_refused_with_the_place(case: str, tmp_path: 
 def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
-    assert reported["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08, yaw" in reported["names"]
+    assert reported["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08 (line 122), yaw" in reported["names"]
     assert any("hinge01" in line for line in reported["changed"]) and any(
         "<gazebo>" in line for line in reported["left_out"]
     )

@@ -62,7 +62,9 @@ def test_names_that_ros_allows() -> None:
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
 def test_the_urdf_is_read_by_mujoco(name: str) -> None:
     robot = of_robot(name)
-    model = mujoco.MjModel.from_xml_string(urdf_of(robot, "lab/"))
+    document = urdf_of(robot, "lab/")
+    assert "has neither inertia nor friction" in document, "what a reader would miss is said in the document"
+    model = mujoco.MjModel.from_xml_string(document)
     assert model.njnt == len(robot.joints)
     for i, joint in enumerate(robot.joints):
         assert model.joint(i).name == joint.name

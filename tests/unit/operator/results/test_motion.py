@@ -1,0 +1,80 @@
+"""Whether a body moved: measured, and told alike by summary, terminal and verdict."""
+
+import re
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_operator.results.motion import motion_of
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.verdict import verdict
+from snakesim_operator.results.summary import summarise
+from snakesim_operator.run.conclusion import print_summary
+from tests.unit.operator.results.recorded import SECONDS, changed
+
+
+def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
+    """The same body, which goes along x like this and does not bend."""
+    position = np.repeat(record.position_w[:1], len(x_m), axis=0)
+    position[:, 0] += x_m
+    still = {name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0) for name in ("orientation_wxyz", "angle_rad")}
+    return changed(record, position_w=position, **still)
+
+
+def test_a_stop_in_between_and_a_rest_at_the_end_are_found_where_they_are(record: RunRecord) -> None:
+    time_s = record.time_s - record.time_s[0]
+    goes = moved_as(record, 0.1 * np.interp(time_s, [0, 2, 4.5, 7, 10], [0, 2, 2, 4.5, 4.5]))
+    motion = motion_of(goes)
+    assert motion is not None
+    spans = [(span.start_s, span.end_s) for span in motion.standing]
+    assert np.array(spans) == pytest.approx(np.array([[2.0, 4.5], [7.0, SECONDS]]), abs=0.15)
+    assert motion.moving_fraction == pytest.approx(4.5 / SECONDS, abs=0.03)
+    assert motion.final_stop == motion.standing[-1]
+    assert [span.what for span in motion.spans] == ["moving", "standing still"] * 2
+
+
+@pytest.mark.parametrize(("amplitude_m", "moves"), [(0.004, False), (0.06, True)])
+def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, amplitude_m: float, moves: bool) -> None:
+    time_s = record.time_s - record.time_s[0]
+    motion = motion_of(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
+    assert motion is not None and motion.moving_fraction == (1.0 if moves else 0.0)
+
+
+def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
+    blind = changed(record, position_w=record.position_w * np.nan)
+    assert motion_of(blind) is None
+    reported = summarise(blind, "complete")
+    assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
+    assert reported.reported_state == "NotLocomoting"
+
+
+def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.CaptureFixture[str]) -> None:
+    names = [joint.name for joint in record.description.joints]
+    control = [
+        msgspec.structs.replace(state, propulsion_joint=names[i // 5 % 3]) for i, state in enumerate(record.control)
+    ]
+    many = changed(record, control=control)
+    summary = summarise(many, "complete")
+    print_summary(summary)
+    printed = re.search(r"\((\d+) hand-overs in all\)", capsys.readouterr().out)
+    said = re.search(r"handed over (\d+) times among 3 joints", verdict(many, summary).words)
+    assert printed is not None and said is not None
+    assert int(printed[1]) == int(said[1]) == summary.hand_overs == len(summary.propulsion_joints or []) - 1 > 30
+
+
+def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
+    record: RunRecord, capsys: pytest.CaptureFixture[str]
+) -> None:
+    claims = [msgspec.structs.replace(one, state="Locomoting", reason="pushing") for one in record.control]
+    summary = summarise(changed(record, control=claims), "complete")
+    sideways = msgspec.structs.replace(summary, energy_j_per_m=None, displacement_energy_j_per_m=50.4)
+    print_summary(sideways)
+    printed = capsys.readouterr().out
+    assert "last state            NotLocomoting: standing still: less than 20 mm in 1 s\n" in printed
+    assert "control reported      Locomoting: pushing\n" in printed
+    assert (
+        "energy per metre      50.4 J/m along its displacement, too little advance along the first heading" in printed
+    )
+    print_summary(summarise(record, "complete"))
+    assert "control reported" not in capsys.readouterr().out
