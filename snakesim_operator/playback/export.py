@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say, printable
 from snakesim_hal.wire.own_sample import own_kinds
-from snakesim_operator.playback.episodes import read_episodes
+from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
@@ -68,11 +68,13 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
 def export_dataset(
     runs: Sequence[Path], out: Path | None, say: Say, *, images: bool, task: str | None, fps: float | None
 ) -> int:
-    """Write a LeRobot dataset, an episode a run or demonstration. Raises ConfigError."""
+    """Writes a LeRobot dataset, an episode a run or demonstration, and one more for each gap. Raises ConfigError."""
     path = _free(out or _beside(runs[0], "lerobot"))
     episodes = read_episodes(runs, task, images=images)
-    frames = write_lerobot(episodes, path, write_parquet, fps)
-    say(f"{len(episodes)} episodes, {frames} frames: {path}")
+    size = write_lerobot(episodes, path, write_parquet, fps)
+    for sentence in gaps_in_words(episodes):
+        say(sentence)
+    say(f"{size.episodes} episodes, {size.frames} frames: {path}")
     return max(exit_code(one.record.folder, one.record.lacks) for one in episodes)
 
 

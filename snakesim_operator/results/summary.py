@@ -260,7 +260,8 @@ def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
         return None, None, 0.0
     net = float(np.linalg.norm(body_centre_w(record.description, last) - body_centre_w(record.description, first)))
     start, end = arc_position_m(record, row), arc_position_m(record, last_row)
-    known_s = (last_row - row + 1) * record.config.period_ns * 1e-9
+    ticks = int(record.ticks[last_row] - record.ticks[row]) + 1  # those in a gap count too: the body moved in it
+    known_s = ticks * record.config.period_ns * 1e-9
     return (None if start is None or end is None else end - start), net, known_s
 
 
