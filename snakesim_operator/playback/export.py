@@ -8,6 +8,7 @@ lacks is told in each format's own way.
 import csv
 import json
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,11 @@ def _beside(run: Path, form: str) -> Path:
 
 def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
     """Every column as an array, (n,) or (n, width)."""
-    found = {name: value for name, value in vars(record).items() if isinstance(value, np.ndarray) and name != "posed"}
+    found: dict[str, NDArray[Any]] = {}
+    for column in fields(record):  # not `vars`: that has what the record has worked out, too
+        value = getattr(record, column.name)
+        if isinstance(value, np.ndarray):
+            found[column.name] = value
     return found | record.own
 
 
