@@ -39,6 +39,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     scene: str
     backend: str
+    emulated: Annotated[bool | None, Meta(description="whether nothing real moved; null: the host did not say")] = None
     controller: str
     seed: int
     pace: Pace
@@ -170,6 +171,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         robot=config.robot.name,
         scene=config.scene.name,
         backend=config.backend,
+        emulated=record.description.emulated,
         controller=config.commander,
         seed=config.seed,
         pace=config.pace,

@@ -11,6 +11,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.what_moves import EMULATED, REAL, UNKNOWN
 from snakesim_hal.network.local_registry import robot_folder
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.terminal import say
@@ -153,6 +154,7 @@ def _print_summary(summary: RunSummary) -> None:
 
     straight = summary.path_distance_m is None
     rows = [
+        _what_moved(summary),
         ("moved" if straight else "moved along the path", number(distance_m(summary), "m", 3)),
         (
             "time",
@@ -186,6 +188,16 @@ def _print_summary(summary: RunSummary) -> None:
     rows += [("not known", lack) for lack in summary.lacks]
     for name, value in rows:
         say(f"  {name:<22}{value}")
+
+
+def _what_moved(summary: RunSummary) -> tuple[str, str]:
+    match summary.emulated:
+        case True:
+            return EMULATED, f"nothing real moved (backend {summary.backend})"
+        case False:
+            return REAL, f"motors moved (backend {summary.backend})"
+        case None:
+            return UNKNOWN, f"whether motors moved (backend {summary.backend})"
 
 
 def _in_short(joints: Sequence[str] | None) -> str:

@@ -5,13 +5,16 @@ import re
 import shlex
 from pathlib import Path
 
+import msgspec
 import pytest
 import yaml
 
 from snakesim_hal.arguments import add_host, add_service, load_scenario
 from snakesim_hal.errors import ConfigError
+from snakesim_operator.lab.check import Findings, check_what_moves
 from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
 from snakesim_operator.lab.render import rendered
+from tests.unit.hal.rig import description
 
 BY_ID = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT4-if00-port0"
 ROBOTS = {
@@ -150,3 +153,29 @@ def test_a_backend_that_is_not_ours_is_given_its_bus_by_a_setting(tmp_path: Path
     host = files_of(robot, tmp_path)["robot1/systemd/snakesim-robot.planar13.service"]
     assert "backends.ethercat.ports=['eth 1']" in command_of(host)
     assert "DeviceAllow=/dev/cpu_dma_latency rw" in host
+
+
+@pytest.mark.parametrize(
+    ("name", "emulated", "wrong"),
+    [
+        ("can", True, "EMULATED: nothing real moves (backend lag), but the lab file names its bus"),
+        ("can", False, ""),
+        ("dynamixel", True, "but the lab file names its bus"),
+        ("mixed", True, "but the lab file names its bus"),
+        ("virtual moteus", True, ""),
+        ("emulated", True, ""),
+        ("emulated", False, "REAL: motors move (backend lag), but by the lab file nothing real is to move"),
+        ("sim", False, "but by the lab file nothing real is to move"),
+        ("sim", None, "UNKNOWN whether motors move"),
+    ],
+)
+def test_a_check_marks_a_robot_that_is_emulated_against_the_lab_file(
+    tmp_path: Path, name: str, emulated: bool | None, wrong: str
+) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(lab_text(ROBOTS[name]))
+    described = None if emulated is None else msgspec.structs.replace(description(), emulated=emulated)
+    said: list[str] = []
+    found = Findings(said.append)
+    check_what_moves(load_lab(path).file.robots["planar13"], described, found)
+    assert found.wrong == bool(wrong) and wrong in said[0]
