@@ -24,6 +24,7 @@ from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.model.checked import CHECK, why_unchecked
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
 from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
@@ -33,7 +34,7 @@ from snakesim_hal.process import HOST_PRIORITY, enter_realtime, on_stop_signal, 
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.record.recorder import HostRecordWriter
 from snakesim_hal.serve import ProcessOptions, joined, process_options
-from snakesim_hal.terminal import exit_code
+from snakesim_hal.terminal import exit_code, print_stderr
 from snakesim_hal.wire import keys
 
 GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
@@ -78,6 +79,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
         refuse_second_host(session, given.link)
         described = backend.describe()
+        print_stderr(f"host: {describe_what_moves(described)}")  # a lab's journal has it, too
         unchecked = ""
         if config.controller != CHECK:
             unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)

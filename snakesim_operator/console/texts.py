@@ -25,11 +25,13 @@ def plain(text: object) -> str:
 
 
 def backend_in_words(robot: Description) -> tuple[str, str]:
-    """What moves, in large letters, and its colour."""
-    if robot.backend == "sim":
-        return "SIMULATOR", SIMULATED
+    """Returns what moves, in large letters, and its colour."""
     kind = robot.backend.upper()[:12]
-    return (f"EMULATED ROBOT ON {kind}", EMULATED) if robot.emulated else (f"ROBOT ON {kind}", REAL)
+    if not robot.emulated:  # whatever the backend is called
+        return f"REAL ROBOT ON {kind}", REAL
+    if robot.backend == "sim":
+        return "EMULATED BY A SIMULATOR", SIMULATED
+    return f"EMULATED ROBOT ON {kind}", EMULATED
 
 
 def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:

@@ -126,6 +126,8 @@ def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: P
     failed = worst([case for case in cases if case.controller == best], done)
     for words in table(lines):
         say(words)
+    if any(line.runs == 1 and line.crossed is None for line in lines):
+        say("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
     if broken := [(case, why) for case in cases if (why := done[case.id].error) is not None]:
         say(f"{len(broken)} could not run, the first: {name_of(broken[0][0])}: {broken[0][1]}")
     again = [

@@ -11,8 +11,9 @@ from snakesim_operator.evaluate.case import GAVE_UP, Case, Outcome
 from snakesim_operator.evaluate.store import Results
 
 Z95 = 1.959964
+T95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)  # of 1 to 8 degrees of freedom
 UNKNOWN = "–"
-HEAD = ("setting", "controller", "crossed", "95 %", "m", "m/s", "J/m", "stood s", "time s", "errors")
+HEAD = ("setting", "controller", "crossed", "95 %", "m", "95 % of m", "m/s", "J/m", "stood s", "time s", "errors")
 WORST = 5
 
 
@@ -59,12 +60,21 @@ class Line:
             UNKNOWN if crossed is None else f"{crossed}/{self.runs}",
             UNKNOWN if crossed is None else f"{100 * low:.0f}-{100 * high:.0f}",
             _median(self.values("advance_m"), 2),
+            self._advance_interval(),
             _median(self.values("advance_m_s", of_crossed=True), 3),
             _median(self.values("energy_j_per_m", of_crossed=True), 1),
             _median(self.values("stalled_s"), 1),
             _median(self.values("crossed_s" if crossed else "duration_s", of_crossed=True), 1),
             str(self.errors or ""),
         ]
+
+    def _advance_interval(self) -> str:
+        """Without a goal the advance is the result, and needs an interval; with one the crossings have it."""
+        advances_m = self.values("advance_m")
+        if self.crossed is not None or len(advances_m) < 2:
+            return UNKNOWN
+        low, high = mean_interval(advances_m)
+        return f"{low:.2f} to {high:.2f}"
 
 
 def lines_of(cases: Sequence[Case], done: Results) -> list[Line]:
@@ -119,6 +129,23 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     middle = (share + z2 / 2) / (1 + z2)
     half = Z95 * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials)) / (1 + z2)
     return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Returns the 95 % confidence interval of the mean, by Student's t. values: two or more."""
+    mean = float(np.mean(values))
+    standard_error = float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    half = _student_t95(len(values) - 1) * standard_error
+    return mean - half, mean + half
+
+
+def _student_t95(degrees: int) -> float:
+    """Two-sided 95 % quantile. Source: Abramowitz and Stegun, table 26.10 and equation 26.7.5."""
+    if degrees <= len(T95):
+        return T95[degrees - 1]
+    first = (Z95**3 + Z95) / 4
+    second = (5 * Z95**5 + 16 * Z95**3 + 3 * Z95) / 96
+    return Z95 + first / degrees + second / degrees**2
 
 
 def _median(values: list[float], digits: int) -> str:

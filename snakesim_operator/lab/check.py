@@ -18,6 +18,7 @@ from typing import Any
 from cryptography import x509
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.private_keys import readable_by_all
 from snakesim_hal.network.probe import open_probe
 from snakesim_hal.network.process_entries import HOST, differences
@@ -25,11 +26,13 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Process, Status
+from snakesim_hal.wire.messages import Description, Process, Status
 from snakesim_hal.wire.roles import RECORDER, TABLE, Role
 from snakesim_operator.lab.certificates import RENEW_AT, read_certificate
+from snakesim_operator.lab.drive_buses import SIMULATOR, is_to_be_real
 from snakesim_operator.lab.identities import Identity, identities
 from snakesim_operator.lab.lab_file import Lab
+from snakesim_operator.lab.lab_robot import Robot
 from snakesim_operator.lab.zenoh_files import session_settings, tls_files
 
 CONNECT_MS = 2000
@@ -161,6 +164,7 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
     try:
         with _session(watcher, robot, lab, folder) as session:
             status = session.latest(keys.STATUS, Status, LISTEN_S)
+            description = session.latest(keys.DESCRIPTION, Description, LISTEN_S) if status is not None else None
             live = session.present(keys.PROCESS_ALL)
             reader = session.latched_reader(keys.PROCESS_ALL, Process)
             with open_probe(json.dumps({**_settings(watcher, lab, folder), "namespace": robot})) as probe:
@@ -171,6 +175,7 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
         return
     if status is not None:
         found.passed(f"{status.lifecycle} - {status.why}")
+        check_what_moves(lab.file.robots[robot], description, found)
     host = next((entry for entry in entries if entry.name == HOST), None)
     expected = {HOST: lab.file.robots[robot].machine}
     for identity in held:
@@ -182,6 +187,19 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
             found.failed(f"{name}: not running; it belongs on {machine}")
         for entry in running:
             _check_process(entry, host, ahead, found)
+
+
+def check_what_moves(robot: Robot, description: Description | None, found: Findings) -> None:
+    """A robot that the lab file names a bus for must not be emulated, and the other way round."""
+    words = describe_what_moves(description)
+    if description is None:
+        found.failed(words)
+    elif is_to_be_real(robot) and description.emulated:
+        found.failed(f"{words}, but the lab file names its bus; render again, install, and restart the host")
+    elif (robot.backend == SIMULATOR or robot.emulated) and not description.emulated:
+        found.failed(f"{words}, but by the lab file nothing real is to move; see which host runs")
+    else:
+        found.passed(words)
 
 
 def _check_process(entry: Process, host: Process | None, ahead: dict[str, float], found: Findings) -> None:

@@ -12,17 +12,15 @@ from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.files import FileStruct, Table, decode, read_table
 from snakesim_hal.wire.quantities import from_zero
 from snakesim_hal.wire.roles import Role
+from snakesim_operator.lab.drive_buses import check_buses
+from snakesim_operator.lab.lab_robot import Name, Robot
 
 EXAMPLE = Path(__file__).parent / "example.toml"
 ALL = "all"
 GNC_SERVICES = ("guidance", "navigation", "control")
-MAX_NAME = 24  # so that a certificate's common name, which holds three of them, has at most the 64 characters of X.509
 
-Name = Annotated[str, Meta(pattern=f"^[a-z][a-z0-9_]{{0,{MAX_NAME - 1}}}$")]
 Address = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9.:-]{0,252}$")]
 Folder = Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./-]+$", max_length=200)]
-Interface = Annotated[str, Meta(pattern=r"^v?can[0-9]{1,3}$")]
-Setting = Annotated[str, Meta(pattern=r"^[^=\s]+=[^\r\n%\"'\\$]+$")]
 PortNumber = Annotated[int, Meta(ge=1, le=65535)]
 Days = Annotated[float, Meta(gt=0, le=825, extra_json_schema={"unit": "days"})]
 
@@ -34,6 +32,7 @@ class Machine(FileStruct, frozen=True, kw_only=True):
     folder: Folder = "/etc/snakesim"  # where its rendered files are installed
     user: Name = "snakesim"  # whom the services run as
     program: Folder = "/opt/snakesim/bin/snakesim"
+    device_groups: list[Name] = msgspec.field(default_factory=lambda: ["dialout"])  # that may open its serial ports
 
 
 class Router(FileStruct, frozen=True, kw_only=True):
@@ -41,23 +40,6 @@ class Router(FileStruct, frozen=True, kw_only=True):
 
     machine: Name
     port: PortNumber = 7447
-
-
-class Robot(FileStruct, frozen=True, kw_only=True):
-    """A robot. Its name in the file is its namespace on the network."""
-
-    machine: Name
-    scenario: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[A-Za-z0-9_./-]+$")]
-    backend: Name = "can"
-    set: list[Setting] = []  # further settings, as with `snakesim run --set`
-    can: list[Interface] = []
-    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
-    faults: bool = False  # whether an administrator may inject faults
-
-    @property
-    def interfaces(self) -> list[str]:
-        """CAN interfaces that its machine brings up; a simulator has none."""
-        return [] if self.backend == "sim" else self.can
 
 
 class Grant(FileStruct, frozen=True, kw_only=True):
@@ -104,6 +86,7 @@ def load_lab(path: Path) -> Lab:
     table = read_table(path)
     file = decode(table, LabFile)
     _check(file, table)
+    check_buses(file.robots, table.source)
     return Lab(file, path)
 
 

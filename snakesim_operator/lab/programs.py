@@ -4,8 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from snakesim_hal.wire.roles import Role
+from snakesim_operator.lab.drive_buses import can_interfaces, devices, host_settings, uses_bus
 from snakesim_operator.lab.identities import Identity, identities
-from snakesim_operator.lab.lab_file import Lab, Robot
+from snakesim_operator.lab.lab_file import Lab
+from snakesim_operator.lab.lab_robot import Robot
 
 STATE = "/var/lib/snakesim"
 
@@ -19,7 +21,8 @@ class Program:
     arguments: tuple[str, ...]  # of the `snakesim` command
     service: str = ""  # of a gnc
     of_robot: str = ""  # of a recorder
-    interfaces: tuple[str, ...] = ()  # CAN, that must be up before it
+    interfaces: tuple[str, ...] = ()  # of the kernel's CAN, that must be up before it
+    devices: tuple[str, ...] = ()  # device files that it opens
 
     @property
     def name(self) -> str:
@@ -46,7 +49,13 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
             robot = lab.file.robots[identity.of]
             out = ("--out", f"{STATE}/{identity.of}")
             arguments = ("host", *_scenario(robot), "--session", file, *out)
-            yield Program(identity, f"HAL host of {identity.of}", arguments, interfaces=tuple(robot.interfaces))
+            yield Program(
+                identity,
+                f"HAL host of {identity.of}",
+                arguments,
+                interfaces=tuple(interface.name for interface in can_interfaces(robot)),
+                devices=tuple(devices(robot)),
+            )
         elif identity.role is Role.GNC:
             robot = lab.file.robots[identity.of]
             for service in identity.services:
@@ -59,6 +68,10 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
 
 
 def _scenario(robot: Robot) -> tuple[str, ...]:
-    """The scenario and what changes it: the same for the host and for its services."""
-    settings = (argument for setting in robot.set for argument in ("--set", setting))
-    return (robot.scenario, "--backend", robot.backend, *settings)
+    """Returns the scenario and what changes it: the same for the host and for its services, which compare it."""
+    words = [robot.scenario, "--backend", robot.backend]
+    if uses_bus(robot):
+        words += ["--pace", "realtime"]  # the only one of drives on a bus, whatever the scenario says
+    for setting in (*host_settings(robot), *robot.set):
+        words += ["--set", setting]
+    return tuple(words)

@@ -1,5 +1,6 @@
 """systemd units, CAN bring-up and a compose file for a lab's machines, from the templates beside this file."""
 
+import re
 from collections.abc import Iterator
 from ipaddress import ip_address
 from pathlib import Path
@@ -7,10 +8,12 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from snakesim_hal.process import SERVICE_PRIORITY
+from snakesim_operator.lab.drive_buses import can_interfaces
 from snakesim_operator.lab.lab_file import Lab
 from snakesim_operator.lab.programs import STATE, Program, programs
 
 CONTAINER_USER = "10001:10001"
+NEEDS_QUOTES = re.compile(r"[\s';]")
 
 
 def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
@@ -32,20 +35,18 @@ def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]
         text = unit.render(**given, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
         yield f"systemd/{program.name}.service", text
     for robot in lab.file.robots.values():
-        for name in robot.interfaces if robot.machine == machine else ():
-            text = templates.get_template("can.j2").render(
-                **given, name=name, virtual=name.startswith("v"), bitrate=robot.bitrate
-            )
-            yield f"systemd/snakesim-{name}.service", text
+        for interface in can_interfaces(robot) if robot.machine == machine else ():
+            text = templates.get_template("can.j2").render(**given, interface=interface)
+            yield f"systemd/snakesim-{interface.name}.service", text
     if found:
         commands = [(program, ["snakesim", *program.arguments]) for program in found]
         yield "compose.yaml", templates.get_template("compose.j2").render(**given, programs=commands)
 
 
 def _command_line(lab: Lab, program: Program) -> str:
-    """As systemd splits it: the file's types allow no quotes, `%`, `$` or backslashes."""
+    """Returns it as systemd splits it: the file's types allow no double quotes, `%`, `$` or backslashes."""
     words = (lab.file.machines[program.identity.machine].program, *program.arguments)
-    return " ".join(f'"{word}"' if " " in word else word for word in words)
+    return " ".join(f'"{word}"' if NEEDS_QUOTES.search(word) else word for word in words)
 
 
 def _addresses(lab: Lab) -> list[str]:

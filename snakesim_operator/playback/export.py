@@ -8,6 +8,7 @@ lacks is told in each format's own way.
 import csv
 import json
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say, printable
 from snakesim_hal.wire.own_sample import own_kinds
-from snakesim_operator.playback.episodes import read_episodes
+from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
@@ -68,11 +69,13 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
 def export_dataset(
     runs: Sequence[Path], out: Path | None, say: Say, *, images: bool, task: str | None, fps: float | None
 ) -> int:
-    """Write a LeRobot dataset, an episode a run or demonstration. Raises ConfigError."""
+    """Writes a LeRobot dataset, an episode a run or demonstration, and one more for each gap. Raises ConfigError."""
     path = _free(out or _beside(runs[0], "lerobot"))
     episodes = read_episodes(runs, task, images=images)
-    frames = write_lerobot(episodes, path, write_parquet, fps)
-    say(f"{len(episodes)} episodes, {frames} frames: {path}")
+    size = write_lerobot(episodes, path, write_parquet, fps)
+    for sentence in gaps_in_words(episodes):
+        say(sentence)
+    say(f"{size.episodes} episodes, {size.frames} frames: {path}")
     return max(exit_code(one.record.folder, one.record.lacks) for one in episodes)
 
 
@@ -97,7 +100,11 @@ def _beside(run: Path, form: str) -> Path:
 
 def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
     """Every column as an array, (n,) or (n, width)."""
-    found = {name: value for name, value in vars(record).items() if isinstance(value, np.ndarray) and name != "posed"}
+    found: dict[str, NDArray[Any]] = {}
+    for column in fields(record):  # not `vars`: that has what the record has worked out, too
+        value = getattr(record, column.name)
+        if isinstance(value, np.ndarray):
+            found[column.name] = value
     return found | record.own
 
 

@@ -1,4 +1,4 @@
-"""A LeRobot dataset, format v3.0, of episodes: a file of frames each.
+"""A LeRobot dataset, format v3.0, of episodes: a file of frames each. A gap in a recording ends an episode.
 
     meta/info.json                          features, rate, numbers of episodes and frames
     meta/stats.json                         of every feature, over all frames
@@ -22,11 +22,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.episodes import Episode
-from snakesim_operator.playback.pictures import Pictures
+from snakesim_operator.playback.lerobot_statistics import (
+    Statistics,
+    feature_statistics,
+    join_picture_statistics,
+    picture_statistics,
+)
 from snakesim_operator.results.record import RunRecord
 
 VERSION = "v3.0"
@@ -34,80 +38,146 @@ LACKS = "meta/lacks.json"  # of each episode that lacks something; not a file of
 FILES_A_CHUNK = 1000
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA, EPISODES = f"data/{FILE}", f"meta/episodes/{FILE}".format(chunk_index=0, file_index=0)
-QUANTILES = (1, 10, 50, 90, 99)  # percent
 INDEX = "__index_level_0__"  # pandas' name for an index without one
 COUNTED = ("frame_index", "episode_index", "index", "task_index")
 
 IMAGES = "observation.images."
-Stats = dict[str, Any]
 Frames = dict[str, NDArray[Any]]
 WriteTable = Callable[[dict[str, Any], Path, dict[bytes, bytes] | None], None]
 
 
-def write_lerobot(episodes: Sequence[Episode], folder: Path, write_table: WriteTable, fps: float | None = None) -> int:
-    """Write the dataset. Returns how many frames. Raises ConfigError for runs that do not fit together.
+@dataclass(frozen=True)
+class DatasetSize:
+    """What was written."""
 
-    write_table: writes columns as Parquet, with metadata of the schema. fps: frames a second, a whole fraction of the
-    robot's rate; None: that rate.
+    episodes: int
+    frames: int
+
+
+def write_lerobot(
+    episodes: Sequence[Episode], folder: Path, write_table: WriteTable, fps: float | None = None
+) -> DatasetSize:
+    """Writes the dataset.
+
+    Args:
+        episodes: Runs, or parts of runs between gaps.
+        folder: Where the dataset goes.
+        write_table: Writes columns as Parquet, with metadata of the schema.
+        fps: Frames a second, a whole fraction of the robot's rate; None: that rate.
+
+    Raises:
+        ConfigError: The runs do not fit together.
     """
     robot_hz = _common_rate_hz([one.record for one in episodes])
     step = _step(robot_hz, fps)
     content = _Content.of(episodes)
-    tasks = list(dict.fromkeys(one.task for one in episodes))
-    all_frames, listed, index = list[Frames](), list[dict[str, Any]](), 0
-    picture_stats: dict[str, list[Stats]] = {name: [] for name in content.cameras}
-    for number, episode in enumerate(episodes):
-        rows, shown = _rows(episode, content, step)
-        count = len(rows)
-        frames = _frames(episode, content, rows) | {
-            "timestamp": (np.arange(count) * step / robot_hz).astype(np.float32),
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, number),
-            "index": np.arange(index, index + count),
-            "task_index": np.full(count, tasks.index(episode.task)),
-        }
+    chosen = [(episode, *_rows(episode, content, step)) for episode in episodes]
+    kept = [(episode, rows, shown) for episode, rows, shown in chosen if len(rows)]
+    for episode in episodes:
+        if not any(one.record is episode.record for one, _, _ in kept):
+            raise ConfigError(
+                f"{episode.record.folder}: no picture came while it was armed; export it without --images"
+            )
+    dataset = _Dataset(folder, write_table, content, seconds_per_frame=step / robot_hz)
+    for episode, rows, shown in kept:
+        dataset.add(episode, rows, shown)
+    dataset.finish(_info(episodes[0], content, robot_hz // step))
+    return DatasetSize(len(dataset.rows), dataset.frame_count)
+
+
+class _Dataset:
+    """The files of a dataset, written episode by episode."""
+
+    def __init__(self, folder: Path, write_table: WriteTable, content: "_Content", *, seconds_per_frame: float) -> None:
+        self._folder = folder
+        self._write_table = write_table
+        self._content = content
+        self._seconds_per_frame = seconds_per_frame
+        self._tasks: list[str] = []
+        self._frames: list[Frames] = []  # of each episode
+        self._picture_statistics: dict[str, list[Statistics]] = {camera: [] for camera in content.cameras}
+        self._records: list[RunRecord] = []  # of each episode
+        self.rows: list[dict[str, Any]] = []  # of meta/episodes, one for each episode
+        self.frame_count = 0
+
+    def add(self, episode: Episode, rows: NDArray[np.int64], shown: dict[str, NDArray[np.int64]]) -> None:
+        """Writes the frames of an episode.
+
+        Args:
+            episode: What they are of.
+            rows: Rows of its record that become frames.
+            shown: By camera, which picture each of the frames shows.
+        """
+        number, count = len(self.rows), len(rows)
+        if episode.task not in self._tasks:
+            self._tasks.append(episode.task)
+        frames = _frames(episode, self._content, rows)
+        frames["timestamp"] = (np.arange(count) * self._seconds_per_frame).astype(np.float32)
+        frames["frame_index"] = np.arange(count)
+        frames["episode_index"] = np.full(count, number)
+        frames["index"] = np.arange(self.frame_count, self.frame_count + count)
+        frames["task_index"] = np.full(count, self._tasks.index(episode.task))
         chunk, file = divmod(number, FILES_A_CHUNK)
-        columns: dict[str, Any] = {name: list(values) if values.ndim > 1 else values for name, values in frames.items()}
         row: dict[str, Any] = {
             "episode_index": number,
             "tasks": [episode.task],
             "length": count,
             "data/chunk_index": chunk,
             "data/file_index": file,
-            "dataset_from_index": index,
-            "dataset_to_index": index + count,
+            "dataset_from_index": self.frame_count,
+            "dataset_to_index": self.frame_count + count,
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
+        columns: dict[str, Any] = {}
         for name, values in frames.items():
-            row |= {f"stats/{name}/{which}": numbers for which, numbers in _stats(values).items()}
-        for camera, at in shown.items():
+            columns[name] = list(values) if values.ndim > 1 else values
+            row |= _columns_of(name, feature_statistics(values))
+        for camera, picture_numbers in shown.items():
             pictures = episode.pictures[camera]
-            columns[IMAGES + camera] = [{"bytes": pictures.png[i], "path": f"frame-{i:06d}.png"} for i in at]
-            found = _picture_stats(pictures, at)
-            picture_stats[camera].append(found)
-            row |= {f"stats/{IMAGES}{camera}/{which}": numbers for which, numbers in found.items()}
-        write_table(columns, folder / DATA.format(chunk_index=chunk, file_index=file), None)
-        listed.append(row)
-        all_frames.append(frames)
-        index += count
-    write_table({name: [row[name] for row in listed] for name in listed[0]}, folder / EPISODES, None)
-    columns = {"task_index": list(range(len(tasks))), INDEX: tasks}
-    write_table(columns, folder / "meta" / "tasks.parquet", {b"pandas": json.dumps(_PANDAS).encode()})
-    stats = {name: _stats(np.concatenate([frames[name] for frames in all_frames])) for name in all_frames[0]}
-    stats |= {f"{IMAGES}{camera}": _together(found) for camera, found in picture_stats.items()}
-    write_text(folder / "meta" / "stats.json", json.dumps(stats, indent=2) + "\n")
-    lacks = {number: one.record.lacks for number, one in enumerate(episodes) if one.record.lacks}
-    if lacks:
-        write_text(folder / LACKS, json.dumps(lacks, indent=2) + "\n")
-    info = _info(episodes[0], content, robot_hz // step) | {
-        "total_episodes": len(episodes),
-        "total_frames": index,
-        "total_tasks": len(tasks),
-        "splits": {"train": f"0:{len(episodes)}"},
-    }
-    write_text(folder / "meta" / "info.json", json.dumps(info, indent=2) + "\n")
-    return index
+            columns[IMAGES + camera] = [
+                {"bytes": pictures.png[i], "path": f"frame-{i:06d}.png"} for i in picture_numbers
+            ]
+            statistics = picture_statistics(pictures, picture_numbers)
+            self._picture_statistics[camera].append(statistics)
+            row |= _columns_of(IMAGES + camera, statistics)
+        self._write_table(columns, self._folder / DATA.format(chunk_index=chunk, file_index=file), None)
+        self._frames.append(frames)
+        self._records.append(episode.record)
+        self.rows.append(row)
+        self.frame_count += count
+
+    def finish(self, info: dict[str, Any]) -> None:
+        """Writes everything that is of all episodes. info: the features."""
+        episode_columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
+        self._write_table(episode_columns, self._folder / EPISODES, None)
+        task_columns = {"task_index": list(range(len(self._tasks))), INDEX: self._tasks}
+        metadata = {b"pandas": json.dumps(_PANDAS).encode()}
+        self._write_table(task_columns, self._folder / "meta" / "tasks.parquet", metadata)
+        statistics: dict[str, Statistics] = {}
+        for name in self._frames[0]:
+            statistics[name] = feature_statistics(np.concatenate([frames[name] for frames in self._frames]))
+        for camera, parts in self._picture_statistics.items():
+            statistics[IMAGES + camera] = join_picture_statistics(parts)
+        self._write_json("meta/stats.json", statistics)
+        lacks = {number: record.lacks for number, record in enumerate(self._records) if record.lacks}
+        if lacks:
+            self._write_json(LACKS, lacks)
+        totals = {
+            "total_episodes": len(self.rows),
+            "total_frames": self.frame_count,
+            "total_tasks": len(self._tasks),
+            "splits": {"train": f"0:{len(self.rows)}"},
+        }
+        self._write_json("meta/info.json", info | totals)
+
+    def _write_json(self, name: str, content: Any) -> None:
+        write_text(self._folder / name, json.dumps(content, indent=2) + "\n")
+
+
+def _columns_of(feature: str, statistics: Statistics) -> Statistics:
+    """Returns the columns that hold a feature's statistics in meta/episodes."""
+    return {f"stats/{feature}/{name}": numbers for name, numbers in statistics.items()}
 
 
 @dataclass(frozen=True)
@@ -142,21 +212,23 @@ def _step(robot_hz: int, fps: float | None) -> int:
 
 
 def _rows(episode: Episode, content: _Content, step: int) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
-    """The rows that become frames, and the newest picture of each camera there. Raises ConfigError.
+    """Returns the rows that become frames, and by camera the number of its newest picture at each of them.
 
-    They begin where every camera has shown something.
+    They begin where every camera has shown something; no row if a camera never does.
     """
-    record = episode.record
-    ticks = np.rint(record.time_s * 1e9 / record.description.period_ns).astype(np.int64)
-    newest = {
-        camera: np.searchsorted(np.array(episode.pictures[camera].ticks), ticks, side="right") - 1
-        for camera in content.cameras
-    }
-    seen = np.logical_and.reduce([np.ones(len(ticks), dtype=bool), *(at >= 0 for at in newest.values())])
-    if not seen.any():
-        raise ConfigError(f"{record.folder}: no picture came while it was armed; export it without --images")
-    rows = np.arange(int(np.argmax(seen)), len(ticks), step)
-    return rows, {camera: at[rows] for camera, at in newest.items()}
+    ticks = episode.record.ticks[episode.rows]
+    every_camera_has_shown = np.ones(len(ticks), dtype=bool)
+    newest: dict[str, NDArray[np.int64]] = {}
+    for camera in content.cameras:
+        picture_ticks = np.array(episode.pictures[camera].ticks)
+        newest[camera] = np.searchsorted(picture_ticks, ticks, side="right") - 1
+        too_old = int(np.searchsorted(picture_ticks, episode.pictures_after_tick, side="right"))
+        every_camera_has_shown &= newest[camera] >= too_old
+    if not every_camera_has_shown.any():
+        return episode.rows[:0], {}
+    first = int(np.argmax(every_camera_has_shown))
+    shown = {camera: numbers[first::step] for camera, numbers in newest.items()}
+    return episode.rows[first::step], shown
 
 
 def _common_rate_hz(records: Sequence[RunRecord]) -> int:
@@ -218,42 +290,11 @@ def _frames(episode: Episode, content: _Content, rows: NDArray[np.int64]) -> Fra
         "next.done": done,
     }
     if content.rewarded and episode.reward_m is not None:
-        frames["next.reward"] = np.add.reduceat(episode.reward_m, rows).astype(np.float32)
+        reward_m = episode.reward_m[: episode.rows[-1] + 1]  # the last frame earns nothing beyond its episode
+        frames["next.reward"] = np.add.reduceat(reward_m, rows).astype(np.float32)
     if content.judged:
         frames["next.success"] = done & bool(episode.success)
     return frames
-
-
-def _stats(values: NDArray[Any]) -> dict[str, list[float]]:
-    wide = values.astype(np.float64).reshape(len(values), -1)
-    numbers = {name: getattr(wide, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")}
-    quantiles = np.percentile(wide, QUANTILES, axis=0)
-    numbers |= {f"q{percent:02d}": row.tolist() for percent, row in zip(QUANTILES, quantiles, strict=True)}
-    return {**numbers, "count": [len(values)]}
-
-
-def _picture_stats(pictures: Pictures, at: NDArray[np.int64]) -> Stats:
-    """Of each channel, 0 to 1, over the pictures of these frames; quantiles are not made of pictures."""
-    mean = np.array(pictures.channel_means)[at].mean(axis=0)
-    squares = np.array(pictures.channel_squares)[at].mean(axis=0)
-    return _of_channels(pictures.least, pictures.most, mean, squares, len(at))
-
-
-def _together(found: Sequence[Stats]) -> Stats:
-    """Of all episodes."""
-    least, most, means, stds = (
-        np.array([one[name] for one in found]).reshape(-1, 3) for name in ("min", "max", "mean", "std")
-    )
-    weights = np.array([one["count"][0] for one in found])
-    mean = np.average(means, axis=0, weights=weights)
-    squares = np.average(np.square(stds) + np.square(means), axis=0, weights=weights)
-    return _of_channels(least.min(axis=0), most.max(axis=0), mean, squares, int(weights.sum()))
-
-
-def _of_channels(least: Floats, most: Floats, mean: Floats, squares: Floats, count: int) -> Stats:
-    """squares: means of the squares; all are (3,)."""
-    numbers = {"min": least, "max": most, "mean": mean, "std": np.sqrt(np.maximum(squares - np.square(mean), 0.0))}
-    return {**{name: value.reshape(3, 1, 1).tolist() for name, value in numbers.items()}, "count": [count]}
 
 
 _PANDAS = {  # what pandas needs to read an index: https://pandas.pydata.org/docs/development/developer.html

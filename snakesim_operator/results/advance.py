@@ -36,7 +36,9 @@ class Advance:
         if len(posed) < 2:
             return None
         step = max(round(SAMPLE_S * record.config.rate_hz), 1)
-        rows = np.unique(np.append(posed[::step], posed[-1]))
+        # Both ends of a stretch, so that nothing is interpolated over a gap that begins or ends between two samples.
+        ends = [row for stretch in record.stretches for row in (stretch[0], stretch[-1]) if record.posed[row]]
+        rows = np.unique(np.concatenate([posed[::step], posed[-1:], np.array(ends, dtype=np.int64)]))
         nodes = np.array([record.nodes_w(int(row)) for row in rows])
         return Advance.along(
             record.config.mission.goal, record.description, record.time_s[rows] - record.time_s[0], nodes

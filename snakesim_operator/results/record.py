@@ -171,6 +171,20 @@ class RunRecord:
         """Whether the robot had contact sensors; its file may list some that its drives do not have."""
         return any(sensor.key == keys.CONTACTS for sensor in self.description.sensors)
 
+    @cached_property
+    def ticks(self) -> NDArray[np.int64]:
+        """Tick of each row, (n,)."""
+        return np.rint(self.time_s * 1e9 / self.description.period_ns).astype(np.int64)
+
+    @cached_property
+    def stretches(self) -> list[NDArray[np.int64]]:
+        """Row numbers between the record's gaps: within a stretch every tick follows the one before."""
+        rows = np.arange(len(self.ticks))
+        if not len(rows):
+            return []
+        after_a_gap = np.flatnonzero(np.diff(self.ticks) > 1) + 1
+        return np.split(rows, after_a_gap)
+
     def row_at(self, time_s: float) -> int:
         """The row whose time is nearest."""
         return int(np.argmin(np.abs(self.time_s - time_s)))

@@ -41,6 +41,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     scene: str
     backend: str
+    emulated: Annotated[bool | None, Meta(description="whether nothing real moved; null: the host did not say")] = None
     controller: str
     seed: int
     pace: Pace
@@ -211,6 +212,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         robot=config.robot.name,
         scene=config.scene.name,
         backend=config.backend,
+        emulated=record.description.emulated,
         controller=config.commander,
         seed=config.seed,
         pace=config.pace,
@@ -308,5 +310,6 @@ def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
         return None, None, 0.0
     net = float(np.linalg.norm(body_centre_w(record.description, last) - body_centre_w(record.description, first)))
     start, end = arc_position_m(record, row), arc_position_m(record, last_row)
-    known_s = (last_row - row + 1) * record.config.period_ns * 1e-9
+    ticks = int(record.ticks[last_row] - record.ticks[row]) + 1  # those in a gap count too: the body moved in it
+    known_s = ticks * record.config.period_ns * 1e-9
     return (None if start is None or end is None else end - start), net, known_s

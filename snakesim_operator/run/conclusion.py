@@ -11,6 +11,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.what_moves import EMULATED, REAL, UNKNOWN
 from snakesim_hal.network.local_registry import robot_folder
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.terminal import say
@@ -159,6 +160,7 @@ def print_summary(summary: RunSummary) -> None:
 
     straight = summary.path_distance_m is None
     rows = [
+        _what_moved(summary),
         ("moved" if straight else "moved along the path", number(distance_m(summary), "m", 3)),
         (
             "time",
@@ -216,6 +218,16 @@ def _energy_per_metre(summary: RunSummary) -> str:
         return shown
     heading = "too little advance along the first heading" if along is None else f"{shown} along the first heading"
     return f"{displaced:.1f} J/m along its displacement, {heading}"
+
+
+def _what_moved(summary: RunSummary) -> tuple[str, str]:
+    match summary.emulated:
+        case True:
+            return EMULATED, f"nothing real moved (backend {summary.backend})"
+        case False:
+            return REAL, f"motors moved (backend {summary.backend})"
+        case None:
+            return UNKNOWN, f"whether motors moved (backend {summary.backend})"
 
 
 def _in_short(summary: RunSummary) -> str:

@@ -26,6 +26,7 @@ from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
 from snakesim_hal.model.plugins import anything_offered
 from snakesim_hal.model.scenario import CONTROL, RunConfig, write
+from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
 from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.record.recorder import HostRecordWriter
@@ -173,6 +174,8 @@ def _go(
     words = _LogWriter(files)
     with contextlib.redirect_stderr(words), InProcessRun(config) as run:
         host, session = run.host, run.network.session()
+        if progress is not None:
+            say(describe_what_moves(host.description))
         control = session.reader(keys.CONTROL_STATE, ControlState)
         watch = GoalWatch(config, host.description, give_up_s)
         with (

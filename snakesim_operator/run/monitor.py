@@ -6,6 +6,7 @@ from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.wire import keys
@@ -113,7 +114,10 @@ class RunMonitor:
             self._progress.start_over()
             self._asked_at = None
         host, before = self._supervisor.host, self._status
+        described_before = self._robot
         self._status, self._robot = (None, None) if host is None else (host.status, host.description)
+        if self._robot is not None and described_before is None:
+            self._say(describe_what_moves(self._robot))
         self._silent_polls = self._silent_polls + 1 if self._status is not None and self._status is before else 0
         self._state = self._control.newest(lambda _state: True) or self._state
         self._progress.show(self._status, self._state, armed=self._armed)

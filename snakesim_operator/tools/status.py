@@ -3,39 +3,59 @@
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from queue import Empty
 
 from snakesim_hal.errors import NotConnectedError, WireError
+from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, differences
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.terminal import say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Process, Status
+from snakesim_hal.wire.messages import Description, Process, Status
 from snakesim_operator.results import last_run
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, flags_of, namespace_of
 
 STATUS_WAIT_S = 1.0
-Robot = tuple[Link, list[Status], list[Process]]  # the newest status of each of its hosts, and its live processes
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """What a robot on the network says of itself."""
+
+    link: Link
+    statuses: list[Status]  # the newest of each of its hosts
+    processes: list[Process]  # that live
+    description: Description | None  # of the host with the last of these statuses; None: none arrived
+
+    @property
+    def status(self) -> Status:
+        """The one that is shown."""
+        return self.statuses[-1]
+
+    @property
+    def is_impostor(self) -> bool:
+        """Whether more than one host has its name."""
+        return len({status.host for status in self.statuses}) > 1
 
 
 def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
-    found: list[Robot] = []
+    found: list[_Robot] = []
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
             found += _robots(link)
     silent = [
         robot
         for robot in where.local()
-        if not any(link.endpoint == robot.endpoint and link.namespace == robot.namespace for link, *_ in found)
+        if not any(shown.link.endpoint == robot.endpoint and shown.link.namespace == robot.namespace for shown in found)
     ]
-    well = bool(found) and all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses, _ in found)
+    well = bool(found) and all(robot.status.lifecycle in ("armed", "disarmed") for robot in found)
     if as_json:
-        say_json({"robots": [_for_scripts(*robot) for robot in found], "silent": silent})
+        say_json({"robots": [_for_scripts(robot) for robot in found], "silent": silent})
         return 0 if well and not silent else 1
     for robot in silent:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
@@ -45,20 +65,25 @@ def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
         say(f"no robot answers on {', '.join(where.endpoints())}{last}")
         say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
         return 1
-    for link, statuses, processes in found:
-        lines = [*_in_words(link, statuses[-1]), *processes_in_words(processes)]
-        if len({status.host for status in statuses}) > 1:
+    for robot in found:
+        lines = [*_in_words(robot), *processes_in_words(robot.processes)]
+        if robot.is_impostor:
             lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
-        for line in [*lines, *_what_to_type(link, statuses[-1])]:
+        for line in [*lines, *_what_to_type(robot.link, robot.status)]:
             say(line)
     return 0 if well and not silent else 1
 
 
-def _robots(link: Link) -> list[Robot]:
+def _robots(link: Link) -> list[_Robot]:
     """Those on a network."""
     arrivals: Mailbox[Arrival] = Mailbox()
-    decoders = {keys.STATUS: Decoder(Status), keys.PROCESS_ALL: Decoder(Process)}
+    decoders = {
+        keys.STATUS: Decoder(Status),
+        keys.PROCESS_ALL: Decoder(Process),
+        keys.DESCRIPTION: Decoder(Description),
+    }
     found: dict[str, dict[str | None, Status]] = {}
+    descriptions: dict[tuple[str, str | None], Description] = {}  # by robot and host
     processes: dict[str, list[Process]] = {}
     prefix = "" if link.namespace is not None else "**/"
     with open_session(link, CONNECT_S) as session:
@@ -69,31 +94,38 @@ def _robots(link: Link) -> list[Robot]:
         while (left := until - time.monotonic()) > 0:
             try:
                 arrival = arrivals.get(timeout=left)
-                at = keys.STATUS if arrival.key.endswith(keys.STATUS) else keys.PROCESS_ALL
-                message = decoders[at].decode(arrival.payload, arrival.encoding)
+                row = next((key for key in (keys.STATUS, keys.DESCRIPTION) if arrival.key.endswith(key)), None)
+                message = decoders[row or keys.PROCESS_ALL].decode(arrival.payload, arrival.encoding)
             except Empty:
                 break
             except WireError:
                 continue
             name = link.namespace or namespace_of(arrival.key)
-            if isinstance(message, Status):
-                found.setdefault(name, {})[message.host] = message
-            elif arrival.key in live:
-                processes.setdefault(name, []).append(message)
-    return [
-        (replace(link, namespace=name), list(of_host.values()), processes.get(name, []))
-        for name, of_host in sorted(found.items())
-    ]
+            match message:
+                case Status():
+                    found.setdefault(name, {})[message.host] = message
+                case Description():
+                    descriptions[name, message.host] = message
+                case _:
+                    if arrival.key in live:
+                        processes.setdefault(name, []).append(message)
+    robots: list[_Robot] = []
+    for name, of_host in sorted(found.items()):
+        statuses = list(of_host.values())
+        description = descriptions.get((name, statuses[-1].host))
+        robots.append(_Robot(replace(link, namespace=name), statuses, processes.get(name, []), description))
+    return robots
 
 
-def _for_scripts(link: Link, statuses: list[Status], processes: list[Process]):
+def _for_scripts(robot: _Robot):
     """One robot, as JSON."""
     return {
-        "namespace": link.namespace,
-        "endpoint": link.endpoint,
-        "impostor": len({status.host for status in statuses}) > 1,  # more than one host has this name
-        "processes": processes,
-        "status": statuses[-1],
+        "namespace": robot.link.namespace,
+        "endpoint": robot.link.endpoint,
+        "emulated": None if robot.description is None else robot.description.emulated,  # null: unknown
+        "impostor": robot.is_impostor,
+        "processes": robot.processes,
+        "status": robot.status,
     }
 
 
@@ -111,12 +143,15 @@ def processes_in_words(processes: Sequence[Process]) -> list[str]:
     return lines
 
 
-def _in_words(link: Link, status: Status) -> list[str]:
+def _in_words(robot: _Robot) -> list[str]:
+    link, status = robot.link, robot.status
+
     def counts(numbers: dict[str, int]) -> str:
         return ", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none"
 
     lines = [
         f"{link.namespace}: {status.lifecycle} - {status.why}",
+        f"  {describe_what_moves(robot.description)}",
         f"  robot {status.robot}, backend {status.backend}, {status.pace} at {status.rate_hz:g} Hz, tick {status.tick}"
         f", on {link.endpoint}",
         f"  lease: {status.lease_holder or 'free'} (epoch {status.lease_epoch})",

@@ -3,13 +3,15 @@
 import contextlib
 import sys
 import time
+from collections.abc import Mapping
 
 import msgspec
 
+from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.terminal import Say, overwrite_lines, say, say_json
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import TICK_TIMES, Timing
+from snakesim_hal.wire.messages import TICK_TIMES, Description, Timing
 from snakesim_operator.tools.targets import RobotSelection, sessions_on
 from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
@@ -37,12 +39,19 @@ def top(where: RobotSelection, say: Say = say, *, once: bool, as_json: bool) -> 
             lines = [line for traffic in traffics for line in traffic.lines(now_ns)]
             latencies = [latency for traffic in traffics for latency in traffic.latencies()]
             times = {robot: found for traffic in traffics for robot, found in traffic.tick_times().items() if found}
+            descriptions = {robot: found for traffic in traffics for robot, found in traffic.descriptions().items()}
             left_out = sum(traffic.keys_left_out for traffic in traffics)
             if as_json:
-                content = {"keys": lines, "latencies": latencies, "tick_times": times, "left_out": left_out}
+                content = {
+                    "emulated": {robot: found.emulated for robot, found in descriptions.items()},  # missing: unknown
+                    "keys": lines,
+                    "latencies": latencies,
+                    "tick_times": times,
+                    "left_out": left_out,
+                }
                 say_json(msgspec.to_builtins(content), say)
             else:
-                table = table_of(lines, latencies, times, left_out)
+                table = table_of(lines, latencies, times, left_out, descriptions)
                 if sys.stdout.isatty() and not once:
                     drawn = overwrite_lines(table, drawn)
                 else:
@@ -72,14 +81,21 @@ def _listen(namespace: str | None, session: Session) -> Traffic:
 
 
 def table_of(
-    lines: list[KeyTraffic], latencies: list[Latency], times: dict[str, dict[str, Timing]], left_out: int
+    lines: list[KeyTraffic],
+    latencies: list[Latency],
+    times: Mapping[str, Mapping[str, Timing]],
+    left_out: int,
+    descriptions: Mapping[str, Description],
 ) -> list[str]:
-    """The table, as lines of text: robot by robot, what is not of the key space at the end of each."""
+    """Returns the table as lines of text: robot by robot, what is not of the key space at the end of each."""
     if not lines:
         return ["nothing arrives"]
     text: list[str] = []
     for robot in dict.fromkeys(line.robot for line in lines):
-        text += ["", f"{robot or 'of no robot'}:", HEAD] if text else [f"{robot or 'of no robot'}:", HEAD]
+        if text:
+            text.append("")
+        name = f"{robot}: {describe_what_moves(descriptions.get(robot))}" if robot else "of no robot:"
+        text += [name, HEAD]
         text += [_row(line) for line in lines if line.robot == robot]
         for latency in latencies:
             if latency.robot == robot:

@@ -13,7 +13,16 @@ from snakesim_hal.errors import WireError
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import AppliedCommand, Clock, JointCommand, JointState, Message, Status, Timing
+from snakesim_hal.wire.messages import (
+    AppliedCommand,
+    Clock,
+    Description,
+    JointCommand,
+    JointState,
+    Message,
+    Status,
+    Timing,
+)
 
 MAX_KEYS = 512  # a stranger may invent more; they are only counted
 KEPT = 256  # newest arrivals of a key
@@ -155,6 +164,19 @@ class Traffic:
             if relative == keys.STATUS
         }
         return {robot: status.tick_times for robot, status in said.items() if isinstance(status, Status)}
+
+    def descriptions(self) -> dict[str, Description]:
+        """Of every robot that has described itself."""
+        with self._lock:
+            newest = dict(self._newest)
+        found: dict[str, Description] = {}
+        for key, arrival in newest.items():
+            robot, relative = self._split(key)
+            if relative == keys.DESCRIPTION:
+                description = _decoded(relative, arrival)
+                if isinstance(description, Description):
+                    found[robot] = description
+        return found
 
     def is_known(self, key: str) -> bool:
         """Whether a key is one of a robot's that are published."""

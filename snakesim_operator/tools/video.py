@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -58,7 +59,9 @@ def film(
     if out.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
     extras.check("video", "a film")
-    times = _times(record, fps, speed, span_s)
+    times = times_of_pictures(record, fps, speed, span_s)
+    for sentence in standstills_in_words(times, speed / fps, record.config.period_ns * 1e-9):
+        say(sentence)
     camera: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
     with contextlib.closing(camera), _written(out, size, fps, record.lacks) as write:
         middle = _centre(record, record.row_at(times[0]))
@@ -78,8 +81,8 @@ def _centre(record: RunRecord, row: int) -> Floats:
     return nodes.mean(axis=0)
 
 
-def _times(record: RunRecord, fps: float, speed: float, span_s: Span) -> Floats:
-    """Robot time of each picture: where the pose is known."""
+def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span) -> Floats:
+    """Robot time of the pose in each picture. In a gap the last pose before it stays: the next one came only later."""
     known = record.time_s[record.posed]
     if not len(known):
         raise ConfigError(f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film")
@@ -88,8 +91,24 @@ def _times(record: RunRecord, fps: float, speed: float, span_s: Span) -> Floats:
     if last <= first:
         lasts_s = known[-1] - known[0]
         raise ConfigError(f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s")
-    times = np.arange(first, last, speed / fps)
-    return known[np.clip(np.searchsorted(known, times), 0, len(known) - 1)]
+    wanted = np.arange(first, last, speed / fps)
+    rounding_s = 0.5 * record.config.period_ns * 1e-9
+    newest = np.searchsorted(known, wanted + rounding_s, side="right") - 1
+    return known[newest]
+
+
+def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> list[str]:
+    """Returns a sentence for each time in which the film stands still because no pose is recorded.
+
+    times_s: of the pose in each picture; picture_s: robot time from picture to picture.
+    """
+    sentences: list[str] = []
+    for before_s, after_s in pairwise(np.unique(times_s).tolist()):
+        if after_s - before_s > picture_s + 1.5 * period_s:
+            sentences.append(
+                f"no pose is recorded between {before_s:.2f} and {after_s:.2f} s of robot time; the film stands still"
+            )
+    return sentences
 
 
 def _forces(record: RunRecord, time_s: float) -> list[Floats]:

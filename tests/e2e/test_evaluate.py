@@ -218,7 +218,7 @@ def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Pat
     (kept,) = (home / "runs").glob("optimise-*.db")
     assert f"runs/{kept.name} keeps all trials" in first.out, first.out + first.err
     more = snakesim(*given, "--storage", f"runs/{kept.name}", "--trials", "4", cwd=home)
-    assert "holds 2 trials already" in more.out and "trial 3:" in more.out, more.out + more.err
+    assert "holds 2 trials already" in more.out and "trial 4:" in more.out, more.out + more.err
     _, said = more.out.split("best path_distance_m: ")
     command = shlex.split(said.splitlines()[1])
     assert command.pop(0) == "snakesim"

@@ -1,6 +1,7 @@
 """A damaged recording: every command goes on behind the damage, tells what is lost, and ends with exit code 3."""
 
 import csv
+import dataclasses
 import json
 import struct
 from collections import Counter
@@ -13,9 +14,15 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.wire import keys
+from snakesim_operator.playback.episodes import read_episodes
+from snakesim_operator.playback.export import write_parquet
+from snakesim_operator.playback.lerobot import write_lerobot
+from snakesim_operator.playback.pictures import Pictures
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.summary import summarise
+from snakesim_operator.tools import video
 from tests.whole.command import snakesim
 from tests.whole.damaged import chunks, flipped, packed, recorded, spans, written
 
@@ -146,6 +153,63 @@ def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Pat
         assert snakesim("export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
     assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.lacks"]
     assert "its end" in json.loads((tmp_path / "set" / "meta" / "lacks.json").read_text())["0"][0]
+
+
+@pytest.mark.parametrize("fps", [None, 50.0])
+def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: Path, fps: float | None) -> None:
+    """No frame gets a time that it did not have, and no reward is earned while nothing was recorded."""
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    damaged = chunks(whole)[len(chunks(whole)) // 2]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    (intact,), parts = read_episodes([run], None, images=False), read_episodes([path], None, images=False)
+    write_lerobot(parts, tmp_path / "set", write_parquet, fps)
+    files = sorted((tmp_path / "set" / "data").rglob("*.parquet"))
+    assert len(files) == 2
+    record = RunRecord.load(path)
+    gap_s = float(np.diff(record.time_s).max())
+    assert gap_s > 0.1
+    begins_s = [record.time_s[0], record.time_s[int(np.argmax(np.diff(record.time_s))) + 1]]
+    assert intact.reward_m is not None
+    for file, begin_s in zip(files, begins_s, strict=True):
+        frames = parquet.read_table(file).to_pydict()
+        rows = [intact.record.row_at(begin_s + timestamp) for timestamp in frames["timestamp"]]
+        angles = np.array(frames["observation.state"])[:, : intact.record.angle_rad.shape[1]]
+        assert np.allclose(angles, intact.record.angle_rad[rows], atol=1e-6)  # they were measured at that time
+        earned_m = float(intact.reward_m[rows[0] : rows[-1] + 1].sum())
+        assert sum(frames["next.reward"]) == pytest.approx(earned_m, abs=0.002)
+        assert max(frames["next.reward"]) < 4 * intact.reward_m.max()
+        assert frames["next.done"] == [False] * (len(rows) - 1) + [True]
+    summary = summarise(record, "complete")
+    assert summary.mean_speed_m_s == pytest.approx(summarise(intact.record, "complete").mean_speed_m_s, rel=1e-6)
+
+
+def test_an_episode_after_a_gap_begins_with_a_picture_of_its_own(whole: bytes, tmp_path: Path) -> None:
+    """What a camera showed before the gap is not what the robot saw behind it."""
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    damaged = chunks(whole)[len(chunks(whole)) // 2]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    before, after = read_episodes([path], None, images=False)
+    record = before.record
+    first_tick, first_tick_after = int(record.ticks[0]), int(record.ticks[after.rows[0]])
+    pictures = Pictures(2, 1)
+    for shade, tick in enumerate((first_tick, first_tick_after + 3)):
+        pictures.take(tick, np.full((1, 2, 3), shade, np.uint8))
+    parts = [dataclasses.replace(part, pictures={"head": pictures}) for part in (before, after)]
+    write_lerobot(parts, tmp_path / "set", write_parquet)
+    lengths = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pydict()["length"]
+    assert lengths == [len(before.rows), len(after.rows) - 3]
+
+
+def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
+    damaged = chunks(whole)[len(chunks(whole)) // 2]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    record = RunRecord.load(path)
+    before, after = (int(rows[end]) for rows, end in zip(record.stretches, (-1, 0), strict=True))
+    times_s = video.times_of_pictures(record, 100.0, 1.0, (0.0, np.inf))
+    gap_s = record.time_s[after] - record.time_s[before]
+    assert (times_s == record.time_s[before]).sum() == round(gap_s * 100)  # and never the pose that came later
+    (sentence,) = video.standstills_in_words(times_s, 0.01, 0.01)
+    assert f"between {record.time_s[before]:.2f} and {record.time_s[after]:.2f} s" in sentence
 
 
 def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: bytes, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
-from snakesim_operator.results.compare.settings import Setting, differences, identity
+from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
 from snakesim_operator.results.propulsion import Propulsion, propulsion_periods
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
@@ -130,6 +130,7 @@ class Difference:
     aligned: Aligned
     compared: list[Setting]
     settings: list[Setting]  # that differ
+    drives: str  # in a sentence, whether they are the same; empty: they are
     advance: Advance | None
     following: list[Following | None]  # of every joint's angle in B, that in A
     angle: Gap
@@ -178,6 +179,7 @@ def differ(a: RunRecord, b: RunRecord) -> Difference:
         aligned=aligned,
         compared=identity(a, b),
         settings=differences(a, b),
+        drives=drives_in_words(a, b),
         advance=_advance(a, b, until_s),
         following=[following(time_s, *pair) for pair in zip(on_a.angle_rad.T, on_b.angle_rad.T, strict=True)],
         angle=angle,

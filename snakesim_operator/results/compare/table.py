@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_operator.results.compare.difference import Difference, Gap, order
-from snakesim_operator.results.compare.settings import Setting
+from snakesim_operator.results.compare.settings import Setting, drive_identities
 from snakesim_operator.results.compare.verdict import SAME, relation, sentences
 
 NAME, VALUE = 24, 22
@@ -20,6 +20,7 @@ def table(difference: Difference) -> list[str]:
         *_compared(difference),
         "",
         *_settings(difference.settings),
+        *filter(None, [difference.drives]),
         "",
         f"over {difference.aligned.time_s[-1]:.2f} s from the first arming, {difference.aligned.how}",
         *_distance(difference),
@@ -44,6 +45,7 @@ def for_scripts(difference: Difference) -> dict[str, Any]:
         "lacks": {"a": difference.a.lacks, "b": difference.b.lacks},
         "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
         "settings": {one.key: {"a": one.a, "b": one.b} for one in difference.settings},
+        "drives": drive_identities(difference.a, difference.b),
         "time_s": float(difference.aligned.time_s[-1]),
         "moved_m": None if advance is None else {"a": advance.a_m, "b": advance.b_m, "percent": advance.percent},
         "gaps": [

@@ -98,7 +98,12 @@ def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_
 
 @pytest.mark.parametrize(
     ("backend", "emulated", "words"),
-    [("sim", True, "SIMULATOR"), ("can", True, "EMULATED ROBOT ON CAN"), ("can", False, "ROBOT ON CAN")],
+    [
+        ("sim", True, "EMULATED BY A SIMULATOR"),
+        ("sim", False, "REAL ROBOT ON SIM"),  # a name alone says nothing
+        ("can", True, "EMULATED ROBOT ON CAN"),
+        ("can", False, "REAL ROBOT ON CAN"),
+    ],
 )
 def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
     robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)

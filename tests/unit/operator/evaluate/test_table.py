@@ -1,9 +1,12 @@
 """The table: intervals, medians of what crossed, and the worst failures first."""
 
+import math
+
+import numpy as np
 import pytest
 
 from snakesim_operator.evaluate.case import Case, Outcome
-from snakesim_operator.evaluate.table import lines_of, table, wilson, worst
+from snakesim_operator.evaluate.table import UNKNOWN, lines_of, mean_interval, table, wilson, worst
 
 
 def case(field: int, controller: str = "poal", row: int = 1) -> Case:
@@ -32,6 +35,24 @@ def test_speed_is_of_the_runs_that_crossed() -> None:
     head, row = table(lines)
     assert head.split()[:3] == ["setting", "controller", "crossed"]
     assert "1/3" in row and "0.200" in row and row.endswith(" 1")
+
+
+def test_without_a_goal_the_advance_has_an_interval() -> None:
+    """Of the mean, by Student's t: 12.7 of its standard error for two runs."""
+    cases = [case(1), case(2), case(1, row=2)]
+    done = {one.id: Outcome(numbers={"advance_m": 0.2 + 0.01 * one.field, "ended": "complete"}) for one in cases}
+    head, two_runs, one_run = table(lines_of(cases, done))
+    assert head.split()[-5:] == ["m", "95", "%", "of", "m"]
+    assert two_runs.endswith("0.15 to 0.28") and one_run.endswith(UNKNOWN)
+    assert "95 %" not in table(lines_of([cases[2]], done))[0]
+
+
+@pytest.mark.parametrize(("runs", "quantile"), [(2, 12.706), (4, 3.182), (11, 2.228), (31, 2.042), (1001, 1.962)])
+def test_students_t_as_tabulated(runs: int, quantile: float) -> None:
+    values = [0.0, 1.0] * (runs // 2) + [0.5] * (runs % 2)
+    low, high = mean_interval(values)
+    standard_error = float(np.std(values, ddof=1)) / math.sqrt(runs)
+    assert (high - low) / 2 / standard_error == pytest.approx(quantile, rel=2e-3)
 
 
 def test_the_worst_come_first() -> None:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.robot import describe
+from snakesim_hal.model.robot import describe, identified
 from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Mode
 from snakesim_operator.results.compare.command import compare
 from snakesim_operator.results.compare.difference import Difference, differ
@@ -206,6 +207,32 @@ def test_a_set_point_holds_until_the_next_one() -> None:
     steps = [np.repeat(np.floor((r.time_s - 0.5) * 10 + 1e-9)[:, None], JOINTS, axis=1) for r in (a, b)]
     difference = differ(dataclasses.replace(a, target=steps[0]), dataclasses.replace(b, target=steps[1]))
     assert difference.targets[0].rms == 0
+
+
+def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
+    """As a simulator and joint modules describe one robot."""
+    a, b = made_up(), made_up()
+    described = identified(b.description, [f"AE{i:02d}" for i in range(JOINTS)], ["1.0"] * JOINTS)
+    imu = next(sensor for sensor in described.sensors if sensor.key == keys.IMU)
+    slower = msgspec.structs.replace(imu, rate_hz=5.0)
+    sensors = [slower, *(sensor for sensor in reversed(described.sensors) if sensor is not imu)]
+    described = msgspec.structs.replace(described, sensors=sensors, simulated_time=True)
+    difference = differ(a, dataclasses.replace(b, description=described))
+    assert [one.key for one in difference.settings] == [f"description.sensors.{keys.IMU}.rate_hz"]
+    lines = table(difference)
+    assert "1 setting differs" in lines
+    assert "drives: A tells no serial numbers and no firmware versions, B those of 13 of 13 joints" in lines
+    assert "drives: A tells no serial numbers" in shown(difference)[1]
+    assert for_scripts(difference)["drives"]["joint_1"]["b"] == {"serial": "AE00", "firmware": "1.0"}
+
+
+def test_other_drives_are_named() -> None:
+    a, b = made_up(), made_up()
+    of_a = identified(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
+    of_b = identified(a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS)
+    difference = differ(dataclasses.replace(a, description=of_a), dataclasses.replace(b, description=of_b))
+    assert difference.settings == []
+    assert "drives: another serial number at 1 of 13 joints, another firmware version at 13" in table(difference)
 
 
 def test_ticks_that_are_missing_are_told() -> None:

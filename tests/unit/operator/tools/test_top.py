@@ -49,7 +49,7 @@ def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -
     lines = traffic.lines(MS)
     assert len(lines) == MAX_KEYS and traffic.keys_left_out == 11
     assert lines[0].failure == "malformed" and lines[1].writer is None
-    text = "\n".join(table_of(lines, [], {}, traffic.keys_left_out))
+    text = "\n".join(table_of(lines, [], {}, traffic.keys_left_out, {}))
     assert "STRANGER" in text and "11 messages on still more keys" in text
 
 

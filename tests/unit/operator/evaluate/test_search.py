@@ -1,0 +1,156 @@
+"""A search goes on with its own file only, and what it prints is of that search."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import optuna
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import find
+from snakesim_hal.model.textfiles import read_text
+from snakesim_operator.evaluate import optimise as search
+from snakesim_operator.evaluate.case import Case, Outcome
+from snakesim_operator.evaluate.optimise import Request, optimise
+
+PROPULSION = "control.propulsion_n"
+FIRST = {
+    "scenario": "triplet",
+    "vary": [f"{PROPULSION}=5:40"],
+    "set": ["duration_s=2"],
+    "goal": "path_distance_m",
+    "minimise": False,
+    "trials": 2,
+    "seeds": 1,
+    "seed": 1,
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_runs() -> Iterator[None]:
+    """Every run has a result at once: its propulsion, and something for its seed."""
+
+    @contextmanager
+    def no_workers(*_arguments: Any) -> Iterator[None]:
+        yield None
+
+    def solve(_client: None, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+        for case in cases:
+            config = msgspec.json.decode(case.config)
+            value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
+            yield case, Outcome(numbers={"path_distance_m": value, "advance_m": value})
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(search, "workers", no_workers)
+        patched.setattr(search, "size", lambda _client: 2)
+        patched.setattr(search, "solve", solve)
+        yield
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of the first search."""
+    storage = tmp_path_factory.mktemp("kept") / "search.db"
+    searched(storage)
+    return storage
+
+
+def searched(storage: Path, **other: Any) -> None:
+    assert optimise(Request(**{**FIRST, **other, "storage": storage})) == 0
+
+
+def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("other", "difference"),
+    [
+        ({"minimise": True}, "--minimise: not given there, given here"),
+        ({"goal": "advance_m"}, "--goal: path_distance_m there, advance_m here"),
+        ({"set": ["duration_s=3"]}, "--set duration_s: 2 there, 3 here"),
+        ({"set": []}, "--set duration_s: 2 there, not given here"),
+        ({"vary": [f"{PROPULSION}=5:20"]}, f"--vary {PROPULSION}: 5:40 there, 5:20 here"),
+        ({"vary": [f"{PROPULSION}=5.0:40.0"]}, f"--vary {PROPULSION}: 5:40 there, 5.0:40.0 here"),
+        ({"seeds": 2}, "--seeds: 1 there, 2 here"),
+        ({"seed": 7}, "--seed: 1 there, 7 here"),
+        ({"scenario": "peg_row"}, "scenario: triplet there, peg_row here"),
+    ],
+)
+def test_another_search_is_refused_with_every_difference(kept: Path, other: dict[str, Any], difference: str) -> None:
+    before = kept.read_bytes()
+    with pytest.raises(ConfigError) as error:
+        searched(kept, **other)
+    assert f"--storage {kept}" in str(error.value) and difference in str(error.value)
+    assert str(error.value).count(" there, ") == 1
+    assert "choose another file" in str(error.value) and "`snakesim optimise triplet --vary" in str(error.value)
+    assert kept.read_bytes() == before
+
+
+def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> None:
+    scenario = tmp_path / "own.toml"
+    text = read_text(find("triplet", "scenarios"))
+    scenario.write_text(text)
+    searched(tmp_path / "search.db", scenario=str(scenario))
+    assert "rate_hz = 100" in text
+    scenario.write_text(text.replace("rate_hz = 100", "rate_hz = 50"))
+    with pytest.raises(ConfigError, match="the same command gives another configuration"):
+        searched(tmp_path / "search.db", scenario=str(scenario))
+
+
+def test_a_file_that_does_not_say_of_which_search_it_is_stays_as_it_is(tmp_path: Path) -> None:
+    storage = tmp_path / "search.db"
+    study = optuna.create_study(storage=f"sqlite:///{storage}", study_name="triplet path_distance_m")
+    study.add_trial(optuna.trial.create_trial(value=1.0))
+    with pytest.raises(ConfigError, match="does not say with which command") as error:
+        searched(storage)
+    assert "choose another file" in str(error.value) and len(study.get_trials()) == 1
+
+
+@pytest.mark.parametrize("name", ["a?b 50%20.db", "{x}#&ä.db"])
+def test_any_file_name_will_do(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    searched(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    printed(capsys)
+    searched(tmp_path / name, trials=3)
+    assert "holds 2 trials already" in printed(capsys)[0]
+
+
+@pytest.mark.parametrize("what", ["text", "folder"])
+def test_what_is_no_search_is_named(tmp_path: Path, what: str) -> None:
+    storage = tmp_path / "search.db"
+    storage.mkdir() if what == "folder" else storage.write_text("mine\n" * 1000)
+    with pytest.raises(ConfigError, match=r"search\.db: .*choose another file"):
+        searched(storage)
+
+
+def test_trials_are_counted_from_1_to_as_many_as_were_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also after a kill, which leaves trials without a result."""
+    storage = tmp_path / "search.db"
+    searched(storage)
+    study = optuna.load_study(study_name=None, storage=f"sqlite:///{storage}")
+    study.ask({PROPULSION: optuna.distributions.IntDistribution(5, 40)})
+    searched(storage, trials=5)
+    lines = printed(capsys)
+    numbers = [int(line.split()[1].strip(":")) for line in lines if line.startswith("trial ")]
+    assert numbers == list(range(1, 6))
+    best = next(line for line in lines[::-1] if line.startswith("best "))
+    value, _, number = best.removeprefix("best path_distance_m: ").partition(", trial ")
+    assert any(line.startswith(f"trial {number}:") and line.endswith(f": {value}") for line in lines)
+
+
+def test_what_is_printed_for_several_seeds_has_the_number_of_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    searched(tmp_path / "search.db", seeds=3, seed=5)
+    *_, best, about, command = printed(capsys)
+    words = shlex.split(command)
+    propulsion = float(next(word for word in words if word.startswith(PROPULSION)).partition("=")[2])
+    assert best.startswith(f"best path_distance_m: {propulsion + 600:.4g}, trial ")
+    assert "seed=5" in words and about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"
