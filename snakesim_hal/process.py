@@ -8,7 +8,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -17,6 +17,8 @@ from snakesim_hal.errors import RefusedError
 from snakesim_hal.terminal import print_stderr
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
+SEARCH_PATH = "PYTHONPATH"
+SAFE_PATH = "PYTHONSAFEPATH"  # the variable that stands for Python's option -P
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
@@ -31,6 +33,37 @@ def user_name() -> str:
         return getpass.getuser()[:64]
     except (KeyError, OSError):
         return "operator"
+
+
+def python_command(*words: str) -> list[str]:
+    """Return the command line of a child that runs this interpreter: `python_command("-m", "package.module")`.
+
+    With `-P` the child does not search the folder that it runs in for modules. Without it, `python -m` searches that
+    folder first, so that a file `random.py` there would replace the module of that name, whoever wrote the file.
+    Every child that is started as Python gets its command line here and its variables from `child_environment`.
+    """
+    return [sys.executable, "-P", *words]
+
+
+def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment variables of a child: those of this process, then each of `more`.
+
+    `PYTHONSAFEPATH` does for the children of the child what `-P` does for itself. An empty entry of `PYTHONPATH`, as
+    in `/opt/mine:$PYTHONPATH`, would stand for the working folder, and is left out.
+    """
+    variables = dict(os.environ)
+    for mapping in more:
+        variables.update(mapping)
+    if SEARCH_PATH in variables:
+        folders = variables[SEARCH_PATH].split(os.pathsep)
+        variables[SEARCH_PATH] = os.pathsep.join(filter(None, folders))
+    variables[SAFE_PATH] = "1"
+    return variables
+
+
+def protect_children() -> None:
+    """Have every Python child that this process starts from now on ignore modules in the working folder."""
+    os.environ.update(child_environment())
 
 
 def die_with_parent(parent_pid: int | None = None) -> None:

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from snakesim_hal import errors
 from snakesim_hal.arithmetic import environment
-from snakesim_hal.process import die_with_parent
+from snakesim_hal.process import child_environment, die_with_parent, python_command
 
 ResultT = TypeVar("ResultT")
 ASKED, ANSWER = "asked", "answer"
@@ -28,8 +28,8 @@ def call_pinned(function: Callable[..., ResultT], **asked: Any) -> ResultT:
     with TemporaryDirectory(prefix="snakesim-") as folder:
         (Path(folder) / ASKED).write_bytes(pickle.dumps((function, asked)))
         process = subprocess.Popen(
-            [sys.executable, "-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())],
-            env={**os.environ, **environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
+            env=child_environment(environment(), {"PYTHONPATH": os.pathsep.join(sys.path)}),
             stdin=subprocess.DEVNULL,
         )
         try:
