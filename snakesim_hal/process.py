@@ -1,5 +1,6 @@
 """Processes that never outlive their parent, and that shut down in order on a signal."""
 
+import contextlib
 import ctypes
 import gc
 import getpass
@@ -8,7 +9,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -109,6 +110,28 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
     for number in stop_signals():
         signal.signal(number, handle)
     accept_interrupts()
+
+
+@contextlib.contextmanager
+def stop_signals_raise() -> Iterator[None]:
+    """Within, the first Ctrl-C, SIGTERM or closed terminal raises KeyboardInterrupt in the main thread.
+
+    So `with` blocks end their workers and remove their files. A second signal ends the process at once.
+    """
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        for number in replaced:  # SIGHUP comes twice of itself, from the kernel and from the shell
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    replaced = {number: signal.getsignal(number) for number in stop_signals()}
+    for number in replaced:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
 
 
 def tune_garbage_collector() -> None:

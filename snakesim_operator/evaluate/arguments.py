@@ -16,7 +16,8 @@ def add_commands(commands: Any) -> None:
     tried = commands.add_parser(
         "evaluate",
         help="run controllers on many fields; a table with confidence intervals, and a page",
-        epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run.",
+        epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run; "
+        "130 stopped by Ctrl-C, and --resume goes on.",
     )
     tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
     tried.add_argument(
@@ -78,9 +79,6 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/NAME-TIME)")
     parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
-    parser.add_argument(
-        "--dashboard", action="store_true", help="Dask's dashboard on 127.0.0.1:8787, if bokeh is there"
-    )
     _add_workers(parser)
 
 
@@ -144,7 +142,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 
 def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
-    names = ("seed", "only", "out", "resume", "cluster", "workers", "dashboard")
+    names = ("seed", "only", "out", "resume", "cluster", "workers")
     return {"again": shlex.join(["snakesim", *again]), **{name: getattr(arguments, name) for name in names}}
 
 

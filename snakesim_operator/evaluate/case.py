@@ -81,7 +81,7 @@ def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Outc
                 numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up and not result.summary.crossed}
             )
         except TookTooLongError:
-            return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
+            return took_too_long(limit_s)
         except SnakesimError as error:
             return Outcome(error=str(error))
 
@@ -98,6 +98,11 @@ def _stopped_after(limit_s: float) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def took_too_long(limit_s: float) -> Outcome:
+    """Return the outcome of a case that was stopped at its limit of wall time."""
+    return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
 
 
 def plain_numbers(summary: RunSummary) -> dict[str, Number]:

@@ -9,19 +9,20 @@ from typing import Any
 
 import numpy as np
 import optuna
-from distributed import Client
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import compose, parse_set
+from snakesim_hal.process import stop_signals_raise
 from snakesim_hal.terminal import say
 from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate.case import Case, Outcome
-from snakesim_operator.evaluate.cluster import size, solve, workers
+from snakesim_operator.evaluate.cluster import Workers, workers
 from snakesim_operator.evaluate.suite import Suite, also_set, cases_of, read_suite, rows_of, seeds_of
 from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.progress import in_minutes
 
 
@@ -44,7 +45,21 @@ class Request:
 
 
 def optimise(request: Request) -> int:
-    """Go on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
+    """Search until so many trials have a result, or have been tried.
+
+    Returns: 0; 1 when no trial has a result; 130 when it was stopped, which loses no trial that is done.
+    """
+    with stop_signals_raise():
+        try:
+            return _search(request)
+        except KeyboardInterrupt:
+            if request.storage.is_file():
+                say(f"stopped: {request.storage} keeps the trials that are done; the same command goes on with")
+                say(f"  --storage {shlex.quote(str(request.storage))}")
+            return INTERRUPTED
+
+
+def _search(request: Request) -> int:
     space: dict[str, BaseDistribution] = dict(map(_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(
@@ -59,10 +74,10 @@ def optimise(request: Request) -> int:
     say(f"{request.storage} {already}; --storage {request.storage} goes on with them")
     if left := max(request.trials - have, 0):
         began, todo = time.monotonic(), left
-        with workers(request.cluster, request.workers) as client:
+        with workers(request.cluster, request.workers) as working:
             while left > 0:
-                asked = [study.ask(space) for _ in range(min(left, size(client)))]
-                _trials(request, study, asked, client)
+                asked = [study.ask(space) for _ in range(min(left, working.size()))]
+                _trials(request, study, asked, working)
                 left -= len(asked)
                 passed_s = time.monotonic() - began
                 left_s = passed_s / (todo - left) * left
@@ -90,10 +105,10 @@ def _study(request: Request) -> Study:
     return study
 
 
-def _trials(request: Request, study: Study, asked: Sequence[Trial], client: Client) -> None:
+def _trials(request: Request, study: Study, asked: Sequence[Trial], working: Workers) -> None:
     cases = {trial.number: _cases(request, trial.params) for trial in asked}
     outcomes: dict[str, Outcome] = {}
-    for case, outcome in solve(client, list({case.id: case for own in cases.values() for case in own}.values())):
+    for case, outcome in working.solve(list({case.id: case for own in cases.values() for case in own}.values())):
         outcomes[case.id] = outcome
     for trial in asked:
         values = [outcomes[case.id].numbers.get(request.goal) for case in cases[trial.number]]
