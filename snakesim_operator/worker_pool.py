@@ -16,7 +16,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -33,6 +32,7 @@ MAX_DEATHS = 5  # of the workers that run a call, until the call is given up
 MAX_RAISES = 3  # of a call, until its exception is its outcome: the fault may have been the worker's
 NICENESS = 10  # robots and consoles that run meanwhile come first
 TEMPORARY_FILES = "TMPDIR"  # the variable that names the folder for them
+BEGIN = f"import sys; from {__name__} import main; sys.exit(main(sys.argv[1:]))"  # not -m: classes are of this module
 FOLDER_PREFIX = "snakesim-workers-"
 
 
@@ -189,7 +189,7 @@ class _Worker:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                python_command("-m", __name__, str(theirs.fileno()), str(os.getpid())),
+                python_command("-c", BEGIN, str(theirs.fileno()), str(os.getpid())),
                 env=child_environment(
                     arithmetic.environment(), arithmetic.ONE_THREAD, {TEMPORARY_FILES: str(self.folder)}
                 ),
@@ -237,9 +237,3 @@ def _portable(error: Exception) -> Exception:
     except Exception:  # noqa: BLE001 - pickling runs code of the exception's class
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error
-
-
-if __name__ == "__main__":
-    from snakesim_operator import worker_pool  # so that what is sent is of the module, not of `__main__`
-
-    sys.exit(worker_pool.main(sys.argv[1:]))
