@@ -23,6 +23,7 @@ SAFE_PATH = "PYTHONSAFEPATH"  # the variable that stands for Python's option -P
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+MIN_MEMORY_LIMIT = 2**30  # bytes: four times what a run allocates
 SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
 # Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs does not delay the host.
 HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
@@ -194,6 +195,26 @@ def lock_memory() -> str | None:
     if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) != 0:
         return f"memory not locked: {os.strerror(ctypes.get_errno())}"
     return None
+
+
+def limit_memory() -> None:
+    """Let this process allocate no more than the computer has available now: beyond that, an allocation fails.
+
+    Otherwise code that allocates without end makes the whole computer swap, until the kernel ends some process. A
+    lower limit, as of `ulimit -d`, stays.
+    """
+    allowed = max(available_memory(), MIN_MEMORY_LIMIT)
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if soft == resource.RLIM_INFINITY or soft > allowed:
+        resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
+
+
+def available_memory() -> int:
+    """Return how many bytes the kernel could give to programs without swapping."""
+    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    raise OSError("/proc/meminfo has no MemAvailable")
 
 
 def raise_open_files(most: int) -> None:

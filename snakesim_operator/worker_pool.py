@@ -10,6 +10,7 @@ temporary files are removed.
 """
 
 import contextlib
+import fcntl
 import os
 import pickle
 import shutil
@@ -22,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import gettempdir, mkdtemp
 from typing import Any, Self
 
 from snakesim_hal import arithmetic
@@ -33,6 +34,7 @@ MAX_RAISES = 3  # of a call, until its exception is its outcome: the fault may h
 NICENESS = 10  # robots and consoles that run meanwhile come first
 TEMPORARY_FILES = "TMPDIR"  # the variable that names the folder for them
 BEGIN = f"import sys; from {__name__} import main; sys.exit(main(sys.argv[1:]))"  # not -m: classes are of this module
+UNLOCKED_S = 60.0  # a new folder is locked long before
 FOLDER_PREFIX = "snakesim-workers-"
 
 
@@ -83,7 +85,10 @@ class WorkerPool:
         self._started = 0
 
     def __enter__(self) -> Self:
+        _remove_abandoned_folders()
         self._folder = Path(mkdtemp(prefix=FOLDER_PREFIX))
+        self._lock = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)  # shows that the folder is in use
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -92,6 +97,7 @@ class WorkerPool:
         self._workers.clear()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
+            os.close(self._lock)
 
     def run(
         self, function: Callable[..., Any], calls: Sequence[Sequence[Any]], limit_s: float | None = None
@@ -176,6 +182,21 @@ class WorkerPool:
         worker.kill()
         self._workers.remove(worker)
         shutil.rmtree(worker.folder, ignore_errors=True)
+
+
+def _remove_abandoned_folders() -> None:
+    """Remove the folders of commands of this user that were killed."""
+    for folder in Path(gettempdir()).glob(f"{FOLDER_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            state = folder.lstat()
+            if state.st_uid != os.geteuid() or time.time() - state.st_ctime < UNLOCKED_S:
+                continue
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails for one that is in use
+                shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(handle)
 
 
 @dataclass(eq=False)

@@ -13,6 +13,7 @@ from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.process import stop_signals_raise
+from snakesim_hal.step_limit import Pulse
 from snakesim_hal.terminal import say
 from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate import store
@@ -51,13 +52,13 @@ class Request:
     workers: int | None = None
 
 
-def go(request: Request) -> int:
-    """Run all cases that are not done yet, or one as a run of its own.
+def go(request: Request, pulse: Pulse | None = None) -> int:
+    """Run all cases that are not done yet, or one as a run of its own. pulse: of that one, as of `run_in_process`.
 
     Returns: 0; 1 when a case could not run; 130 when it was stopped, which loses no case that is done.
     """
     if request.only is not None:
-        return _run_one(request, request.only)
+        return _run_one(request, request.only, pulse)
     with stop_signals_raise():
         try:
             return _run_all(request)
@@ -104,12 +105,12 @@ def first_field(request: Request) -> int:
     return seed
 
 
-def _run_one(request: Request, only: str) -> int:
+def _run_one(request: Request, only: str, pulse: Pulse | None) -> int:
     """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
     case = choose(request.suite, request.source, only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
-    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s)
+    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, pulse=pulse)
 
 
 def choose(suite: Suite, source: str, only: str) -> Case:

@@ -25,11 +25,11 @@ LOOK_S = 1.0  # Python code runs again after so long, so that an exception can b
 
 def call_pinned(function: Callable[..., ResultT], **asked: Any) -> ResultT:
     """Call a function of a module with these arguments in a process of its own. Raises as it does."""
-    with TemporaryDirectory(prefix="snakesim-") as folder:
+    with TemporaryDirectory(prefix="snakesim-") as folder:  # also for the child's own, which Ctrl-C kills
         (Path(folder) / ASKED).write_bytes(pickle.dumps((function, asked)))
         process = subprocess.Popen(
             python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
-            env=child_environment(environment(), {"PYTHONPATH": os.pathsep.join(sys.path)}),
+            env=child_environment(environment(), {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}),
             stdin=subprocess.DEVNULL,
         )
         try:

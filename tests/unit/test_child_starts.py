@@ -43,7 +43,11 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "snakesim_can_backend/bus/bus_faults.py": "ip",
     "snakesim_hal/process.py": "the same program again, with its own options",
 }
-FORKS = {"benchmarks/environments.py", "snakesim/environments/vector.py"}  # copies of a process, which import nothing
+FORKS = {
+    "benchmarks/environments.py",
+    "snakesim/environments/vector.py",
+    "snakesim_operator/run/guarded_process.py",
+}  # copies of a process, which import nothing
 
 
 def dotted(node: ast.expr) -> str:

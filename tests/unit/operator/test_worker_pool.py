@@ -8,6 +8,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from snakesim_operator import worker_pool
 from snakesim_operator.worker_pool import (
     FOLDER_PREFIX,
     CallTookTooLongError,
@@ -37,6 +38,9 @@ def test_calls_are_spread_over_processes_to_which_nothing_can_connect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    abandoned = tmp_path / f"{FOLDER_PREFIX}killed"
+    abandoned.mkdir()
+    monkeypatch.setattr(worker_pool, "UNLOCKED_S", 0.0)
     before = listening_sockets()
     with WorkerPool(2) as pool:
         assert pool.map(math.sqrt, [(4.0,), (9.0,), (16.0,)]) == [2.0, 3.0, 4.0]
