@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import zenoh
 
+from snakesim_hal.process import child_environment, python_command
 from tests.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
@@ -56,7 +57,8 @@ def echo_times_us(
     with zenoh.open(_config(endpoint, listen=True)) as session:
         publisher = publisher_of(session, REQUEST)
         replies = session.declare_subscriber(REPLY, zenoh.handlers.RingChannel(4))
-        other = subprocess.Popen([*prefix, sys.executable, "-m", "benchmarks.echo", endpoint, str(len(reply))])
+        command = python_command("-m", "benchmarks.echo", endpoint, str(len(reply)))
+        other = subprocess.Popen([*prefix, *command], env=child_environment())
         try:
             deadline = time.monotonic() + 20
             while replies.try_recv() is None:  # until the other side answers

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from snakesim_hal.process import child_environment, python_command
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 
@@ -18,11 +19,14 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
     """One `snakesim run`; another when it was stopped, as a machine that stands still for 50 ms does to it."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        typed = [sys.executable, "-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments]
+        typed = python_command("-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments)
         for left in reversed(range(TRIES)):
-            if subprocess.run(typed, check=left == 0, stdout=subprocess.DEVNULL, timeout=300).returncode == 0:
+            ended = subprocess.run(
+                typed, env=child_environment(), check=left == 0, stdout=subprocess.DEVNULL, timeout=300
+            )
+            if ended.returncode == 0:
                 break
-            print(f"stopped, tried again: {' '.join(typed[3:])}", file=sys.stderr)
+            print(f"stopped, tried again: snakesim run {scenario} {' '.join(arguments)}", file=sys.stderr)
         return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
 
 

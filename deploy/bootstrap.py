@@ -187,8 +187,9 @@ def fetch_environment() -> "dict[str, str]":
         for name, value in os.environ.items()
         if not name.startswith(INSTALLER_VARIABLES) or HOW_TO_FETCH.search(name)
     }
-    # The first two override a pip.conf that asks for --user or for an active environment.
-    return dict(kept, PIP_USER="0", PIP_REQUIRE_VIRTUALENV="0", PIP_DISABLE_PIP_VERSION_CHECK="1")
+    # The first two override a pip.conf that asks for --user or for an active environment. The last one keeps
+    # `python -m` from taking modules from the folder in which `make setup` was typed.
+    return dict(kept, PIP_USER="0", PIP_REQUIRE_VIRTUALENV="0", PIP_DISABLE_PIP_VERSION_CHECK="1", PYTHONSAFEPATH="1")
 
 
 if __name__ == "__main__":

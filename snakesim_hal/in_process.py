@@ -9,7 +9,9 @@ The parts are those of a run in lockstep: the same host with its authority, the 
 them. So a configuration drives the motors alike in both, to the bit. What needs processes or a network is refused.
 """
 
+import itertools
 import time
+import traceback
 from collections.abc import Generator
 from contextlib import ExitStack, closing
 from typing import Self
@@ -25,12 +27,16 @@ from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.plugin_check import find_service
-from snakesim_hal.service import ServiceLoop
+from snakesim_hal.service import START_LIMIT_S, ServiceLoop
+from snakesim_hal.step_limit import Pulse, StepLimit, StepTooLongError, place_of
 from snakesim_hal.terminal import report_error
 from snakesim_hal.wire.messages import request_to_arm
 
 AFTER_FAULT_S = 1.5
 ARM_LIMIT_S, ARM_LIMIT_TURNS = 10.0, 100  # both: planning, or a busy computer, may take long for a turn
+TURN_LIMIT_S = 60.0  # of one part in one turn; beyond, it computes without end
+INTERRUPT_GRACE_S = 1.0  # of the present turn of a part, after Ctrl-C
+OVER = object()
 WHO = "run in one process"
 
 
@@ -52,10 +58,21 @@ def check(config: RunConfig) -> None:
 class InProcessRun:
     """One run, from `with` to its end."""
 
-    def __init__(self, config: RunConfig) -> None:
-        """Raises ConfigError for a run that needs more than one process."""
+    def __init__(self, config: RunConfig, pulse: Pulse | None = None, turn_limit_s: float | None = None) -> None:
+        """Check the configuration.
+
+        Args:
+            config: of the run.
+            pulse: shows another process whether the run goes on.
+            turn_limit_s: wall time that a part may take in one turn, if not as the configuration says.
+
+        Raises:
+            ConfigError: the run needs more than one process.
+        """
         check(config)
         self.config = config
+        self._limit = StepLimit(START_LIMIT_S, pulse)
+        self._turn_limit_s = turn_limit_s or max(TURN_LIMIT_S, config.start_limit_s)
         self.network = LocalNetwork()
         self.failed: list[str] = []  # services that could not go on, and why
         self._errors: dict[str, SnakesimError] = {}  # what ended them
@@ -66,11 +83,17 @@ class InProcessRun:
     def __enter__(self) -> Self:
         """Open the backend and all services. Raises SnakesimError."""
         with ExitStack() as opening:
-            self._open(opening)
+            try:
+                with self._limit:
+                    self._open(opening)
+            except StepTooLongError as error:
+                raise RefusedError(f"the run did not begin: {self._explain(error)}") from error
             self._opened = opening.pop_all()
+        self._limit.limit_s = self._turn_limit_s
         return self
 
     def __exit__(self, *_error: object) -> None:
+        self._limit.close()
         self._opened.close()
 
     def _open(self, opened: ExitStack) -> None:
@@ -115,7 +138,10 @@ class InProcessRun:
         limit_s = min(ARM_LIMIT_S, self.config.start_limit_s)
         give_up = time.monotonic() + limit_s
         with closing(self.host.turns()) as turns:
-            for turn, _ in enumerate(turns):
+            for turn in itertools.count():
+                with self._limit:  # the backend may be third-party code, and turns this into an error of its own
+                    if next(turns, OVER) is OVER:
+                        return
                 if turn == 0:
                     for loop in self._loops.values():
                         loop.join()
@@ -149,13 +175,33 @@ class InProcessRun:
         loops = self._loops.items()
         return [f"{name}: {loop.service.too_slow}" for name, loop in loops if loop.service.too_slow]
 
+    def hurry(self) -> None:
+        """Wait no longer for a part that does not return. May be called by a signal handler."""
+        self._limit.hurry(INTERRUPT_GRACE_S)
+
     def _let_act(self) -> None:
         for name, loop in list(self._loops.items()):
             try:
-                loop.act()
+                with self._limit:
+                    loop.act()
             except SnakesimError as error:  # its process would end here, and the host would go on
                 report_error(error, f"snakesim {name}")
-                self.failed.append(f"{name} ended: {error}")
                 self._errors[name] = error
-                del self._loops[name]
-                self._parts[name].close()
+                self._end_service(name, str(error))
+            except StepTooLongError as error:
+                traceback.print_exc()
+                self._end_service(name, self._explain(error))
+
+    def _explain(self, error: StepTooLongError) -> str:
+        """Return why a part was interrupted, and what to do about it."""
+        if self._limit.is_hurried:
+            return f"{place_of(error)} had not returned {INTERRUPT_GRACE_S:g} s after the run was told to stop"
+        return (
+            f"{place_of(error)} took longer than {self._limit.limit_s:g} s in one tick; if it needs so long, allow it "
+            "with --set start_limit_s=600"
+        )
+
+    def _end_service(self, name: str, why: str) -> None:
+        self.failed.append(f"{name} ended: {why}")
+        del self._loops[name]
+        self._parts[name].close()

@@ -1,5 +1,6 @@
 """Processes that never outlive their parent, and that shut down in order on a signal."""
 
+import contextlib
 import ctypes
 import gc
 import getpass
@@ -8,7 +9,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -17,9 +18,12 @@ from snakesim_hal.errors import RefusedError
 from snakesim_hal.terminal import print_stderr
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
+SEARCH_PATH = "PYTHONPATH"
+SAFE_PATH = "PYTHONSAFEPATH"  # the variable that stands for Python's option -P
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+MIN_MEMORY_LIMIT = 2**30  # bytes: four times what a run allocates
 SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
 # Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs does not delay the host.
 HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
@@ -31,6 +35,37 @@ def user_name() -> str:
         return getpass.getuser()[:64]
     except (KeyError, OSError):
         return "operator"
+
+
+def python_command(*words: str) -> list[str]:
+    """Return the command line of a child that runs this interpreter: `python_command("-m", "package.module")`.
+
+    With `-P` the child does not search the folder that it runs in for modules. Without it, `python -m` searches that
+    folder first, so that a file `random.py` there would replace the module of that name, whoever wrote the file.
+    Every child that is started as Python gets its command line here and its variables from `child_environment`.
+    """
+    return [sys.executable, "-P", *words]
+
+
+def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment variables of a child: those of this process, then each of `more`.
+
+    `PYTHONSAFEPATH` does for the children of the child what `-P` does for itself. An empty entry of `PYTHONPATH`, as
+    in `/opt/mine:$PYTHONPATH`, would stand for the working folder, and is left out.
+    """
+    variables = dict(os.environ)
+    for mapping in more:
+        variables.update(mapping)
+    if SEARCH_PATH in variables:
+        folders = variables[SEARCH_PATH].split(os.pathsep)
+        variables[SEARCH_PATH] = os.pathsep.join(filter(None, folders))
+    variables[SAFE_PATH] = "1"
+    return variables
+
+
+def protect_children() -> None:
+    """Have every Python child that this process starts from now on ignore modules in the working folder."""
+    os.environ.update(child_environment())
 
 
 def die_with_parent(parent_pid: int | None = None) -> None:
@@ -76,6 +111,28 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
     for number in stop_signals():
         signal.signal(number, handle)
     accept_interrupts()
+
+
+@contextlib.contextmanager
+def stop_signals_raise() -> Iterator[None]:
+    """Within, the first Ctrl-C, SIGTERM or closed terminal raises KeyboardInterrupt in the main thread.
+
+    So `with` blocks end their workers and remove their files. A second signal ends the process at once.
+    """
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        for number in replaced:  # SIGHUP comes twice of itself, from the kernel and from the shell
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    replaced = {number: signal.getsignal(number) for number in stop_signals()}
+    for number in replaced:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
 
 
 def tune_garbage_collector() -> None:
@@ -138,6 +195,26 @@ def lock_memory() -> str | None:
     if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) != 0:
         return f"memory not locked: {os.strerror(ctypes.get_errno())}"
     return None
+
+
+def limit_memory() -> None:
+    """Let this process allocate no more than the computer has available now: beyond that, an allocation fails.
+
+    Otherwise code that allocates without end makes the whole computer swap, until the kernel ends some process. A
+    lower limit, as of `ulimit -d`, stays.
+    """
+    allowed = max(available_memory(), MIN_MEMORY_LIMIT)
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if soft == resource.RLIM_INFINITY or soft > allowed:
+        resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
+
+
+def available_memory() -> int:
+    """Return how many bytes the kernel could give to programs without swapping."""
+    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    raise OSError("/proc/meminfo has no MemAvailable")
 
 
 def raise_open_files(most: int) -> None:

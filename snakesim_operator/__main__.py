@@ -1,12 +1,30 @@
 """Entry point of the `snakesim` command."""
 
 import os
-import resource
-import signal
 import sys
 
-from snakesim_hal.arithmetic import pin
-from snakesim_hal.terminal import print_stderr
+
+def _leave_out_working_folder() -> None:
+    """Keep files in the working folder from replacing the modules that are imported below."""
+    if __name__ == "__main__" and not sys.flags.safe_path:
+        del sys.path[0]  # `python -m` has put that folder there
+    search_path = os.environ.get("PYTHONPATH", "")
+    if search_path and "" in search_path.split(os.pathsep):  # as in PYTHONPATH=/opt/mine:$PYTHONPATH
+        try:
+            folder = os.getcwd()  # noqa: PTH109 - pathlib itself could be replaced
+        except FileNotFoundError:  # it has been deleted
+            return
+        sys.path.sort(key=folder.__eq__)  # to the end: Python looks there last
+
+
+_leave_out_working_folder()
+
+import resource  # noqa: E402
+import signal  # noqa: E402
+
+from snakesim_hal.arithmetic import pin  # noqa: E402
+from snakesim_hal.process import protect_children  # noqa: E402
+from snakesim_hal.terminal import print_stderr  # noqa: E402
 
 
 def main() -> int:
@@ -21,6 +39,7 @@ def main() -> int:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    protect_children()
     pin(one_thread=True)  # before NumPy is imported
     try:
         from snakesim_operator.cli import main as command

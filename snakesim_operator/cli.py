@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 3 an incomplete record, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
-        return exit_code("snakesim", lambda: _act(given))
+        return exit_code("snakesim", lambda: _act(given, owns_process=argv is None))
     except ModuleNotFoundError as error:
         from snakesim_operator.extras import explained
 
@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
 
 
-def _act(given: list[str]) -> int:
+def _act(given: list[str], *, owns_process: bool) -> int:
     if not given:
         parser().print_help()
         return OK
@@ -70,6 +70,7 @@ def _act(given: list[str]) -> int:
     arguments, unknown = ours.parse_known_args(given)
     if unknown:
         _refuse(unknown[0], ours.of(given))
+    arguments.owns_process = owns_process  # whether nothing but this command runs in this process
     return arguments.act(arguments)
 
 

@@ -3,10 +3,12 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-
-from distributed import Client
+from typing import TYPE_CHECKING
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, short
+
+if TYPE_CHECKING:  # takes a second to import, and most commands only check an address
+    from distributed import Client
 
 MEET_S = 20.0
 
@@ -18,9 +20,12 @@ def check_address(address: str | None) -> None:
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Client]:
+def connected(address: str) -> "Iterator[Client]":
     """Its client. Raises NotConnectedError when there is no answer, ConfigError for an invalid address."""
+    from distributed import Client
+
     check_address(address)
+    _check_certificates(address)
     try:
         client = Client(address, timeout=MEET_S, set_as_default=False)
     except (OSError, TimeoutError):
@@ -33,3 +38,18 @@ def connected(address: str) -> Iterator[Client]:
                 f"--cluster {address}: no worker within {MEET_S:g} s; start some: dask worker {address} --nthreads 1"
             ) from None
         yield client
+
+
+def _check_certificates(address: str) -> None:
+    """Raise ConfigError for a scheduler with TLS when this computer has no certificate for it."""
+    from distributed import Security
+
+    try:
+        context = Security().get_connection_args("client")["ssl_context"]
+    except OSError as error:  # that of the ssl module, too
+        raise ConfigError(f"--cluster {address}: a file of Dask's TLS configuration cannot be used: {error}") from None
+    if address.startswith("tls:") and context is None:
+        raise ConfigError(
+            f"--cluster {address}: Dask has no certificate for TLS; name the files in its configuration, "
+            "distributed.comm.tls, as docs/evaluation.md shows"
+        )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snakesim_hal.arithmetic import ONE_THREAD
-from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent
+from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent, python_command
 
 NET = "10.78.0"
 HURRIED = ("chrt", "--fifo", str(SERVICE_PRIORITY))
@@ -66,7 +66,7 @@ class Machine:
     ) -> subprocess.Popen[bytes]:
         """The same for a Python module."""
         return self.start(
-            sys.executable, "-m", *module_and_arguments, log=log, env=ONE_THREAD, inherits=inherits, hurried=hurried
+            *python_command("-m", *module_and_arguments), log=log, env=ONE_THREAD, inherits=inherits, hurried=hurried
         )
 
     def _started(

@@ -21,6 +21,7 @@ from benchmarks.echo import echo_times_us
 from benchmarks.physics import config_of, wire_bytes
 from benchmarks.whole import run
 from snakesim_hal.in_process import InProcessRun
+from snakesim_hal.process import child_environment, python_command
 from snakesim_hal.safety.authority import Authority
 
 HERE = Path(__file__).parent
@@ -47,14 +48,15 @@ def main() -> int:
     if given.inside:
         return _measure(write=given.write)
     _install()
-    again = [sys.executable, "-m", "benchmarks.peers", "--inside", *(["--write"] if given.write else [])]
+    again = python_command("-m", "benchmarks.peers", "--inside", *(["--write"] if given.write else []))
     user = () if os.geteuid() == 0 else ("--map-root-user",)
-    return subprocess.call([*ISOLATED, *user, "sh", "-c", 'ip link set lo up && exec "$@"', "sh", *again])
+    shell = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
+    return subprocess.call([*ISOLATED, *user, *shell, *again], env=child_environment())
 
 
 def _install() -> None:
     if not (DORA / "bin/dora").exists():
-        subprocess.run([sys.executable, "-m", "venv", DORA], check=True)
+        subprocess.run(python_command("-m", "venv", str(DORA)), env=child_environment(), check=True)
         packages = ("dora-rs", "dora-rs-cli", "pyarrow", "numpy")
         subprocess.run([DORA / "bin/python", "-m", "pip", "install", "--quiet", *packages], check=True)
     if not _has_rospy():

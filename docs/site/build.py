@@ -15,6 +15,7 @@ from pathlib import Path
 import pdoc
 
 import snakesim  # before NumPy
+from snakesim_hal.process import child_environment, python_command
 from snakesim_operator.cli import parser
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -87,8 +88,8 @@ def commands(command: argparse.ArgumentParser) -> Iterator[argparse.ArgumentPars
 
 def run(module: str, *arguments: str, **variables: str) -> None:
     """Run a module of this environment's Python, and end with it if it fails."""
-    command = (sys.executable, "-m", module, *arguments)
-    if (ended := subprocess.run(command, cwd=ROOT, env={**os.environ, **variables})).returncode:
+    ended = subprocess.run(python_command("-m", module, *arguments), cwd=ROOT, env=child_environment(variables))
+    if ended.returncode:
         sys.exit(f"docs: {module} {' '.join(arguments)} exited with {ended.returncode}")
 
 

@@ -1,5 +1,6 @@
 """The search for a policy: `snakesim train`, in the extra `train`. See `docs/environments.md`.
 
 `form` has the policy and its numbers, `episodes` runs it in environments, `search` looks for better ones, `exported`
-writes it as an ONNX file that the controller `policy` takes, `curve` what came of each generation.
+writes it as an ONNX file that the controller `policy` takes, `curve` what came of each generation. `kept_search` has
+what a search needs to go on after it was stopped.
 """

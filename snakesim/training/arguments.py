@@ -16,7 +16,7 @@ def add_commands(commands: Any) -> None:
         "train",
         help="search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE",
         epilog="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers give the "
-        "same policy, whatever --workers. Exit code: 0; 2 wrong input.",
+        "same policy, whatever --workers. Exit code: 0; 2 wrong input; 130 stopped by Ctrl-C, and --resume goes on.",
     )
     train.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
     train.add_argument("--form", choices=("feeling", "wave"), default="feeling", help="what is learned (feeling)")
@@ -47,6 +47,7 @@ def add_commands(commands: Any) -> None:
     train.add_argument("--workers", type=number(1, 1000), metavar="N", help="processes (one a core)")
     train.add_argument("--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster, instead")
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of what comes of it")
+    train.add_argument("--resume", action="store_true", help="go on with the search that was stopped in --out")
     train.set_defaults(act=_train)
 
 
@@ -83,4 +84,5 @@ def _train(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         cluster=arguments.cluster,
         again=["snakesim", "train", arguments.scenario, *chosen],
+        resume=arguments.resume,
     )

@@ -1,19 +1,22 @@
 """The learning curve: a table, and a figure of it."""
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from snakesim.training.search import Generation
+from snakesim_hal.model.whole_file import write_whole
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
     """`curve.csv` and `curve.png` in a folder."""
-    with (folder / "curve.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, list(asdict(generations[0])))
-        table.writeheader()
-        table.writerows(asdict(one) for one in generations)
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, list(asdict(generations[0])))
+    table.writeheader()
+    table.writerows(asdict(one) for one in generations)
+    write_whole(folder / "curve.csv", text.getvalue().encode())
     _draw(folder / "curve.png", generations)
 
 
@@ -30,4 +33,6 @@ def _draw(file: Path, generations: Sequence[Generation]) -> None:
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    figure.savefig(file, dpi=120)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=120)
+    write_whole(file, picture.getvalue())

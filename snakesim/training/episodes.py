@@ -1,12 +1,8 @@
 """Episodes of policies, in a process for each processor, or on the workers of a Dask cluster."""
 
-import os
-import signal
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any, Self
 
 import numpy as np
@@ -14,11 +10,12 @@ import numpy as np
 from snakesim.environments import SnakeEnv
 from snakesim.training.form import OBSERVE, Policy
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.process import die_with_parent
+from snakesim_operator.worker_pool import WorkerPool
 
 RETRIES = 2  # of an episode whose worker died
 Values = Mapping[str, float]
 Arguments = Mapping[str, Any]  # of `SnakeEnv`
+Map = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]  # what each call returns, in their order
 _SEATS: list[tuple[Arguments, SnakeEnv]] = []  # of this process: one environment
 
 
@@ -38,13 +35,16 @@ class Episodes:
 
     def __init__(self, arguments: Arguments, workers: int | None = None, cluster: str | None = None) -> None:
         """cluster: address of a Dask scheduler. Raises ConfigError, NotConnectedError."""
-        self._arguments, self._opened = dict(arguments), ExitStack()
+        self._arguments = dict(arguments)
+        self._workers = workers
+        self._cluster = cluster
+        self._opened = ExitStack()
         env = _seat(self._arguments)
         self.axes = [joint.axis for joint in env.description.joints]
         self.sizes = {name: len(part.names) for name, part in env.parts.items()}
-        self._pool = self._opened.enter_context(_local(workers) if cluster is None else _remote(cluster))
 
     def __enter__(self) -> Self:
+        self._map = self._map_here() if self._cluster is None else self._map_there(self._cluster)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -54,34 +54,21 @@ class Episodes:
         """Every policy on every field; those that a scene cannot have are left out."""
         made = [Policy.of(values, self.axes, self.sizes) for values in policies]
         jobs = [(self._arguments, policy, field) for policy in made for field in fields]
-        found = list(self._pool.map(_episode, *zip(*jobs, strict=True)))
+        found = self._map(_episode, jobs)
         return [
             [episode for episode in found[start : start + len(fields)] if episode is not None]
             for start in range(0, len(found), len(fields))
         ]
 
+    def _map_here(self) -> Map:
+        return self._opened.enter_context(WorkerPool(self._workers)).map
 
-@contextmanager
-def _local(workers: int | None) -> Iterator[Executor]:
-    pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"), initializer=_begin)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
+    def _map_there(self, address: str) -> Map:
+        from snakesim_operator.dask_cluster import connected  # of another extra
 
-
-@contextmanager
-def _remote(address: str) -> Iterator[Executor]:
-    from snakesim_operator.dask_cluster import connected
-
-    with connected(address) as client:
-        yield client.get_executor(pure=False, retries=RETRIES)
-
-
-def _begin() -> None:
-    """In each process."""
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for the command
+        client = self._opened.enter_context(connected(address))
+        executor = client.get_executor(pure=False, retries=RETRIES)
+        return lambda function, calls: list(executor.map(function, *zip(*calls, strict=True)))
 
 
 def _seat(arguments: Arguments) -> SnakeEnv:

@@ -1,6 +1,6 @@
 """The search for a policy: CMA-ES over the parameters of a form, on fields that are drawn anew each generation."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cmaes
@@ -8,6 +8,7 @@ import numpy as np
 
 from snakesim.training.episodes import Episode, Episodes
 from snakesim.training.form import FORMS
+from snakesim.training.kept_search import Check, KeptGeneration
 
 CHECK_EVERY = 5  # generations
 FIRST_FIELD, CHECK_FIELD, OTHER_FIELDS = 1_000_001, 2_000_001, 10_000_000  # nothing is learned on fields from 1 on
@@ -38,47 +39,91 @@ class Effort:
     spread: float = 1.0  # of the first generation, times that of the form
 
 
+@dataclass(frozen=True)
+class Step:
+    """The search after one generation."""
+
+    row: Generation
+    kept: KeptGeneration  # what the search needs to go on after it
+    best: dict[str, float]  # the best policy of all that were checked
+    best_reward: float  # of that policy, on the fields that it was checked on
+
+
 def search(
     episodes: Episodes,
     form: str,
     effort: Effort,
     begin: Mapping[str, float],
-    tell: Callable[[Generation, dict[str, float]], None],
-) -> tuple[dict[str, float], float]:
-    """The best of all checked policies, and its mean reward there.
+    kept: Sequence[KeptGeneration] = (),
+) -> Iterator[Step]:
+    """Search, and yield each generation as it is done.
 
-    begin: parameters where it begins, if not where the form does. tell: gets each generation as it is done, and the
-    best until then.
+    Args:
+        episodes: runs policies.
+        form: name of the form whose parameters are searched.
+        effort: how long to search.
+        begin: parameters where the search begins, if not where the form does.
+        kept: the first generations, as an earlier search with the same arguments has run them. Their policies are
+            asked for again, but not run.
     """
     parameters = FORMS[form]
     starts = np.array([begin.get(name, one.start) for name, one in parameters.items()])
     sigmas = effort.spread * np.array([one.sigma for one in parameters.values()])
     optimizer = cmaes.CMA(np.zeros(len(starts)), 1.0, seed=effort.seed, population_size=effort.population)
-    best: tuple[float, dict[str, float]] = (-np.inf, {})
+    best: dict[str, float] = {}
+    best_reward = -np.inf
 
     def values(asked: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters, (starts + sigmas * asked).tolist(), strict=True))
 
-    checked_on = range(CHECK_FIELD, CHECK_FIELD + effort.check_fields)
     for number in range(effort.generations + 1):
-        check: Sequence[Episode] = ()
-        if number % CHECK_EVERY == 0 or number == effort.generations:
-            mean = values(optimizer.mean)
-            check = episodes.run([mean], checked_on)[0]
-            best = max(best, (mean_of(check, "paid"), mean), key=lambda one: one[0])
-        paid = [np.nan]
-        if number < effort.generations:
-            first = FIRST_FIELD + number * effort.fields
-            asked = [optimizer.ask() for _ in range(effort.population)]
-            tried = [values(one) for one in asked]
-            while not all(ran := episodes.run(tried, range(first, first + effort.fields))):
-                first += OTHER_FIELDS  # none of these has room for its obstacles
-            paid = [mean_of(one, "paid") for one in ran]
-            optimizer.tell([(one, -reward) for one, reward in zip(asked, paid, strict=True)])
-        told = [mean_of(check, what) if check else None for what in ("paid", "advance_m", "goal")]
-        done = min(number + 1, effort.generations) * effort.population * effort.fields
-        tell(Generation(number, done, float(np.mean(paid)), float(np.max(paid)), *told), best[1])
-    return best[1], best[0]
+        is_last = number == effort.generations
+        mean = values(optimizer.mean)
+        asked = [] if is_last else [optimizer.ask() for _ in range(effort.population)]
+        if number < len(kept):
+            done = kept[number]
+        else:
+            done = KeptGeneration(
+                check=_check(episodes, mean, effort) if is_last or number % CHECK_EVERY == 0 else None,
+                rewards=_rewards(episodes, [values(one) for one in asked], number, effort),
+            )
+        if done.check is not None and done.check.reward > best_reward:
+            best = mean
+            best_reward = done.check.reward
+        if not is_last:
+            optimizer.tell([(one, -reward) for one, reward in zip(asked, done.rewards, strict=True)])
+        yield Step(_row(number, done, effort), done, best, best_reward)
+
+
+def _check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) -> Check:
+    """Run a policy on the fields that nothing is searched on."""
+    fields = range(CHECK_FIELD, CHECK_FIELD + effort.check_fields)
+    ran = episodes.run([policy], fields)[0]
+    return Check(mean_of(ran, "paid"), mean_of(ran, "advance_m"), mean_of(ran, "goal"))
+
+
+def _rewards(episodes: Episodes, policies: Sequence[Mapping[str, float]], number: int, effort: Effort) -> list[float]:
+    """Run the policies of a generation on its fields; return the mean reward of each."""
+    if not policies:
+        return []
+    first = FIRST_FIELD + number * effort.fields
+    while not all(ran := episodes.run(policies, range(first, first + effort.fields))):
+        first += OTHER_FIELDS  # none of these has room for its obstacles
+    return [mean_of(one, "paid") for one in ran]
+
+
+def _row(number: int, done: KeptGeneration, effort: Effort) -> Generation:
+    rewards = done.rewards or [np.nan]
+    check = done.check
+    return Generation(
+        generation=number,
+        episodes=min(number + 1, effort.generations) * effort.population * effort.fields,
+        mean_reward=float(np.mean(rewards)),
+        best_reward=float(np.max(rewards)),
+        check_reward=None if check is None else check.reward,
+        check_advance_m=None if check is None else check.advance_m,
+        check_goals=None if check is None else check.goals,
+    )
 
 
 def mean_of(ran: Sequence[Episode], what: str) -> float:

@@ -4,7 +4,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,6 +16,7 @@ from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.fault_plan import check_backend_can
 from snakesim_hal.injection import KINDS, Injection
 from snakesim_hal.model.scenario import RunConfig, write
+from snakesim_hal.process import child_environment, python_command
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import print_stderr
 
@@ -98,11 +98,11 @@ class TwinProcess:
         write(config, run)
         with self._said.open("wb") as output:
             return subprocess.Popen(
-                [sys.executable, "-m", "snakesim_can_backend.twin.command", str(run), *arguments, "--interactive"],
+                python_command("-m", "snakesim_can_backend.twin.command", str(run), *arguments, "--interactive"),
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                env=child_environment({"PYTHONUNBUFFERED": "1"}),
                 start_new_session=True,
             )
 

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
 from snakesim_hal.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.injection import Injection
+from snakesim_hal.step_limit import StepTooLongError, place_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState
 from snakesim_hal.wire.outgoing import checked, packed
@@ -30,6 +31,9 @@ def _guarded(method: MethodT) -> MethodT:
             return method(self, *arguments, **named)
         except SnakesimError:
             raise
+        except StepTooLongError as error:
+            where = f"{self.name}.{method.__name__}"
+            raise BackendError(f"{where} did not return in time: it was in {place_of(error)}") from error
         except (Exception, SystemExit) as error:  # third-party code, which must not end the host
             where = f"{self.name}.{method.__name__}"
             raise BackendError(f"{where} failed: {type(error).__name__}: {error}") from error

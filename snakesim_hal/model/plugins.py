@@ -18,6 +18,7 @@ import msgspec
 
 from snakesim_hal.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import Table, decode, expanded
+from snakesim_hal.model.sibling_modules import find_siblings_of
 from snakesim_hal.model.textfiles import read_bytes
 
 BACKENDS = "snakesim.backends"
@@ -165,6 +166,7 @@ def _from_file(name: str, kind: str) -> Any:
         raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
+    find_siblings_of(path)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:

@@ -1,9 +1,10 @@
 """Checks of endpoints and namespaces that people type, because Zenoh's own error messages are terse."""
 
 import re
+import socket
 from ipaddress import ip_address
 
-from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.errors import ConfigError, RefusedError, short
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
@@ -50,6 +51,28 @@ def is_exposed(endpoint: str) -> bool:
         return not ip_address(host).is_loopback
     except ValueError:
         return host != "localhost"
+
+
+def check_loopback(endpoint: str) -> None:
+    """Check that an endpoint on loopback can be reached at all: a new network namespace has that interface down.
+
+    Raises:
+        RefusedError: it cannot; whoever waits for something there would wait forever.
+    """
+    parts = _parts.fullmatch(endpoint)
+    if parts is None or is_exposed(endpoint):
+        return
+    host = parts["host"].strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((host, int(parts["port"])))  # sends nothing
+        except OSError as error:
+            raise RefusedError(
+                f"{endpoint}: the loopback interface of this computer, container or network namespace is down "
+                f"({error.strerror}), and the processes of a robot meet there. Bring it up with `ip link set lo up` as "
+                "root, or run in one process with `snakesim run --in-process`"
+            ) from None
 
 
 def check_namespace(text: str, origin: str) -> str:

@@ -22,7 +22,7 @@ import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
-from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded, check_loopback
 from snakesim_hal.network.image_connection import configure_for_images, set_unless_given
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.process import raise_open_files
@@ -427,7 +427,12 @@ def intersects(pattern: str, key: str) -> bool:
 
 @contextmanager
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
-    """Connect to the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
+    """Connect to the network.
+
+    Raises:
+        NotConnectedError: the endpoint does not answer, or cannot be listened on.
+        RefusedError: the endpoint is on loopback, and that interface is down.
+    """
     if link.listen:
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
@@ -481,7 +486,9 @@ def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:
 def open_zenoh(
     link: Link, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
 ) -> zenoh.Session:
-    """The session under a `Session`. change: what is different for this one. Raises NotConnectedError."""
+    """The session under a `Session`. change: what is different for this one. Raises as `open_session`."""
+    if link.session is None:  # a session file may name other endpoints, too
+        check_loopback(link.endpoint)
     zenoh.init_log_from_env_or("off")
     config = _config(link, connect_timeout_s)
     if change is not None:

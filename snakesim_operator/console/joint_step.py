@@ -8,11 +8,12 @@ import contextlib
 import os
 import pty
 import subprocess
-import sys
 import termios
 import threading
 from collections import deque
 from collections.abc import Sequence
+
+from snakesim_hal.process import child_environment, python_command
 
 LINES = 14
 ENTER, FORWARDS, BACKWARDS = b"\n", b"+", b"-"
@@ -30,10 +31,15 @@ class JointStep:
         mode = termios.tcgetattr(theirs)
         mode[3] &= ~termios.ECHO
         termios.tcsetattr(theirs, termios.TCSANOW, mode)
-        program = [sys.executable, "-m", "snakesim_operator", "joints", *words]
         try:
             self._process = subprocess.Popen(
-                program, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+                python_command("-m", "snakesim_operator", "joints", *words),
+                env=child_environment(),
+                stdin=theirs,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
             )
         except OSError:
             os.close(self._terminal)

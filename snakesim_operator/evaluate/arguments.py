@@ -4,9 +4,14 @@ import argparse
 import dataclasses
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.arguments import number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from snakesim_hal.step_limit import Pulse
 
 TASK = "run"  # under which `snakesim --help` lists it
 
@@ -16,7 +21,8 @@ def add_commands(commands: Any) -> None:
     tried = commands.add_parser(
         "evaluate",
         help="run controllers on many fields; a table with confidence intervals, and a page",
-        epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run.",
+        epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run; "
+        "130 stopped by Ctrl-C, and --resume goes on.",
     )
     tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
     tried.add_argument(
@@ -78,9 +84,6 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/NAME-TIME)")
     parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
-    parser.add_argument(
-        "--dashboard", action="store_true", help="Dask's dashboard on 127.0.0.1:8787, if bokeh is there"
-    )
     _add_workers(parser)
 
 
@@ -97,7 +100,20 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
+    return _guarded_if_one_run(arguments, _evaluate_with)
+
+
+def _guarded_if_one_run(arguments: argparse.Namespace, act: "Callable[[argparse.Namespace, Pulse | None], int]") -> int:
+    """A single run is computed in a child, which can be ended whatever its controller does."""
     _check_extra()
+    if arguments.only is None:
+        return act(arguments, None)
+    from snakesim_operator.run.guarded_process import guarded
+
+    return guarded(lambda pulse: act(arguments, pulse), owns_process=arguments.owns_process)
+
+
+def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
     from snakesim_hal.model.scenario import parse_set
     from snakesim_operator.evaluate.evaluation import Request, go
     from snakesim_operator.evaluate.suite import also_set, read_suite
@@ -114,7 +130,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     rows = _numbers(arguments.rows or "", "--rows")
     name = Path(arguments.suite).stem
     return go(
-        Request(suite, source, name, chosen, fields, rows=rows, against=arguments.against, **_shared(arguments, again))
+        Request(suite, source, name, chosen, fields, rows=rows, against=arguments.against, **_shared(arguments, again)),
+        pulse,
     )
 
 
@@ -129,7 +146,10 @@ def _numbers(text: str, flag: str) -> list[int]:
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
-    _check_extra()
+    return _guarded_if_one_run(arguments, _sweep_with)
+
+
+def _sweep_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
     from snakesim_hal.model.scenario import parse_set
     from snakesim_operator.evaluate.evaluation import Request, go
     from snakesim_operator.evaluate.suite import Suite, parse_vary
@@ -140,11 +160,11 @@ def _sweep(arguments: argparse.Namespace) -> int:
     again = ["sweep", arguments.scenario]
     for flag, values in (("--vary", arguments.vary), ("--set", arguments.set)):
         again += [word for value in values for word in (flag, value)]
-    return go(Request(suite, "sweep", "sweep", [], arguments.seeds, **_shared(arguments, again)))
+    return go(Request(suite, "sweep", "sweep", [], arguments.seeds, **_shared(arguments, again)), pulse)
 
 
 def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
-    names = ("seed", "only", "out", "resume", "cluster", "workers", "dashboard")
+    names = ("seed", "only", "out", "resume", "cluster", "workers")
     return {"again": shlex.join(["snakesim", *again]), **{name: getattr(arguments, name) for name in names}}
 
 

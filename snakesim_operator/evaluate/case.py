@@ -1,18 +1,17 @@
 """One case: a configuration to run, and the numbers that come of it. Runs in a worker process."""
 
-import ctypes
 import hashlib
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import msgspec
 
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.model.scenario import RunConfig, check, config_hash
+from snakesim_hal.step_limit import StepLimit
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import simulate
 
@@ -75,29 +74,20 @@ def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Outc
         try:
             asked = msgspec.json.decode(config, type=RunConfig)
             check(asked)
-            with _stopped_after(limit_s):
-                result = simulate(asked, until_goal=True, give_up_s=give_up_s)
+            with closing(StepLimit(limit_s, error=TookTooLongError)) as limit, limit:
+                result = simulate(asked, until_goal=True, give_up_s=give_up_s, turn_limit_s=limit_s)
             return Outcome(
                 numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up and not result.summary.crossed}
             )
         except TookTooLongError:
-            return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
+            return took_too_long(limit_s)
         except SnakesimError as error:
             return Outcome(error=str(error))
 
 
-@contextmanager
-def _stopped_after(limit_s: float) -> Iterator[None]:
-    """Raise TookTooLongError in this thread, wherever its Python code is then: in a controller's endless loop, too."""
-    thread = ctypes.c_ulong(threading.get_ident())
-    raised = partial(ctypes.pythonapi.PyThreadState_SetAsyncExc, thread, ctypes.py_object(TookTooLongError))
-    timer = threading.Timer(limit_s, raised)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+def took_too_long(limit_s: float) -> Outcome:
+    """Return the outcome of a case that was stopped at its limit of wall time."""
+    return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
 
 
 def plain_numbers(summary: RunSummary) -> dict[str, Number]:

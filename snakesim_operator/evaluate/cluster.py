@@ -1,73 +1,136 @@
-"""Workers of Dask: processes on this computer, or a lab's cluster, to which the same cases are sent."""
+"""The workers that run cases: processes on this computer, or those of a lab's Dask cluster."""
 
-import logging
-import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
 
-import dask.config
-from distributed import Client, Future, LocalCluster, as_completed
-from distributed.scheduler import KilledWorker
+from snakesim_operator.evaluate.case import Case, Outcome, code_digest, run_case, took_too_long
+from snakesim_operator.worker_pool import MAX_DEATHS, CallTookTooLongError, Raised, WorkerDiedError, WorkerPool
+from snakesim_operator.worker_pool import Outcome as CallOutcome
 
-from snakesim_operator.dask_cluster import connected
-from snakesim_operator.evaluate.case import Case, Outcome, code_digest, run_case
+if TYPE_CHECKING:  # Dask takes a second to import, and only `--cluster` needs it
+    from distributed import Client, Future
 
-DEATHS, RETRIES = 4, 2  # of the workers that run a case, and of the case, until it is given up
-LOOPBACK = "127.0.0.1"
+RETRIES = 2  # of a case that raised in a worker of a cluster
+KILL_AFTER_S = 30.0  # beyond a case's own limit, which only Python code obeys; a worker takes some seconds to start
+
+
+class Workers(Protocol):
+    """What runs cases."""
+
+    def size(self) -> int:
+        """Return how many cases run at a time now."""
+        ...
+
+    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+        """Run all cases; yield each with its outcome as it is done.
+
+        They begin in the order given. No two may have one id.
+        """
+        ...
 
 
 @contextmanager
-def workers(cluster: str | None, count: int | None = None, *, dashboard: bool = False) -> Iterator[Client]:
-    """Connect to a cluster, or start one here: a process a core, reachable from this computer only.
+def workers(cluster: str | None, count: int | None = None) -> Iterator[Workers]:
+    """Connect to a cluster, or start processes here. Ends what it has started.
 
-    Raises NotConnectedError when there is no answer, ConfigError for an invalid address.
+    Args:
+        cluster: address of a Dask scheduler; None: processes on this computer, to which nothing can connect.
+        count: how many processes here; None: one a core.
+
+    Raises:
+        ConfigError: the address is invalid.
+        NotConnectedError: the scheduler does not answer.
     """
-    with ExitStack() as opened:
-        if cluster is not None:
-            yield opened.enter_context(connected(cluster))
+    if cluster is None:
+        with WorkerPool(count) as pool:
+            yield LocalWorkers(pool)
+    else:
+        from snakesim_operator.dask_cluster import connected
+
+        with connected(cluster) as client:
+            yield ClusterWorkers(client)
+
+
+class LocalWorkers:
+    """Processes on this computer."""
+
+    def __init__(self, pool: WorkerPool) -> None:
+        self._pool = pool
+
+    def size(self) -> int:
+        """Return how many cases run at a time."""
+        return self._pool.size
+
+    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+        """Run all cases; yield each with its outcome as it is done."""
+        if not cases:
             return
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        settings = {"distributed.scheduler.allowed-failures": DEATHS, "distributed.comm.timeouts.connect": "60s"}
-        opened.enter_context(dask.config.set(settings))
-        here = LocalCluster(
-            n_workers=count or len(os.sched_getaffinity(0)),
-            threads_per_worker=1,
-            host=LOOPBACK,
-            dashboard_address=f"{LOOPBACK}:8787" if dashboard else f"{LOOPBACK}:0",
-            worker_dashboard_address=f"{LOOPBACK}:0",
-            silence_logs=logging.CRITICAL,
-            preload=["snakesim_operator.evaluate.worker"],
-        )
-        opened.enter_context(here)
-        yield opened.enter_context(Client(here, set_as_default=False))
+        calls = [_arguments(case) for case in cases]
+        limit_s = max(case.limit_s for case in cases) + KILL_AFTER_S
+        for number, outcome in self._pool.run(run_case, calls, limit_s):
+            yield cases[number], _outcome_of_call(cases[number], outcome)
 
 
-def size(client: Client) -> int:
-    """How many workers there are now."""
-    return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+class ClusterWorkers:
+    """The workers of a Dask cluster."""
+
+    def __init__(self, client: "Client") -> None:
+        self._client = client
+
+    def size(self) -> int:
+        """Return how many workers the cluster has now."""
+        return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
+
+    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+        """Run all cases; yield each with its outcome as it is done."""
+        from distributed import as_completed
+
+        submitted: dict[Future, Case] = {}
+        for place, case in enumerate(cases):
+            future = self._client.submit(
+                run_case,
+                *_arguments(case),
+                key=case.id,
+                retries=RETRIES,
+                priority=-place,  # otherwise the last comes first
+            )
+            submitted[future] = case
+        for future in as_completed(submitted, loop=self._client.loop):
+            yield submitted[future], _outcome_of_future(future)
+            future.release()
 
 
-def solve(client: Client, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
-    """Run all cases; each with its outcome as it is done. Begun in the order given; no two may have one id."""
-    submitted = {
-        client.submit(
-            run_case,
-            *(case.config, code_digest(), case.give_up_s, case.limit_s),
-            key=case.id,
-            retries=RETRIES,
-            priority=-place,  # otherwise the last comes first
-        ): case
-        for place, case in enumerate(cases)
-    }
-    for future in as_completed(submitted, loop=client.loop):
-        yield submitted[future], _outcome(future)
-        future.release()
+def _arguments(case: Case) -> tuple[bytes, str, float, float]:
+    return case.config, code_digest(), case.give_up_s, case.limit_s
 
 
-def _outcome(future: Future) -> Outcome:
+def _outcome_of_call(case: Case, outcome: CallOutcome) -> Outcome:
+    if not isinstance(outcome, Raised):
+        return outcome.value
+    match outcome.error:
+        case WorkerDiedError():
+            return _outcome_of_deaths(MAX_DEATHS)
+        case CallTookTooLongError():
+            return took_too_long(case.limit_s)
+        case error:  # whatever a controller raised; the other cases go on
+            return _outcome_of_error(error)
+
+
+def _outcome_of_future(future: "Future") -> Outcome:
+    from distributed.scheduler import KilledWorker
+
     try:
         return future.result()
-    except KilledWorker:
-        return Outcome(error=f"its worker process died, {DEATHS + 1} times; its memory may not suffice")
+    except KilledWorker as error:
+        return _outcome_of_deaths(error.allowed_failures + 1)
     except Exception as error:  # noqa: BLE001 - whatever a controller raised; the other cases go on
-        return Outcome(error=f"{type(error).__name__}: {error}"[:300])
+        return _outcome_of_error(error)
+
+
+def _outcome_of_deaths(count: int) -> Outcome:
+    return Outcome(error=f"its worker process died, {count} times; its memory may not suffice")
+
+
+def _outcome_of_error(error: Exception) -> Outcome:
+    return Outcome(error=f"{type(error).__name__}: {error}"[:300])

@@ -12,16 +12,19 @@ import msgspec
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
+from snakesim_hal.process import stop_signals_raise
+from snakesim_hal.step_limit import Pulse
 from snakesim_hal.terminal import say
 from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate import store
 from snakesim_operator.evaluate.card import CARD, Card, card_of, compare, read_card, text
 from snakesim_operator.evaluate.case import Case
-from snakesim_operator.evaluate.cluster import size, solve, workers
+from snakesim_operator.evaluate.cluster import workers
 from snakesim_operator.evaluate.page import page
 from snakesim_operator.evaluate.progress import Progress
 from snakesim_operator.evaluate.suite import Suite, cases_of, rows_of
 from snakesim_operator.evaluate.table import best_of, lines_of, table, worst
+from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.folder import named_after
 from snakesim_operator.run.in_process import run_in_process
 
@@ -47,13 +50,24 @@ class Request:
     resume: bool = False
     cluster: str | None = None
     workers: int | None = None
-    dashboard: bool = False
 
 
-def go(request: Request) -> int:
-    """Run all cases that are not done yet, or one as a run of its own. Returns 0, or 1 when a case could not run."""
+def go(request: Request, pulse: Pulse | None = None) -> int:
+    """Run all cases that are not done yet, or one as a run of its own. pulse: of that one, as of `run_in_process`.
+
+    Returns: 0; 1 when a case could not run; 130 when it was stopped, which loses no case that is done.
+    """
     if request.only is not None:
-        return _run_one(request, request.only)
+        return _run_one(request, request.only, pulse)
+    with stop_signals_raise():
+        try:
+            return _run_all(request)
+        except KeyboardInterrupt:
+            say("stopped before any case was begun")
+            return INTERRUPTED
+
+
+def _run_all(request: Request) -> int:
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out")
     check_address(request.cluster)
@@ -67,9 +81,16 @@ def go(request: Request) -> int:
         todo.sort(key=lambda case: case.field)  # whenever it ends early, every row has as many fields
         if request.resume:
             say(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
-        if todo:
-            _run(request, todo, kept, out)
-        _finish(request, cases, kept.done, out, others)
+        try:
+            if todo:
+                _run(request, todo, kept, out)
+            _finish(request, cases, kept.done, out, others)
+        except KeyboardInterrupt:
+            done = sum(case.id in kept.done for case in cases)
+            drawn = f" --seed {seed}" if request.suite.fresh else ""
+            say(f"stopped: {done} of {len(cases)} cases are done; the same command goes on with")
+            say(f"  --resume --out {shlex.quote(str(out))}{drawn}")
+            return INTERRUPTED
         return 1 if any(kept.done[case.id].error is not None for case in cases) else 0
 
 
@@ -84,12 +105,12 @@ def first_field(request: Request) -> int:
     return seed
 
 
-def _run_one(request: Request, only: str) -> int:
+def _run_one(request: Request, only: str, pulse: Pulse | None) -> int:
     """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
     case = choose(request.suite, request.source, only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
-    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s)
+    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, pulse=pulse)
 
 
 def choose(suite: Suite, source: str, only: str) -> Case:
@@ -111,11 +132,11 @@ def name_of(case: Case) -> str:
 
 
 def _run(request: Request, todo: Sequence[Case], kept: store.Store, out: Path) -> None:
-    with workers(request.cluster, request.workers, dashboard=request.dashboard) as client, Progress(len(todo)) as shown:
+    with workers(request.cluster, request.workers) as working, Progress(len(todo)) as shown:
         where = request.cluster or "on this computer"
-        say(f"{len(todo)} cases on {size(client)} workers, {where}")
+        say(f"{len(todo)} cases on {working.size()} workers, {where}")
         say(f"results: {out}; if this ends early, --resume --out {out} goes on")
-        for case, outcome in solve(client, todo):
+        for case, outcome in working.solve(todo):
             kept.add(case, outcome)
             shown.done(outcome)
 

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 import optuna
-from distributed import Client
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import compose, parse_set
+from snakesim_hal.process import stop_signals_raise
 from snakesim_hal.terminal import say
 from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate.case import GAVE_UP, Case, Outcome, code_digest
-from snakesim_operator.evaluate.cluster import size, solve, workers
+from snakesim_operator.evaluate.cluster import Workers, workers
 from snakesim_operator.evaluate.search_file import (
     NUMBER,
     RESULTS,
@@ -32,6 +32,7 @@ from snakesim_operator.evaluate.search_file import (
 )
 from snakesim_operator.evaluate.suite import Suite, also_set, cases_of, read_suite, rows_of, seeds_of
 from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.progress import in_minutes
 
 Span = FloatDistribution | IntDistribution
@@ -56,7 +57,21 @@ class Request:
 
 
 def optimise(request: Request) -> int:
-    """Goes on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
+    """Search until so many trials have a result, or have been tried.
+
+    Returns: 0; 1 when no trial has a result; 130 when it was stopped, which loses no trial that is done.
+    """
+    with stop_signals_raise():
+        try:
+            return _search(request)
+        except KeyboardInterrupt:
+            if request.storage.is_file():
+                say(f"stopped: {request.storage} keeps the trials that are done; the same command goes on with")
+                say(f"  --storage {shlex.quote(str(request.storage))}")
+            return INTERRUPTED
+
+
+def _search(request: Request) -> int:
     space = dict(map(_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(
@@ -74,14 +89,14 @@ def optimise(request: Request) -> int:
     if left := max(request.trials - have, 0):
         began, todo = time.monotonic(), left
         numbers = free_numbers(study)
-        with workers(request.cluster, request.workers) as client:
+        with workers(request.cluster, request.workers) as working:
             while left > 0:
                 asked: list[Trial] = []
-                for number in islice(numbers, min(left, size(client))):
+                for number in islice(numbers, min(left, working.size())):
                     trial = study.ask(dict[str, BaseDistribution](space))
                     trial.set_user_attr(NUMBER, number)
                     asked.append(trial)
-                _run_trials(request, study, asked, client)
+                _run_trials(request, study, asked, working)
                 left -= len(asked)
                 passed_s = time.monotonic() - began
                 left_s = passed_s / (todo - left) * left
@@ -106,11 +121,11 @@ def _search_command(request: Request, space: Mapping[str, Span], cases_at_ends: 
     )
 
 
-def _run_trials(request: Request, study: Study, asked: Sequence[Trial], client: Client) -> None:
+def _run_trials(request: Request, study: Study, asked: Sequence[Trial], working: Workers) -> None:
     """Runs all cases of these trials, and tells the study and the user what came of each trial."""
     cases = {trial.number: _cases(request, trial.params) for trial in asked}
     outcomes: dict[str, Outcome] = {}
-    for case, outcome in solve(client, list({case.id: case for own in cases.values() for case in own}.values())):
+    for case, outcome in working.solve(list({case.id: case for own in cases.values() for case in own}.values())):
         outcomes[case.id] = outcome
     for trial in asked:
         values = [outcomes[case.id].numbers.get(request.goal) for case in cases[trial.number]]

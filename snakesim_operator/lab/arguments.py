@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from snakesim_hal.process import stop_signals_raise
 from snakesim_hal.terminal import say
 
 if TYPE_CHECKING:
@@ -81,7 +82,11 @@ def _check(arguments: argparse.Namespace) -> int:
     lab = _lab(arguments)
     from snakesim_operator.lab.check import check
 
-    return check(lab, arguments.out)
+    with stop_signals_raise():  # so that no session file stays behind
+        try:
+            return check(lab, arguments.out)
+        except KeyboardInterrupt:
+            return 130
 
 
 def _lab(arguments: argparse.Namespace) -> "Lab":

@@ -2,7 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.arguments import (
     add_host,
@@ -18,6 +18,10 @@ from snakesim_hal.arguments import (
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import output_may_fail
 from snakesim_operator.recording.message import RAW_ONLY
+
+if TYPE_CHECKING:
+    from snakesim_hal.model.scenario import RunConfig
+    from snakesim_hal.step_limit import Pulse
 
 
 def add_commands(commands: Any) -> None:
@@ -78,19 +82,12 @@ def add_commands(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from snakesim_hal.plugin_check import check_plugins
-
     check_network(arguments)
-    loaded = load_scenario(arguments)
-    config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
     if arguments.in_process:
-        from snakesim_operator.run.in_process import run_in_process
+        from snakesim_operator.run.guarded_process import guarded  # before anything large is loaded
 
-        for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
-            if getattr(arguments, flag):
-                raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-        with output_may_fail():
-            return run_in_process(config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only)
+        return guarded(lambda pulse: _run_in_process(arguments, pulse), owns_process=arguments.owns_process)
+    config = _config_of(arguments)
 
     from snakesim_operator.run.run import RunRequest, run
 
@@ -111,6 +108,27 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     with output_may_fail():
         return run(request)
+
+
+def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
+    config = _config_of(arguments)
+    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
+        if getattr(arguments, flag):
+            raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
+
+    from snakesim_operator.run.in_process import run_in_process
+
+    with output_may_fail():
+        return run_in_process(
+            config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only, pulse=pulse
+        )
+
+
+def _config_of(arguments: argparse.Namespace) -> "RunConfig":
+    from snakesim_hal.plugin_check import check_plugins
+
+    loaded = load_scenario(arguments)
+    return check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
 
 
 def _host(arguments: argparse.Namespace) -> int:

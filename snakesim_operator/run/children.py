@@ -5,13 +5,13 @@ import fcntl
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from snakesim_hal import arithmetic
+from snakesim_hal.process import child_environment, python_command
 from snakesim_hal.workers import start_worker
 
 STOP_LIMIT_S = 5.0
@@ -77,19 +77,13 @@ def start(
     It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
     A SIGINT that comes while its interpreter starts waits until it has a handler.
     """
-    environment = {
-        **os.environ,
-        **arithmetic.environment(),
-        **arithmetic.ONE_THREAD,
-        "PYTHONUNBUFFERED": "1",
-        "PYTHONHASHSEED": "0",
-        **more,
-    }
+    reproducible = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
+    environment = child_environment(arithmetic.environment(), arithmetic.ONE_THREAD, reproducible, more)
     ours, theirs = os.pipe()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
     try:
         process = subprocess.Popen(
-            [sys.executable, "-m", *arguments, "--parent", str(os.getpid())],
+            python_command("-m", *arguments, "--parent", str(os.getpid())),
             stdin=subprocess.DEVNULL,
             stdout=theirs,
             stderr=subprocess.STDOUT,

@@ -2,7 +2,7 @@
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from types import FrameType
 
@@ -15,6 +15,8 @@ class Ending:
 
     causes: list[str] = field(default_factory=list[str])
     interrupted: bool = False
+    over: bool = False  # the robot has stopped: from here on a signal does not change how the run ended
+    on_interrupt: Callable[[], None] = lambda: None  # called by the signal handler
 
     @property
     def reason(self) -> str | None:
@@ -31,11 +33,14 @@ class Ending:
 def interruptible(ending: Ending) -> Iterator[None]:
     """Ctrl-C, SIGTERM and a closed terminal end the run in order.
 
-    A second Ctrl-C or SIGTERM is left to the default; SIGHUP comes twice of itself, from the kernel and the shell.
+    A signal that comes while the record and the report of a finished run are written does not stop that. A second
+    Ctrl-C or SIGTERM is left to the default; SIGHUP comes twice of itself, from the kernel and the shell.
     """
 
     def handle(number: int, _frame: FrameType | None) -> None:
-        ending.interrupted = True
+        if not ending.over:
+            ending.interrupted = True
+            ending.on_interrupt()
         signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
 
     old = {number: signal.signal(number, handle) for number in stop_signals()}

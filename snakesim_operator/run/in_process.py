@@ -30,6 +30,7 @@ from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
 from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.record.recorder import HostRecordWriter
+from snakesim_hal.step_limit import Pulse
 from snakesim_hal.terminal import print_stderr, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
@@ -93,12 +94,18 @@ class Result:
 
 
 def simulate(
-    config: RunConfig, out: Path | None = None, *, until_goal: bool = False, give_up_s: float | None = None
+    config: RunConfig,
+    out: Path | None = None,
+    *,
+    until_goal: bool = False,
+    give_up_s: float | None = None,
+    turn_limit_s: float | None = None,
 ) -> Result:
     """Run a configuration. out: folder for what a run leaves, the report too; None keeps nothing.
 
     until_goal: a run whose mission has a goal is complete soon after that is reached; give_up_s: and after so much
-    robot time without 3 cm of advance towards it.
+    robot time without 3 cm of advance towards it. turn_limit_s: wall time that a part of the run may take in one tick,
+    60 s by default, or `start_limit_s` if that is longer.
     Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
@@ -111,7 +118,14 @@ def simulate(
             f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path"
         )
     if not is_pinned() and not anything_offered():  # what this program offers, a child would not have
-        return call_pinned(simulate, config=config, out=out, until_goal=until_goal, give_up_s=give_up_s)
+        return call_pinned(
+            simulate,
+            config=config,
+            out=out,
+            until_goal=until_goal,
+            give_up_s=give_up_s,
+            turn_limit_s=turn_limit_s,
+        )
     extras.check("record", "`simulate`, whose results are read from a recording,")
     config, ending = check_plugins(config), Ending()
     with contextlib.ExitStack() as opened:
@@ -126,7 +140,15 @@ def simulate(
         opened.callback(files.close)
         recorded = SERVICE_STREAMS if out is None else [row.key for row in keys.SPACE]
         run, outcome, gave_up = _go(
-            config, files, ending, None, recorded, until_goal=until_goal, give_up_s=give_up_s, raw_only=out is None
+            config,
+            files,
+            ending,
+            None,
+            recorded,
+            until_goal=until_goal,
+            give_up_s=give_up_s,
+            raw_only=out is None,
+            turn_limit_s=turn_limit_s,
         )
         explain(ending, record_of(run.host), config)
         record, summary = leave(files, files.folder, ending, outcome, report=out is not None)
@@ -142,21 +164,32 @@ def run_in_process(
     give_up_s: float | None = None,
     record: bool = True,
     raw_only: bool = False,
+    pulse: Pulse | None = None,
 ) -> int:
     """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal, give_up_s: as of `simulate`.
 
-    raw_only: the recording is without topics for viewers."""
+    raw_only: the recording is without topics for viewers. pulse: shows another process whether the run goes on.
+    """
     check(config)
     check_recorder(record=record)
     ending = Ending()
     with opened_files(config, out) as (files, _):
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
-        with interruptible(ending), Progress(config) as progress:
-            recorded = [row.key for row in keys.SPACE] if record else []
-            _, outcome, _ = _go(
-                config, files, ending, progress, recorded, until_goal=until_goal, give_up_s=give_up_s, raw_only=raw_only
-            )
-        return conclude(config, files, ending, outcome)
+        with interruptible(ending):
+            with Progress(config) as progress:
+                recorded = [row.key for row in keys.SPACE] if record else []
+                _, outcome, _ = _go(
+                    config,
+                    files,
+                    ending,
+                    progress,
+                    recorded,
+                    until_goal=until_goal,
+                    give_up_s=give_up_s,
+                    raw_only=raw_only,
+                    pulse=pulse,
+                )
+            return conclude(config, files, ending, outcome)
 
 
 def _go(
@@ -169,10 +202,14 @@ def _go(
     until_goal: bool,
     give_up_s: float | None,
     raw_only: bool,
+    pulse: Pulse | None = None,
+    turn_limit_s: float | None = None,
 ) -> tuple[InProcessRun, Outcome, bool]:
     """recorded: keys, which may have wildcards. Also returns whether it was given up."""
     words = _LogWriter(files)
-    with contextlib.redirect_stderr(words), InProcessRun(config) as run:
+    run = InProcessRun(config, pulse, turn_limit_s)
+    ending.on_interrupt = run.hurry
+    with contextlib.redirect_stderr(words), run:
         host, session = run.host, run.network.session()
         if progress is not None:
             say(describe_what_moves(host.description))
@@ -192,6 +229,7 @@ def _go(
                         host.complete()
                 if ending.interrupted:
                     run.stop()
+    ending.over = True
     for failure in run.failed:
         ending.because(failure)
     lost = [] if recording is None or not recording.failure else [recording.failure]

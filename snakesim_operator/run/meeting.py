@@ -4,7 +4,7 @@ import contextlib
 import socket
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
-from snakesim_hal.network.endpoint import DEFAULT_PORT
+from snakesim_hal.network.endpoint import DEFAULT_PORT, check_loopback
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.stop_port import open_stop_port, stop_address
 from snakesim_hal.wire import keys
@@ -18,10 +18,15 @@ def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tup
     """Where the run's parts meet, and its stop port, which this process keeps bound until the run is over.
 
     Two runs that start at the same moment cannot get the same endpoint, because a port has one holder. Without
-    `endpoint` it is the default port, or any other if that is in use. Raises NotConnectedError.
+    `endpoint` it is the default port, or any other if that is in use.
+
+    Raises:
+        NotConnectedError: no port is free.
+        RefusedError: the loopback interface is down.
     """
     if lab is not None:
         return lab, open_stop_port(*stop_address(lab.endpoint, listens=False))
+    check_loopback(endpoint or f"tcp/{LOOPBACK}:{DEFAULT_PORT}")
     if endpoint is not None:
         stop_port = open_stop_port(*stop_address(endpoint, listens=True))
         return Link(endpoint, namespace), stop_port

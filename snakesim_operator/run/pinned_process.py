@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from snakesim_hal import errors
 from snakesim_hal.arithmetic import environment
-from snakesim_hal.process import die_with_parent
+from snakesim_hal.process import child_environment, die_with_parent, python_command
 
 ResultT = TypeVar("ResultT")
 ASKED, ANSWER = "asked", "answer"
@@ -25,11 +25,11 @@ LOOK_S = 1.0  # Python code runs again after so long, so that an exception can b
 
 def call_pinned(function: Callable[..., ResultT], **asked: Any) -> ResultT:
     """Call a function of a module with these arguments in a process of its own. Raises as it does."""
-    with TemporaryDirectory(prefix="snakesim-") as folder:
+    with TemporaryDirectory(prefix="snakesim-") as folder:  # also for the child's own, which Ctrl-C kills
         (Path(folder) / ASKED).write_bytes(pickle.dumps((function, asked)))
         process = subprocess.Popen(
-            [sys.executable, "-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())],
-            env={**os.environ, **environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
+            env=child_environment(environment(), {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}),
             stdin=subprocess.DEVNULL,
         )
         try:

@@ -85,20 +85,20 @@ def run(request: RunRequest) -> int:
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         names = (request.config.robot.name, request.config.backend)
         common = [str(config_file), "--namespace", request.network_name, *_meeting(link)]
-        with (
-            interruptible(ending),
-            registered(LocalRobot.on(link, *names, stop_port, str(config_file.absolute()))) as failure,
-            # first, because somebody waits for it
-            console_beside(common, files, say) if request.console else contextlib.nullcontext(),
-        ):
-            if failure is not None:
-                say(failure)
-            _conduct(request, supervisor, link, files, config_file, ending)
-        from snakesim_operator.run.conclusion import Outcome, conclude
+        with interruptible(ending):
+            with (
+                registered(LocalRobot.on(link, *names, stop_port, str(config_file.absolute()))) as failure,
+                # first, because somebody waits for it
+                console_beside(common, files, say) if request.console else contextlib.nullcontext(),
+            ):
+                if failure is not None:
+                    say(failure)
+                _conduct(request, supervisor, link, files, config_file, ending)
+            from snakesim_operator.run.conclusion import Outcome, conclude
 
-        lost = list(supervisor.lost.values())
-        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts, lost)
-        return conclude(request.config, files, ending, outcome, stay=request.stay)
+            lost = list(supervisor.lost.values())
+            outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts, lost)
+            return conclude(request.config, files, ending, outcome, stay=request.stay)
 
 
 @contextlib.contextmanager
@@ -182,6 +182,7 @@ def _conduct(
     except SnakesimError as error:
         ending.because(str(error))
     finally:
+        ending.over = True
         supervisor.end()
 
 

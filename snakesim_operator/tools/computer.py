@@ -19,7 +19,13 @@ from typing import Literal
 
 import msgspec
 
-from snakesim_hal.process import HOST_PRIORITY, die_with_parent, lock_memory
+from snakesim_hal.process import (
+    HOST_PRIORITY,
+    child_environment,
+    die_with_parent,
+    lock_memory,
+    python_command,
+)
 from snakesim_operator import extras
 
 MIN_PYTHON = (3, 11)
@@ -110,8 +116,8 @@ def _probe(kind: str) -> str | None:
     parent = os.getpid()
     try:
         ended = subprocess.run(
-            [sys.executable, "-c", OPENGL],
-            env={**os.environ, "MUJOCO_GL": kind},
+            python_command("-c", OPENGL),
+            env=child_environment({"MUJOCO_GL": kind}),
             capture_output=True,
             text=True,
             timeout=PROBE_LIMIT_S,

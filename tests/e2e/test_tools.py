@@ -162,7 +162,10 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     blocks = re.findall(r"```python wave\.py\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
     example = next(block for block in blocks if "class Wave" in block)
     assert len([line for line in example.splitlines() if line.strip()]) <= 24
-    (tmp_path / "wave.py").write_text(example, encoding="utf-8")
+    (tmp_path / "wave.py").write_text(f"import shape, queue\n{example}", encoding="utf-8")
+    (tmp_path / "shape.py").write_text("")  # a neighbour, which the file may import
+    for name in ("random", "queue", "can", "calendar"):  # replace no module in any process of a run
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__)")
     flags = ("--duration", "2", "--in-process")
     ended, summary = command.run_to_summary(tmp_path / "run", "triplet", "--controller", "./wave.py:Wave", *flags[:2])
     assert ended.code == 0, ended.out + ended.err
@@ -179,3 +182,4 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     ended = snakesim(*typed, cwd=tmp_path, more={"PYTHONPATH": path})
     assert ended.code == 0, ended.out + ended.err
     assert RunRecord.load(tmp_path / "again").host.command_digest == summary.command_digest
+    assert not (tmp_path / "executed").exists()

@@ -40,6 +40,18 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
 
+def test_a_search_that_was_stopped_goes_on_to_the_same_policy(trained: Path, tmp_path: Path) -> None:
+    out = tmp_path / "two"
+    out.mkdir()
+    first, second, *_ = (trained / "search.jsonl").read_bytes().splitlines(keepends=True)
+    (out / "search.jsonl").write_bytes(first + second + b'{"rewards": [0.')  # killed while it wrote
+    typed = ["train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]
+    assert main(typed) == main([*typed, "--resume", "--seed", "2"]) == 2, "another search is in that folder"
+    assert main([*typed, "--resume"]) == 0
+    for name in ("policy.onnx", "curve.csv", "search.jsonl"):
+        assert (out / name).read_bytes() == (trained / name).read_bytes(), name
+
+
 def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) -> None:
     began = learned_by(str(trained / "policy.onnx"))
     nothing = ("--generations", "1", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.1")

@@ -1,9 +1,14 @@
 """Endpoints and namespaces as people mistype them."""
 
+import shutil
+import subprocess
+from pathlib import Path
+
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.network.endpoint import check_endpoint, check_guarded, check_namespace
+from snakesim_hal.network.endpoint import check_endpoint, check_guarded, check_loopback, check_namespace
+from snakesim_hal.process import child_environment, python_command
 
 GOOD = [
     *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),
@@ -70,3 +75,20 @@ def test_namespaces() -> None:
     for text in ("", "/", "a/", "/a", "a//b", "**", "a/*", "a b", "a#b", "@x", "a\x1b"):
         with pytest.raises(ConfigError, match="such as planar13"):
             check_namespace(text, "--namespace")
+
+
+APART = ["unshare", "--net", "--map-root-user"]  # a network namespace of its own, whose loopback interface is down
+LOOKS = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+
+
+def test_a_loopback_interface_that_is_down_is_named_instead_of_waited_for(tmp_path: Path) -> None:
+    if shutil.which("unshare") is None or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("no network namespace can be made here")
+    command = [*APART, *python_command("-c", LOOKS), "run", "triplet", "--out", "run"]
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=child_environment(), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode == 1 and "loopback interface" in ended.stderr and "ip link set lo up" in ended.stderr
+    assert not (tmp_path / "run").exists()
+    check_loopback("tcp/127.0.0.1:7447")
+    check_loopback("tcp/192.0.2.1:7447")  # not on loopback: whether it answers is another question

@@ -1,0 +1,103 @@
+"""What a search keeps in its folder so that it can go on after it was stopped: `search.jsonl`.
+
+The first line has the command, each further one the rewards of a generation. CMA-ES with a seed asks for the same
+policies again when it gets the same rewards, so nothing else is needed.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.whole_file import write_whole
+
+FILE = "search.jsonl"
+
+
+class Check(msgspec.Struct, frozen=True):
+    """How the mean of the search did on the fields that it is checked on: means of the episodes."""
+
+    reward: float
+    advance_m: float
+    goals: float  # share that reached it
+
+
+class KeptGeneration(msgspec.Struct, frozen=True):
+    """What the simulations of one generation gave."""
+
+    rewards: list[float]  # of each policy, in the order of the search; empty in the last generation
+    check: Check | None  # None: not checked in this generation
+
+
+class _Header(msgspec.Struct, frozen=True):
+    command: list[str]  # without --out, --workers and --cluster, which change no number
+    version: str  # of SnakeSIM
+
+
+class KeptSearch:
+    """The file of one search, open for more generations."""
+
+    def __init__(self, handle: int, generations: list[KeptGeneration]) -> None:
+        self._handle = handle
+        self.generations = generations
+
+    def add(self, generation: KeptGeneration) -> None:
+        """Keep a generation; it is on the disk when this returns."""
+        os.write(self._handle, msgspec.json.encode(generation) + b"\n")
+        os.fsync(self._handle)
+
+
+@contextmanager
+def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[KeptSearch]:
+    """Open the file of a search in a folder.
+
+    Args:
+        folder: where the search writes.
+        command: what was typed, without what changes no number.
+        resume: go on with the search that is there, instead of beginning one.
+
+    Raises:
+        ConfigError: there is none to go on with, or another one.
+    """
+    path = folder / FILE
+    header = _Header(list(command), version("snakesim"))
+    if resume:
+        generations = _read(path, header)
+    elif path.exists():
+        raise ConfigError(f"--out {folder} holds a search; go on with it by --resume, or choose another folder")
+    else:
+        generations = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(path, b"".join(msgspec.json.encode(line) + b"\n" for line in (header, *generations)))
+        handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+    except OSError as error:
+        raise ConfigError(f"--out {folder}: {error.strerror}; choose another folder") from None
+    try:
+        yield KeptSearch(handle, generations)
+    finally:
+        os.close(handle)
+
+
+def _read(path: Path, expected: _Header) -> list[KeptGeneration]:
+    """The generations of the same search. A last line that was cut by a kill or a full disk is left out."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"--resume: {path}: {error.strerror}; leave --resume out to begin a search there") from None
+    try:
+        first, *lines = content.split(b"\n")[:-1]
+        header = msgspec.json.decode(first, type=_Header)
+        generations = [msgspec.json.decode(line, type=KeptGeneration) for line in lines]
+    except (ValueError, msgspec.MsgspecError) as error:
+        raise ConfigError(f"--resume: {path} is no search: {error}; choose another --out") from None
+    if header != expected:
+        raise ConfigError(
+            f"--resume: {path} is of another search: {' '.join(header.command)} (SnakeSIM {header.version}); type that "
+            "command with --resume, or choose another --out"
+        )
+    return generations
