@@ -37,6 +37,7 @@ class CanTwin(DriveTwin):
         return None
 
     def _act(self) -> None:
+        self.catch_up()
         for wire in self._ends:
             for frame in wire.receive():
                 i = self._at.get((id(wire), self.addressee(frame)))
@@ -46,7 +47,7 @@ class CanTwin(DriveTwin):
                     self.take(i, frame)
                 except (ValueError, LookupError, struct.error):
                     continue
-        self.body.advance_to((self._clock_ns() - self._start_ns) / 1000)
+        self.pass_time()
 
     def say(self, i: int, frame: Frame) -> None:
         """A frame of a drive, unless it is silent."""

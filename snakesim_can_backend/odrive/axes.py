@@ -99,6 +99,7 @@ class Axes(CanDrives):
                 pass
 
     def _errs(self, i: int, errors: int) -> None:
+        self.readings.state_was_read(i)
         drive, self.axes[i].errors = self.following.drives[i], errors
         drive.errors = names(errors & ~Error.ESTOP_REQUESTED if drive.stopped else errors)
 
@@ -113,7 +114,9 @@ class Axes(CanDrives):
         return "" if known else f"has firmware {said}; this driver knows {FIRMWARE[0]}.{FIRMWARE[1]}"
 
     def ask(self, i: int) -> bool:
-        """Encoder estimates and current."""
+        """Encoder estimates and current; before them errors, of an axis that may have stopped by itself."""
+        if i in self.readings.doubted:
+            self._ask(i, Message.ERROR)
         return self._ask(i, Message.MOTION, Message.CURRENT)
 
     def ask_health(self, i: int) -> None:

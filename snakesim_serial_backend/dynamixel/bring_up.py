@@ -1,5 +1,6 @@
 """Before a motor turns: every servo is there, of a known model, and kept as the driver needs it. Enables nothing."""
 
+import logging
 import struct
 import time
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,8 @@ from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 
 WANTED = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
 KEPT = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}  # written only where it differs: it wears out
+
+_log = logging.getLogger("snakesim.dynamixel")
 
 
 def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
@@ -89,6 +92,9 @@ def _strangers(servos: Sequence[Servo], port: Port) -> Iterator[str]:
 
 
 def _set_up(servo: Servo) -> None:
+    state = _answer(servo, at.TORQUE_ENABLE, at.STATE_SIZE).data
+    if state[at.WATCHDOG - at.TORQUE_ENABLE] == at.TRIPPED:
+        _log.warning("%s: clearing an expired bus watchdog of an earlier run", servo.who)
     kept = _answer(servo, 0, at.KEPT).data
     differs = {address: value for address, value in KEPT.items() if kept[address] != value}
     for address, value in {**WANTED, **differs}.items():
