@@ -56,7 +56,8 @@ class CanBackend(DriveBackend):
             self._sensors = Sensors(config, self._reports, self.modules.reading, mocap)
             return self.modules
 
-        super().__init__(config, NAME, "+".join(settings.channels), clock, mocap, make_modules)
+        watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
+        super().__init__(config, NAME, "+".join(settings.channels), clock, mocap, make_modules, watchdogs_s)
 
     def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)

@@ -134,7 +134,8 @@ class Watch:
     ) -> list[Finding]:
         """Findings about faults that it reports, or that it does not follow."""
         state = module.state.name.lower()
-        as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
+        # An emergency stop says nothing of a fault that had stopped the module before it.
+        as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
         if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
             faults = module.fault_names()
             kinds = [f"module_{word}" for word in (*faults, state)]

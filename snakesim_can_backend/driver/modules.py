@@ -164,7 +164,14 @@ class Modules:
                 _log.warning("after a clear: %s", error)
 
     def command(
-        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+        self,
+        following: frozenset[int],
+        modes: list[Mode],
+        targets: Floats,
+        limits_nm: Floats,
+        *,
+        may_enable: bool,
+        emergency: bool,
     ) -> None:
         """Armed: send the set-points. Otherwise send none: the modules bring themselves to rest and stay passive."""
         if self._arms and not self._unconfigured - self._isolated:

@@ -191,9 +191,18 @@ class CanDrives(ABC):
         self._receive()
 
     def command(
-        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+        self,
+        following: frozenset[int],
+        modes: list[Mode],
+        targets: Floats,
+        limits_nm: Floats,
+        *,
+        may_enable: bool,
+        emergency: bool,
     ) -> None:
         """Set-points; enable, let go, remind."""
+        if not may_enable:
+            following &= self.following.enabled()
         for i in sorted(following):
             self.set_point(i, modes[i], float(targets[i]), float(limits_nm[i]))
         for i, word in self.following.words(following, emergency=emergency):

@@ -41,6 +41,7 @@ class CanTwin(DriveTwin):
         return None
 
     def _act(self) -> None:
+        self.catch_up()
         for wire in self._ends:
             for frame in wire.receive():
                 for i in self._addressees(wire, frame):
@@ -48,7 +49,7 @@ class CanTwin(DriveTwin):
                         continue
                     with contextlib.suppress(ValueError, LookupError, struct.error):
                         self.take(i, frame)
-        self.body.advance_to((self._clock_ns() - self._start_ns) / 1000)
+        self.pass_time()
 
     @abstractmethod
     def of_second(self, frame: Frame) -> Frame:

@@ -4,6 +4,7 @@ Every set-point is a whole command in position mode: gains of the robot file as 
 mode is a proportional gain of 0, torque mode both gains 0, passive that without torque. Answers say mode and fault.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -33,6 +34,7 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode as JointMode
 
 TURN = 2 * math.pi
+OFF_BY_ITSELF = (Mode.FAULT, Mode.TIMEOUT)  # latched until a stop, which also clears the reason
 NO_LIMIT = -1.0
 IDENTITY = part(READ, INT32, Register.MAP_VERSION, count=1), part(READ, INT8, Register.HOME_STATE, count=1)
 MOTION = part(READ, FLOAT, Register.MODE, count=4), part(READ, INT8, Register.FAULT, count=1)
@@ -43,6 +45,8 @@ HEALTH = (
 )
 SERIAL_WORDS = 3
 SERIAL = part(READ, INT32, Register.SERIAL, count=SERIAL_WORDS)
+
+_log = logging.getLogger("snakesim.moteus")
 
 
 class Controllers(CanDrives):
@@ -77,6 +81,7 @@ class Controllers(CanDrives):
         if Register.POSITION in said:
             mode, fault = int(said[Register.MODE]), int(said[Register.FAULT])
             self._mode[i] = mode
+            self.readings.state_was_read(i)
             self.readings.moved(i, said[Register.POSITION] * TURN, said[Register.VELOCITY] * TURN)
             self.readings.pushed(i, said[Register.TORQUE])
             self.following.says(i, enabled=mode == Mode.POSITION, state=f"in mode {mode}")
@@ -137,21 +142,35 @@ class Controllers(CanDrives):
         )
 
     def tell(self, i: int, word: Word) -> None:
-        """A set-point is what makes it follow. A fault is off already, and a stop would clear it."""
-        if word != "follow" and self._mode[i] != Mode.FAULT:
-            self.clear_errors(i)
+        """A set-point is what makes it follow; a stop clears whatever has stopped a controller before."""
+        if self._mode[i] in OFF_BY_ITSELF:
+            return  # its reason is for the operator to reset
+        match word:
+            case "follow":
+                return
+            case "idle":
+                if i not in self.readings.doubted:  # else it is told again, once it says that it is on
+                    self._stop(i)
+            case "stop":
+                self._stop(i)
 
     def set_up(self, i: int) -> None:
         """Nothing: every command is whole."""
 
     def forgive(self, i: int) -> None:
-        """Nothing: an expired watchdog ends when it is told to be idle."""
+        """An expired watchdog."""
+        if self._mode[i] == Mode.TIMEOUT:
+            _log.warning("%s: clearing an expired watchdog of an earlier run", self.following.drives[i].who)
+            self._stop(i)
 
     def give_back(self, i: int) -> None:
         """Nothing: limits are part of each command."""
 
     def clear_errors(self, i: int) -> None:
         """Stopped: it clears faults, too."""
+        self._stop(i)
+
+    def _stop(self, i: int) -> None:
         self._send(i, part(WRITE, INT8, Register.MODE, Mode.STOPPED))
 
     def _send(self, i: int, *content: bytes, reply: bool = False) -> bool:

@@ -134,6 +134,7 @@ class Axes(CanDrives):
                 pass
 
     def _errs(self, i: int, errors: int) -> None:
+        self.readings.state_was_read(i)
         drive, self.axes[i].errors = self.following.drives[i], errors
         drive.errors = names(errors & ~Error.ESTOP_REQUESTED if drive.stopped else errors)
 
@@ -213,7 +214,9 @@ class Axes(CanDrives):
     # --- a tick -------------------------------------------------------------------------------------------------
 
     def ask(self, i: int) -> bool:
-        """Encoder estimates and current."""
+        """Encoder estimates and current; before them errors, of an axis that may have stopped by itself."""
+        if i in self.readings.doubted:
+            self._ask(i, Message.ERROR)
         return self._ask(i, Message.MOTION, Message.CURRENT)
 
     def ask_health(self, i: int) -> None:

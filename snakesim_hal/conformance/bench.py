@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -19,6 +19,24 @@ SCENARIO = str(Path(__file__).parent / "scenario.toml")
 Mute = Callable[[Any, int], None]
 
 
+class EmulatedDrives(Protocol):
+    """The emulated drives of an open backend, for clauses about what drives do while their driver does nothing."""
+
+    def enabled(self) -> list[bool]:
+        """Return for each joint whether its drive would follow a set-point now: in truth, not as the driver has it."""
+        ...
+
+    def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
+        """Let time pass at the drives while nothing of the driver runs, as when its process is stopped.
+
+        A driver with threads holds them meanwhile. `sleep` waits where the drives' time is that of a clock.
+        """
+        ...
+
+
+DrivesOf = Callable[[Any], EmulatedDrives]
+
+
 class Bench:
     """A column of the contract's table."""
 
@@ -30,16 +48,19 @@ class Bench:
         scenario: str = SCENARIO,
         sets: tuple[str, ...] = (),
         mute: Mute | None = None,
+        drives: DrivesOf | None = None,
         unavailable: str | None = None,
     ) -> None:
         """backend: an installed one's name, `./file.py:Class`, or the class itself.
 
         sets: as `--set` of `snakesim run`; mute: `mute(backend, joint)` silences one joint's module, as by a
-        broken wire; unavailable: why the bench cannot be used on this machine.
+        broken wire; drives: gives the emulated drives of an open backend; unavailable: why the bench cannot
+        be used on this machine.
         """
         self.name = name
         self.unavailable = unavailable
         self.mute = mute
+        self.drives = drives
         self._backend = backend
         self._scenario, self._sets = scenario, sets
         self._rig: Rig | None = None

@@ -1,7 +1,7 @@
 """The pytest plugin: options, fixtures and the table at the end. It does nothing until a contract test runs.
 
-Options of its own: --snakesim-backend, -scenario, -set, -mute, -table. A repository with several benches implements
-`pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/backends.md.
+Options of its own: --snakesim-backend, -scenario, -set, -mute, -drives, -table. A repository with several benches
+implements `pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/backends.md.
 """
 
 from collections.abc import Generator, Iterator
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
-    from snakesim_hal.conformance.bench import Bench
+    from snakesim_hal.conformance.bench import Bench, EmulatedDrives
     from snakesim_hal.conformance.loopback import Hosted
     from snakesim_hal.conformance.recordings import Pushing
     from snakesim_hal.conformance.rig import Floats, Record, Rig
@@ -23,7 +23,18 @@ CLAUSE, BENCH = "snakesim_clause", "snakesim_bench"  # properties that a test's 
 PACKAGE = "snakesim_hal.conformance."
 WORST_FIRST = ("error", "fail", "skip", "pass")
 # Tests that share an opening of the backend are adjacent; those that need their own openings come last.
-SUBJECTS = ("description", "samples", "modes", "limits", "switching", "lifecycle", "faults", "host", "closing")
+SUBJECTS = (
+    "description",
+    "samples",
+    "modes",
+    "limits",
+    "switching",
+    "lifecycle",
+    "faults",
+    "drives",
+    "host",
+    "closing",
+)
 _failed = pytest.StashKey[bool]()
 
 
@@ -54,6 +65,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--snakesim-mute",
         metavar="./FILE.py:FUNCTION",
         help="function(backend, joint) that silences a joint's module",
+    )
+    group.addoption(
+        "--snakesim-drives",
+        metavar="./FILE.py:CLASS",
+        help="CLASS(backend) is the emulated drives of an open backend: see EmulatedDrives in docs/backends.md",
     )
     group.addoption("--snakesim-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
 
@@ -119,12 +135,14 @@ def _from_options(config: pytest.Config) -> "list[Bench]":
         sets: list[str] = config.getoption("--snakesim-set") or []
         try:
             mute: Any = config.getoption("--snakesim-mute")
+            drives: Any = config.getoption("--snakesim-drives")
             bench = Bench(
                 backend.rpartition(":")[2],
                 backend,
                 scenario=str(config.getoption("--snakesim-scenario") or SCENARIO),
                 sets=tuple(sets),
                 mute=find_plugin(BACKENDS, mute) if mute else None,
+                drives=find_plugin(BACKENDS, drives) if drives else None,
             )
             assert bench.config  # a wrong setting is reported once, not by every test
         except ConfigError as error:
@@ -155,6 +173,14 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
         rig.late_periods = 0.0
     if request.node.stash.get(_failed, False):
         bench.spoil()
+
+
+@pytest.fixture
+def drives(bench: "Bench", rig: "Rig") -> "EmulatedDrives":
+    """The emulated drives of the open backend."""
+    if bench.drives is None:
+        pytest.skip("this bench has no emulated drives to look at; give --snakesim-drives")
+    return bench.drives(rig.backend)
 
 
 @pytest.fixture

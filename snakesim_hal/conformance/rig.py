@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -31,6 +31,10 @@ from snakesim_hal.wire.messages import (
 JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
 HOLDER = "control"
 REANCHOR_PERIODS = 10
+
+
+def _no_sleep(_seconds: float) -> None:
+    """In lockstep no drive's time is that of a clock."""
 
 
 @dataclass
@@ -206,6 +210,11 @@ class Rig:
                 wanted_mode, wanted = Mode.POSITION, self._next_along(joint, wanted)
             mode[joint], target[joint] = wanted_mode, wanted
         return SetPoints(mode, target, torque_limit_nm or self.full_torque_nm)
+
+    def freeze_host(self, seconds: float, freeze_driver: Callable[[float, Callable[[float], None]], None]) -> None:
+        """Let time pass in which the host does nothing, as when its process is stopped and goes on later."""
+        freeze_driver(seconds, time.sleep if self.pace == "realtime" else _no_sleep)
+        self.tick += self.periods(seconds)
 
     # --- the lifecycle -------------------------------------------------------------------------------------
 

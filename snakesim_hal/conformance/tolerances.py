@@ -20,6 +20,8 @@ ATTEMPTS = 3  # with host and controller in real time in one process, a busy mac
 SETTLE_S = 0.6  # bench4 let go at CRUISE is at rest after 0.3 s; a reached target has settled after 0.4 s
 CRUISE_S = 0.3  # long enough to reach CRUISE_RAD_S, short enough to stay inside the limits of the joint
 PUSH_S = 0.5  # against a stop: the impact is over
+FROZEN_S = 1.0  # that a host does nothing: ten times a watchdog
+BRAKES_S = 0.1  # after a fault: the greatest watchdog of the bench's drives
 
 # --- commands --------------------------------------------------------------------------------------------------
 

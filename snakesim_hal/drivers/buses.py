@@ -5,6 +5,9 @@ delays nobody: the host waits for a bus only if that answered in time when it wa
 their last values, whose age grows. Of set-points the newest is sent; none that is older than a lease: a bus that gets
 no others lets its drives go. What cannot be sent is the business of the drives' own watchdogs.
 
+Drives stop by themselves while a driver is away. After a pause in which a watchdog may have expired, a bus first reads
+the state of every drive, and only then sends anything; see `drive_guard`.
+
 In lockstep the same is done in turn, in the host's thread, and a run is the same each time.
 """
 
@@ -19,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.drivers.drive_backend import Drives
+from snakesim_hal.drivers.drive_backend import CLEAR_GRACE, Drives
+from snakesim_hal.drivers.drive_guard import DriveGuard
 from snakesim_hal.drivers.drive_settings import answer_limit_s
 from snakesim_hal.drivers.findings import Finding
 from snakesim_hal.drivers.readings import Readings
@@ -32,6 +36,8 @@ from snakesim_hal.wire.messages import Mode
 WAITS_FOR = 1.2  # of the time that drives have for an answer
 SLICES = 6  # of that time
 CLOSES_WITHIN_S = 2.0
+GAP_OF_WATCHDOG = 0.5  # a longer pause, as a fraction of the watchdog's time, may have let watchdogs expire
+MAX_READINGS_AFTER_PAUSE = 3  # the computer may pause again while states are read
 
 _log = logging.getLogger("snakesim.drivers")
 
@@ -44,6 +50,7 @@ class Bus:
     joints: tuple[int, ...]  # numbers in the robot
     open: Callable[[Readings], Drives]  # with readings of these drives alone. Raises ConfigError and BackendError
     every_ticks: int = 1
+    watchdog_s: float = 0.1  # of its drives
 
 
 class Told(NamedTuple):
@@ -53,27 +60,32 @@ class Told(NamedTuple):
     modes: list[Mode]
     targets: Floats
     limits_nm: Floats
+    may_enable: bool  # the robot is armed: drives that are off may be enabled
     emergency: bool
 
 
 class BusInTurn:
     """One bus. Numbers of joints are those on it."""
 
-    def __init__(self, bus: Bus, joints: Sequence[Joint], clock_ns: Callable[[], int]) -> None:
-        """joints: of the robot."""
+    def __init__(self, bus: Bus, joints: Sequence[Joint], clock_ns: Callable[[], int], period_ns: int) -> None:
+        """joints: of the robot; period_ns: of its ticks."""
         self.bus = bus
         self.readings = Readings([joints[j] for j in bus.joints], clock_ns)
         self.drives = bus.open(self.readings)
-        self.last: tuple[frozenset[int], bool] | None = None  # who was told to follow, or to stop
+        self.last: tuple[frozenset[int], bool, bool] | None = None  # who was told to follow, or to stop
         self.slower_s = 0.0  # an injected fault, of a bus in a thread
+        self._gap_ns = round(GAP_OF_WATCHDOG * bus.watchdog_s * 1e9)
+        grace_ns = CLEAR_GRACE * bus.every_ticks * period_ns
+        self._guard = DriveGuard(clock_ns, gap_ns=self._gap_ns, grace_ns=grace_ns)
+        self._found_early: list[Finding] = []  # before set-points were sent
 
     def begin(self) -> None:
         """Ticks begin."""
 
     def ask(self) -> bool:
         """What its drives measure; False: it is still busy."""
-        self.readings.ask()
-        self.drives.read()
+        if not self._read_states_after_a_pause():
+            self._read_drives()
         return True
 
     def wait(self, slices: int) -> int:
@@ -86,10 +98,20 @@ class BusInTurn:
 
     def tell(self, told: Told) -> None:
         """Set-points; any earlier ones need not be sent any more."""
-        self.drives.command(told.following, told.modes, told.targets, told.limits_nm, emergency=told.emergency)
+        self._read_states_after_a_pause()
+        self.drives.command(
+            self._guard.drives_to_command(told.following, may_enable=told.may_enable),
+            told.modes,
+            told.targets,
+            told.limits_nm,
+            may_enable=told.may_enable,
+            emergency=told.emergency,
+        )
 
     def clear(self, joints: frozenset[int]) -> None:
         """Errors of these drives."""
+        self._read_states_after_a_pause()
+        self._guard.reset(joints)
         self.drives.clear(joints)
 
     def let_run(self) -> None:
@@ -98,7 +120,7 @@ class BusInTurn:
 
     def findings(self) -> list[Finding]:
         """What is wrong."""
-        return self.drives.findings()
+        return self._collect_findings()
 
     def finish(self) -> None:
         """No more will be asked."""
@@ -108,15 +130,56 @@ class BusInTurn:
         del until_s
         self.drives.close()
 
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _read_states_after_a_pause(self) -> bool:
+        """After a pause of the driver: read whether drives have stopped by themselves. Returns whether it did.
+
+        A stop that a drive has latched would be lost with the next command that lets it go or clears its errors.
+        """
+        self._guard.mark_active()
+        if not self._guard.was_away:
+            return False
+        for _ in range(MAX_READINGS_AFTER_PAUSE):
+            self._guard.states_were_read()
+            self.drives.let_run()  # receives what drives sent before the pause, which says nothing of their state now
+            self.readings.doubt(range(len(self.bus.joints)))
+            self._read_drives()
+            self._guard.mark_active()
+            if not self._guard.was_away:
+                break
+        self._found_early = self._collect_findings()
+        return True
+
+    def _read_drives(self) -> None:
+        """Ask all drives. Those that have been silent for long are asked for their state, too."""
+        silent = [i for i in range(len(self.bus.joints)) if self.readings.age_ns(i) > self._gap_ns]
+        self.readings.doubt(silent)
+        self.readings.ask()
+        self.drives.read()
+        self._guard.mark_active()
+
+    def _collect_findings(self) -> list[Finding]:
+        found = [*self._found_early, *self.drives.findings()]
+        self._found_early = []
+        self._guard.note_findings(found)
+        return found
+
 
 class BusInThread(BusInTurn):
     """The same in a thread, which alone uses the drives from `begin` on."""
 
     def __init__(
-        self, bus: Bus, joints: Sequence[Joint], clock_ns: Callable[[], int], lease_ns: int, waits_s: float
+        self,
+        bus: Bus,
+        joints: Sequence[Joint],
+        clock_ns: Callable[[], int],
+        period_ns: int,
+        lease_ns: int,
+        waits_s: float,
     ) -> None:
         """waits_s: that the host waits for an answer at most."""
-        super().__init__(bus, joints, clock_ns)
+        super().__init__(bus, joints, clock_ns, period_ns)
         self._lease_s, self._slice_s = lease_ns * 1e-9, waits_s / SLICES
         self._took_s, self._slow = 0.0, False
         self._said = Readings([joints[j] for j in bus.joints], clock_ns)
@@ -238,7 +301,7 @@ class BusInThread(BusInTurn):
             moves = told is not None and bool(told[0].following)
             may_move = told is not None and time.monotonic() - told[1] <= self._lease_s and self._failed is None
         if clears:
-            self.drives.clear(clears)
+            super().clear(clears)
         if told is not None and (may_move or not moves):
             self._send(*told)
         elif told is not None or self._left_s() == 0:
@@ -257,14 +320,27 @@ class BusInThread(BusInTurn):
         super().tell(told)
         self._fed_s = at_s if told.following else None
         self.drives.let_run()
-        found = self.drives.findings()
-        with self._has:
-            self._found += of_buses(found) if self._to_clear else found
+        self._report_findings()
 
     def _let_go(self) -> None:
+        """Switch all drives off; they stay off until the operator resets the fault that this is."""
         self._fed_s, count = None, len(self.bus.joints)
-        super().tell(Told(frozenset(), [Mode.PASSIVE] * count, np.zeros(count), np.zeros(count), emergency=False))
+        self._read_states_after_a_pause()
+        if self._guard.let_go():
+            self._found_early.append(Finding("no_setpoints", self._starved()))
+        none = np.zeros(count)
+        super().tell(Told(frozenset(), [Mode.PASSIVE] * count, none, none, may_enable=False, emergency=False))
         self.drives.let_run()
+        self._report_findings()
+
+    def _starved(self) -> str:
+        lease_ms = 1e3 * self._lease_s
+        return f"{self.bus.name}: no set-points for {lease_ms:.0f} ms, one lease: its drives were switched off"
+
+    def _report_findings(self) -> None:
+        found = self._collect_findings()
+        with self._has:
+            self._found += of_buses(found) if self._to_clear else found
 
     def _read(self) -> None:
         time.sleep(self.slower_s)
@@ -296,9 +372,9 @@ class Buses:
         try:
             for bus in buses:
                 if config.pace == "lockstep":
-                    self.lines.append(BusInTurn(bus, joints, clock_ns))
+                    self.lines.append(BusInTurn(bus, joints, clock_ns, config.period_ns))
                 else:
-                    self.lines.append(BusInThread(bus, joints, clock_ns, config.lease_ns, waits_s))
+                    self.lines.append(BusInThread(bus, joints, clock_ns, config.period_ns, config.lease_ns, waits_s))
         except BaseException:
             self.close()
             raise
@@ -331,15 +407,23 @@ class Buses:
             line.say(self._readings)
 
     def command(
-        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+        self,
+        following: frozenset[int],
+        modes: list[Mode],
+        targets: Floats,
+        limits_nm: Floats,
+        *,
+        may_enable: bool,
+        emergency: bool,
     ) -> None:
         """Tell all whose turn it is, and at once whoever is to begin or to stop."""
         for line in self.lines:
             at = list(line.bus.joints)
             mine = frozenset(i for i, j in enumerate(at) if j in following)
-            if self._is_turn(line) or line.last != (mine, emergency):
-                line.last = mine, emergency
-                line.tell(Told(mine, [modes[j] for j in at], targets[at], limits_nm[at], emergency))
+            now = mine, may_enable, emergency
+            if self._is_turn(line) or line.last != now:
+                line.last = now
+                line.tell(Told(mine, [modes[j] for j in at], targets[at], limits_nm[at], may_enable, emergency))
         self._ticks += 1
 
     def clear(self, joints: frozenset[int]) -> None:

@@ -5,7 +5,7 @@ numbers between here and a family are those of the drives' shafts, in SI units.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import msgspec
@@ -13,6 +13,7 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.drivers.braking import Braking
 from snakesim_hal.drivers.findings import Finding, Told
 from snakesim_hal.drivers.mocap import MocapReceiver
 from snakesim_hal.drivers.readings import Readings
@@ -43,11 +44,19 @@ class Drives(Protocol):
         ...
 
     def command(
-        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+        self,
+        following: frozenset[int],
+        modes: list[Mode],
+        targets: Floats,
+        limits_nm: Floats,
+        *,
+        may_enable: bool,
+        emergency: bool,
     ) -> None:
         """Set-points of the drives that follow; any other is to be idle, and is told again if it is not.
 
-        A drive that begins to follow is enabled after it has its set-point. emergency: by the drives' own stop.
+        A drive that begins to follow is enabled after it has its set-point. may_enable: the robot is armed; otherwise
+        a drive that is not on stays off. emergency: by the drives' own stop.
         """
         ...
 
@@ -96,9 +105,13 @@ class DriveBackend:
         clock: Clock,
         mocap: MocapReceiver | None,
         make_drives: Callable[[Readings], Drives],
+        watchdogs_s: Sequence[float],
         every_ticks: int = 1,
     ) -> None:
-        """make_drives: opens the buses; every_ticks: of the slowest. Raises ConfigError and BackendError."""
+        """make_drives: opens the buses; watchdogs_s: of every joint's drive; every_ticks: of the slowest bus.
+
+        Raises ConfigError and BackendError.
+        """
         joints = config.robot.joint_table
         self._clock, self._mocap, self._open = clock, mocap, True
         self._period_ns, self._lease_ns, self._every = config.period_ns, config.lease_ns, every_ticks
@@ -107,6 +120,9 @@ class DriveBackend:
         self._mounting = self._readings.mounting
         self._may_lose = config.robot.safety.may_lose_joints
         self._told = Told()
+        self._braking = Braking(
+            [round(watchdog_s * 1e9) for watchdog_s in watchdogs_s], holds=config.robot.safety.action == "hold"
+        )
         self._lifecycle: LifecycleState = "disarmed"
         self._following: frozenset[int] = frozenset()
         self._isolated: frozenset[int] = frozenset()
@@ -139,7 +155,7 @@ class DriveBackend:
         return self._samples(tick, stamp_ns)
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Armed: all that are not isolated follow. At fault those go on that did, while they are told to damp."""
+        """Armed: all that are not isolated follow. At fault those go on that did, while they brake."""
         if not self._open:
             return
         self._announce(lifecycle, set_points.isolated)
@@ -150,16 +166,14 @@ class DriveBackend:
             self._told.forget()
             self._drives.clear(everybody if self._lifecycle in LATCHED else back)
             self._quiet = self.clear_grace * self._every
-        damped = {i for i in self._following if set_points.mode[i] != Mode.PASSIVE}
-        self._following = (
-            everybody if lifecycle == "armed" else everybody & damped if lifecycle == "fault" else frozenset()
-        )
+        self._following = self._joints_to_drive(lifecycle, everybody, set_points.mode)
         self._lifecycle = lifecycle
         self._drives.command(
             self._following,
             set_points.mode,
             self._mounting.drive_targets(set_points.mode, set_points.target),
             self._mounting.drive_torque_limit_nm(np.array(set_points.torque_limit_nm)),
+            may_enable=lifecycle == "armed",
             emergency=lifecycle == "estop",
         )
 
@@ -204,6 +218,21 @@ class DriveBackend:
             self._mocap.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _joints_to_drive(
+        self, lifecycle: LifecycleState, connected: frozenset[int], modes: Sequence[Mode]
+    ) -> frozenset[int]:
+        """Return the joints whose drives get set-points in this lifecycle state. A fault begins with no new one."""
+        if lifecycle != "fault":
+            self._braking.reset()
+        match lifecycle:
+            case "armed":
+                return connected
+            case "fault":
+                speeds = self._mounting.joint_velocity_rad_s(self._readings.velocity_rad_s)
+                return self._braking.joints(connected & self._following, modes, speeds, self._clock.ns())
+            case _:
+                return frozenset()
 
     def _must_be_open(self) -> None:
         if not self._open:

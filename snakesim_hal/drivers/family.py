@@ -112,7 +112,9 @@ class FamilyBackend(DriveBackend):
 
         hardware = "+".join(port for part in parts for port in part.ports)
         slowest = max(self.every_ticks(part.settings) for part in parts)
-        super().__init__(config, self.name, hardware, clock, mocap, open_buses, slowest)
+        watchdog_s = {joint: part.settings.watchdog_s for part in parts for joint in part.joints}
+        watchdogs_s = [watchdog_s[joint] for joint in range(len(watchdog_s))]
+        super().__init__(config, self.name, hardware, clock, mocap, open_buses, watchdogs_s, slowest)
 
     @staticmethod
     def every_ticks(settings: DriveSettings) -> int:
@@ -132,5 +134,6 @@ def buses_of(
     for number, port in enumerate(ports):
         mine = tuple(j for j, bus in zip(joints, on, strict=True) if bus == number)
         if mine:
-            found.append(Bus(port, mine, partial(open_drives, port, mine), settings.every_ticks))
+            open_these = partial(open_drives, port, mine)
+            found.append(Bus(port, mine, open_these, settings.every_ticks, settings.watchdog_s))
     return found

@@ -59,6 +59,10 @@ class Following:
                 told.append((i, "follow" if drive.follows else "stop" if emergency else "idle"))
         return told
 
+    def enabled(self) -> frozenset[int]:
+        """Return the drives that were told to follow, and say that they do."""
+        return frozenset(i for i, drive in enumerate(self.drives) if drive.follows and drive.enabled)
+
     def forgive(self, joints: Iterable[int]) -> None:
         """These are being cleared."""
         for i in joints:

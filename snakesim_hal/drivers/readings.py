@@ -5,7 +5,7 @@ questions without an answer, as a computer that stutters asks late, too. What is
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class Readings:
         self.serials, self.firmware = [""] * count, [""] * count  # empty: the drive does not say it
         self._asked = LATELY  # questions so far
         self._motion_at, self._torque_at = [0] * count, [0] * count  # the newest one that was answered
+        self._doubted: set[int] = set()
 
     # --- what drives say -------------------------------------------------------------------------------------
 
@@ -81,6 +82,24 @@ class Readings:
             self._motor_c[j], self._board_c[j] = part._motor_c[i], part._board_c[i]
             self._health_ns[j] = part._health_ns[i]
             self.serials[j], self.firmware[j] = part.serials[i], part.firmware[i]
+
+    # --- whether drives have switched themselves off ----------------------------------------------------------
+
+    @property
+    def doubted(self) -> frozenset[int]:
+        """Drives that may have switched themselves off since they were read last: a driver reads their state first.
+
+        Until it has, nothing that clears a latched stop may be sent to them.
+        """
+        return frozenset(self._doubted)
+
+    def doubt(self, drives: Iterable[int]) -> None:
+        """The driver was silent, or these drives were, for so long that their watchdogs may have expired."""
+        self._doubted.update(drives)
+
+    def state_was_read(self, i: int) -> None:
+        """A drive has just reported whether it is on, and whether it has stopped by itself."""
+        self._doubted.discard(i)
 
     # --- what is known ---------------------------------------------------------------------------------------
 

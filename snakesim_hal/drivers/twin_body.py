@@ -75,9 +75,13 @@ class Motion:
         if camera is not None and send_pose is not None:
             self._camera = PoseCamera(camera, plant, (config.seed, len(self.joints)), config.period_ns)
 
+    def lag_us(self, clock_us: float) -> float:
+        """How far the physics is behind the clock."""
+        return clock_us - self._skipped_us - self.now_us
+
     def advance_to(self, clock_us: float) -> None:
         """Physics until then."""
-        if clock_us - self._skipped_us - self.now_us > MAX_AT_ONCE_US:
+        if self.lag_us(clock_us) > MAX_AT_ONCE_US:
             self._skipped_us = clock_us - self.now_us - MAX_AT_ONCE_US
         until_us = clock_us - self._skipped_us
         plant, motors = self.plant, self.motors
@@ -126,6 +130,10 @@ class TwinBody:
         """No longer."""
         with self.lock:
             self._all.each_step.remove(act)
+
+    def is_late(self, clock_us: float) -> bool:
+        """Whether the process of these drives has paused for longer than they catch up with."""
+        return self._all.lag_us(clock_us) > MAX_AT_ONCE_US
 
     def advance_to(self, clock_us: float) -> None:
         """Physics until then. Twins of several buses hold the `lock` while they act, as those may be in threads."""
@@ -223,6 +231,22 @@ class DriveTwin(ABC):
     @abstractmethod
     def each_step(self, now_us: float) -> None:
         """Time has passed: watchdogs, heat, reports that are due."""
+
+    def catch_up(self) -> None:
+        """After a pause of this process, let time pass before anything that was sent since then is heard.
+
+        Real drives do not pause with the computer: their watchdogs expire.
+        """
+        clock_us = self._clock_us()
+        if self.body.is_late(clock_us):
+            self.body.advance_to(clock_us)
+
+    def pass_time(self) -> None:
+        """Let time pass up to now."""
+        self.body.advance_to(self._clock_us())
+
+    def _clock_us(self) -> float:
+        return (self._clock_ns() - self._start_ns) / 1000
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
         """Begin or end a fault of a drive."""

@@ -514,7 +514,8 @@ class Host:
             return
         if self.authority.arming and not self._stopping:
             cause = f"{service} is gone: its process ended or its connection broke"
-            self.authority.note(Fault(tick=self._tick, what="service_lost", cause=cause))
+            commands = self.authority.state == "armed" and self.authority.lease.holder == service
+            self.authority.note(Fault(tick=self._tick, what="service_lost", cause=cause), precedes_stop=commands)
         if self.authority.lease.holder == service:
             self.authority.holder_gone(f"{service} is gone")
 
@@ -534,7 +535,7 @@ class Host:
         if held_up:
             wrong["the network accepts no message: it is congested, or under attack"] = "network_held_up"
         for cause in wrong.keys() - self._network_faults:
-            self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause, reach="none"))
+            self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause))
         self._network_faults = set(wrong)
 
     # --- outputs -------------------------------------------------------------------------------------------

@@ -217,7 +217,7 @@ class Authority:
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
         """Stop now, for any requester."""
         stopping = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
-        self.note(stopping, stops=self.state != "estop")
+        self._record(stopping, stops=self.state != "estop")
         self._go("estop", f"emergency stop by {request.who}; clear it to go on")
         return self._answer(None)
 
@@ -228,23 +228,25 @@ class Authority:
         None: the one that the fault names.
         """
         if fault.reach == "none":
-            self.note(fault)
+            self._record(fault, stops=False)
             return
         joints = self._isolation.mask(fault.joint) if joints is None else joints
         if fault.reach == "joint" and self._set_aside(fault, joints):
             return
         fault = msgspec.structs.replace(fault, reach="robot")
         stops = self.state not in ("fault", "estop")  # later faults are usually consequences of the first
-        self.note(fault, stops=stops)
+        self._record(fault, stops=stops)
         if stops:
             self._go("fault", fault.cause[:500] or fault.what)
         self._drop_lease()
 
-    def note(self, fault: Fault, *, stops: bool = False) -> None:
-        """Record a fault for people that stops nothing by itself. stops: it does."""
-        fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
-        for log in (self.since_clear, self.since_start):
-            log.add(fault, stops=stops)
+    def note(self, fault: Fault, *, precedes_stop: bool = False) -> None:
+        """Record a fault for people that stops nothing by itself.
+
+        precedes_stop: what it leads to stops the robot, as the loss of the process that holds the lease does.
+        """
+        reach = "robot" if precedes_stop else "none"
+        self._record(msgspec.structs.replace(fault, reach=reach), stops=False)
 
     def holder_gone(self, cause: str) -> None:
         """The lease holder's process has ended: while disarmed, free the lease at once."""
@@ -342,13 +344,19 @@ class Authority:
     def _is_aside(self, fault: Fault) -> bool:
         return fault.reach == "joint" and self._isolation.has(fault.joint)
 
+    def _record(self, fault: Fault, *, stops: bool) -> None:
+        """stops: it is why the robot is in `fault` or `estop` now."""
+        fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
+        for log in (self.since_clear, self.since_start):
+            log.add(fault, stops=stops)
+
     def _set_aside(self, fault: Fault, joints: Mask) -> bool:
         """Isolate failed joints, if allowed; later faults of isolated joints are ignored."""
         if self._isolation.covers(joints):
             return True
         if self.state != "armed" or not self._isolation.add(joints):
             return False
-        self.note(fault)
+        self._record(fault, stops=False)
         self.why = f"armed, without {', '.join(self.isolated)}: {fault.cause}"[:500]
         return True
 

@@ -1,5 +1,6 @@
 """Before a motor turns: every servo is there, of a known model, and kept as the driver needs it. Enables nothing."""
 
+import logging
 import struct
 import time
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,8 @@ TORQUE_AT_START = 0x01
 READS = 3  # to tell a second servo from a single disturbance
 MEASURED = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos differ: position, voltage, temperature
 KEPT = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}  # written only where it differs: it wears out
+
+_log = logging.getLogger("snakesim.dynamixel")
 
 
 def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
@@ -139,6 +142,9 @@ def _strangers(servos: Sequence[Servo], port: Port) -> Iterator[str]:
 
 
 def _set_up(servo: Servo) -> None:
+    state = _answer(servo, at.TORQUE_ENABLE, at.STATE_SIZE).data
+    if state[at.WATCHDOG - at.TORQUE_ENABLE] == at.TRIPPED:
+        _log.warning("%s: clearing an expired bus watchdog of an earlier run", servo.who)
     kept = _answer(servo, 0, at.KEPT).data
     differs = {address: value for address, value in KEPT.items() if kept[address] != value}
     for address, value in {**WANTED, **differs}.items():

@@ -44,6 +44,7 @@ gains_form = Struct("<HHH")
 goals_form = Struct("<hiIIi")  # current, velocity, acceleration and velocity of the profile (0: none), position
 present_form = Struct("<hii")  # current, velocity, position: signed
 HEALTH_SIZE = TEMPERATURE + 1 - TORQUE_ENABLE  # from TORQUE_ENABLE on
+STATE_SIZE = WATCHDOG + 1 - TORQUE_ENABLE  # from TORQUE_ENABLE on: torque, hardware error, watchdog
 
 
 class HardwareError(IntFlag):

@@ -71,6 +71,7 @@ class Servos:
         self._turn += 1
         everybody = range(len(self.servos))
         steady, silent = [i for i in everybody if i not in self._lost], sorted(self._lost)
+        self._read_states([i for i in steady if i in self._readings.doubted])
         self._ask(steady)
         if silent:
             self._ask_lost(silent[self._turn % len(silent)])
@@ -115,6 +116,13 @@ class Servos:
         self._readings.pushed(i, current * servo.unit_nm)
         servo.current_a = abs(current) * servo.unit_nm / servo.constant
 
+    def _read_states(self, which: Sequence[int]) -> None:
+        """Read at once whether these servos have stopped by themselves; one that is silent is asked later."""
+        answers = self._port.read_all([self.servos[i].id for i in which], at.TORQUE_ENABLE, at.STATE_SIZE)
+        for i in which:
+            if (said := answers.get(self.servos[i].id)) is not None:
+                self._take_state(i, said)
+
     def _ask_health(self, i: int) -> None:
         servo = self.servos[i]
         if (said := servo.port.read(servo.id, at.TORQUE_ENABLE, at.HEALTH_SIZE)) is not None:
@@ -123,22 +131,39 @@ class Servos:
     def _check(self, i: int, said: Packet) -> None:
         """What a servo says of its health."""
         servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
-        servo.enabled, servo.health_ns = bool(data[0]), self._clock_ns()
-        servo.errors, servo.watchdog = data[at.HARDWARE_ERROR - first], data[at.WATCHDOG - first]
+        self._take_state(i, said)
         volts = struct.unpack_from("<H", data, at.VOLTAGE - first)[0] * at.VOLTS
         self._readings.supplied(i, volts, servo.current_a)
         temperature_c = float(data[at.TEMPERATURE - first])
         self._readings.warmed(i, temperature_c, temperature_c)
+
+    def _take_state(self, i: int, said: Packet) -> None:
+        """Whether a servo's torque is on, and what has switched it off."""
+        servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
+        servo.enabled = bool(data[0])
+        servo.errors = data[at.HARDWARE_ERROR - first]
+        servo.watchdog = data[at.WATCHDOG - first]
+        servo.health_ns = self._clock_ns()
+        self._readings.state_was_read(i)
 
     def let_run(self) -> None:
         """Emulated servos."""
         self._port.wire.let_run()
 
     def command(
-        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+        self,
+        following: frozenset[int],
+        modes: list[Mode],
+        targets: Floats,
+        limits_nm: Floats,
+        *,
+        may_enable: bool,
+        emergency: bool,
     ) -> None:
         """Set-points; torque on and off. An emergency stop is torque off, too: servos know no other."""
         everybody = range(len(self.servos))
+        if not may_enable:
+            following &= {i for i in everybody if self.servos[i].follows}
         off = [i for i in everybody if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
         on = [i for i in everybody if i in following and not self.servos[i].follows]
         self._tell(at.TORQUE_ENABLE, off, b"\0")
@@ -169,9 +194,15 @@ class Servos:
         self._port.write_all(address, [(self.servos[i].id, data) for i in who])
 
     def clear(self, joints: frozenset[int]) -> None:
-        """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second."""
+        """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second.
+
+        A watchdog that has stopped its servo is cleared by writing 0.
+        """
         for i in sorted(joints):
             servo = self.servos[i]
+            if servo.watchdog == at.TRIPPED:
+                self._tell(at.WATCHDOG, [i], b"\0")
+                servo.watchdog = 0
             if servo.errors or servo.alert:
                 servo.port.reboot(servo.id)
                 servo.errors, servo.alert, servo.booting_ns = 0, False, self._clock_ns()
@@ -190,11 +221,12 @@ class Servos:
             if servo.errors:
                 cause = f"{servo.who} reports {at.error_names(servo.errors)}; a clear restarts it"
                 found.append(Finding("drive_fault", cause, i, alone=True))
-            elif servo.follows and servo.health_ns > servo.told_ns:
-                tripped = servo.watchdog == at.TRIPPED
-                if tripped or not servo.enabled:
-                    why = "its bus watchdog has stopped it" if tripped else "its torque is off: it has restarted"
-                    found.append(Finding("drive_not_armed", f"{servo.who} does not follow: {why}", i, alone=True))
+            elif servo.watchdog == at.TRIPPED:
+                cause = f"{servo.who} was stopped by its bus watchdog, as it got no packet in time"
+                found.append(Finding("drive_fault", cause, i, alone=True))
+            elif servo.follows and servo.health_ns > servo.told_ns and not servo.enabled:
+                cause = f"{servo.who} does not follow: its torque is off: it has restarted"
+                found.append(Finding("drive_not_armed", cause, i, alone=True))
         return found
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:

@@ -98,11 +98,12 @@ class DynamixelTwin(DriveTwin):
         """Handle what has arrived, and let time pass up to now."""
         taken = [port.take() for port in self._ends]  # may wait for the kernel; nobody else has to wait for it
         with self.body.lock:
+            self.catch_up()
             for port, decoder, data in zip(self._ends, self._decoders, taken, strict=True):
                 for packet in decoder.feed(data):
                     if packet.instruction != Instruction.STATUS:
                         self._take(port, packet)
-            self.body.advance_to((self._clock_ns() - self._start_ns) / 1000)
+            self.pass_time()
 
     # --- packets ----------------------------------------------------------------------------------------------
 

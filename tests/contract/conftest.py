@@ -11,6 +11,7 @@ from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.drivers.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Pace
+from tests.contract.drives import DrivesOfAnyFamily, DrivesOfModules
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
 IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs the other clauses, too
@@ -29,9 +30,16 @@ LOOKS_AHEAD = (
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
+WITHOUT_THE_DRIVER = "test_drives_"  # moteus does it otherwise; for buses in threads see tests/unit/hal/drivers
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 HEAD_OF_SERVOS = (
     'robot.drive.family="odrive"',
+    'robot.joints.joint_3.family="dynamixel"',
+    'robot.joints.joint_4.family="dynamixel"',
+)
+ALL_FAMILIES = (
+    'robot.drive.family="odrive"',
+    'robot.joints.joint_2.family="moteus"',
     'robot.joints.joint_3.family="dynamixel"',
     'robot.joints.joint_4.family="dynamixel"',
 )
@@ -59,19 +67,20 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("sim", "sim"),
         Bench("sim-camera", "sim", sets=LOOKS_AHEAD),
         Bench("sim-position", "sim", sets=POSITION_ONLY),
-        Bench("can-virtual", "can", mute=cut_off),
-        Bench("odrive", "odrive", mute=cut_drive_off),
-        Bench("moteus", "moteus", mute=cut_drive_off),
-        Bench("dynamixel", "dynamixel", mute=cut_drive_off),
-        Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off),
-        Bench("threads", IN_REAL_TIME, sets=HEAD_OF_SERVOS, mute=cut_drive_off),
+        Bench("can-virtual", "can", mute=cut_off, drives=DrivesOfModules),
+        Bench("odrive", "odrive", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("threads", IN_REAL_TIME, sets=ALL_FAMILIES, mute=cut_drive_off, drives=DrivesOfAnyFamily),
     ]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make test-all`."""
     for item in items:
-        if any(f"[{bench}" in item.name for bench in AS_ANOTHER):
+        is_special = WITHOUT_THE_DRIVER in item.name and "[moteus" in item.name
+        if any(f"[{bench}" in item.name for bench in AS_ANOTHER) and not is_special:
             item.add_marker(pytest.mark.slow)
         if "sim-camera" in item.name and not any(words in item.name for words in OF_SENSORS):
             item.add_marker(pytest.mark.slow)

@@ -20,7 +20,7 @@ from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
-from tests.contract.workbench import Workbench, mute
+from tests.contract.workbench import DrivesWorkbench, Workbench, WorkbenchDrives, mute
 from tests.unit.hal.rig import pose
 
 
@@ -445,6 +445,45 @@ class RepeatsItsFaults(Workbench):
         return [Fault(tick=0, what="silent", cause=f"joint {i} is silent") for i in self.silent]
 
 
+FROZEN = "drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an_arming"
+
+
+@breaks(FROZEN)
+class EnablesWhatHasTripped(DrivesWorkbench):
+    """Whatever it sends enables drives again."""
+
+    def enact(self, set_points, lifecycle):
+        super().enact(set_points, lifecycle)
+        self.enabled |= self.tripped
+
+
+@breaks(FROZEN)
+class ClearsATripBeforeItIsRead(DrivesWorkbench):
+    """Any command that lets a drive go ends what its watchdog has latched."""
+
+    def enact(self, set_points, lifecycle):
+        super().enact(set_points, lifecycle)
+        if lifecycle != "armed":
+            self.tripped[:] = False
+
+
+@breaks(FROZEN)
+class HasNoWatchdog(DrivesWorkbench):
+    WATCHDOG_S = 3600.0
+
+
+@breaks("drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watchdogs_time")
+class BrakesForEver(DrivesWorkbench):
+    def still_brakes(self):
+        return self.enabled
+
+
+@breaks("drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watchdogs_time")
+class LetsGoAtOnce(DrivesWorkbench):
+    def still_brakes(self):
+        return self.enabled & False
+
+
 @breaks("bad_commands_are_refused_and_counted_and_move_nothing")
 class Creeps(Workbench):
     crept = 0.0
@@ -512,7 +551,7 @@ class ModulesThatTellThemselvesASimulator(Liar):
 
 def pytest_snakesim_benches() -> list[Bench]:
     """Every mutant on a bench of its own."""
-    return [Bench(mutant.name, mutant.backend, mute=mute) for mutant in MUTANTS]
+    return [Bench(mutant.name, mutant.backend, mute=mute, drives=WorkbenchDrives) for mutant in MUTANTS]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -2,6 +2,7 @@
 
 from snakesim_hal.conformance.test_closing import *  # noqa: F403
 from snakesim_hal.conformance.test_description import *  # noqa: F403
+from snakesim_hal.conformance.test_drives import *  # noqa: F403
 from snakesim_hal.conformance.test_faults import *  # noqa: F403
 from snakesim_hal.conformance.test_host import *  # noqa: F403
 from snakesim_hal.conformance.test_lifecycle import *  # noqa: F403

@@ -1,5 +1,6 @@
 """The backend that docs/backends.md shows, taken from there, and one like it that behaves as a robot on a bus does."""
 
+import dataclasses
 import re
 import sys
 from pathlib import Path
@@ -10,7 +11,9 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.drivers.braking import AT_REST_RAD_S
+from snakesim_hal.drivers.drive_backend import LATCHED
+from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
 DOCS = Path(__file__).parents[2] / "docs" / "backends.md"
 
@@ -29,7 +32,73 @@ Workbench: Any = example.Workbench
 mute: Any = example.mute
 
 
-class BusWorkbench(Workbench):
+class DrivesWorkbench(Workbench):
+    """With drives that stop by a watchdog of their own, and are enabled by an arming alone."""
+
+    WATCHDOG_S = 0.1
+
+    def __init__(self, config: Any, settings: Any) -> None:
+        super().__init__(config, settings)
+        joints = len(self.angle)
+        self.enabled = np.zeros(joints, dtype=bool)
+        self.tripped = np.zeros(joints, dtype=bool)  # by the watchdog, until a clear
+        self.reported = np.zeros(joints, dtype=bool)
+        self.braked_s = 0.0
+        self.was: LifecycleState = "disarmed"
+
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        was_latched, self.was = self.was in LATCHED, lifecycle
+        if was_latched and lifecycle not in LATCHED:
+            self.tripped[:] = self.reported[:] = False
+        match lifecycle:
+            case "armed":
+                self.enabled, self.braked_s = self.may_be_enabled(), 0.0
+            case "fault":
+                self.enabled = self.still_brakes()
+            case _:
+                self.enabled[:] = False
+        modes = [mode if on else Mode.PASSIVE for mode, on in zip(set_points.mode, self.enabled, strict=True)]
+        super().enact(dataclasses.replace(set_points, mode=modes), lifecycle)
+
+    def may_be_enabled(self) -> Any:
+        return ~self.tripped
+
+    def still_brakes(self) -> Any:
+        moves = np.abs(self.velocity) > AT_REST_RAD_S
+        return self.enabled & moves & (self.braked_s < self.WATCHDOG_S)
+
+    def advance(self) -> None:
+        super().advance()
+        self.braked_s += self.steps * example.STEP_S
+
+    def faults(self) -> list[Fault]:
+        fresh = self.tripped & ~self.reported
+        self.reported |= fresh
+        names = [joint.name for joint, is_fresh in zip(self.description.joints, fresh, strict=True) if is_fresh]
+        return [Fault(tick=0, what="drive_fault", cause=f"{name}: its watchdog", joint=name) for name in names]
+
+
+class WorkbenchDrives:
+    """The drives of a `DrivesWorkbench`."""
+
+    def __init__(self, backend: Any) -> None:
+        self._backend = backend
+
+    def enabled(self) -> list[bool]:
+        return self._backend.enabled.tolist()
+
+    def freeze_driver(self, seconds: float, sleep: Any) -> None:
+        backend = self._backend
+        sleep(seconds)
+        if seconds > backend.WATCHDOG_S:
+            backend.tripped |= backend.enabled
+            backend.enabled &= False
+            backend.mode[:] = Mode.PASSIVE
+        for _ in range(round(seconds / example.STEP_S)):
+            backend.step()
+
+
+class BusWorkbench(DrivesWorkbench):
     """As late, coarse and slow to wake as a robot on a bus may be, and at rest by itself when it is not armed."""
 
     WAKES_AFTER = 4  # periods until joint 0 is armed; each further joint takes one more

@@ -117,8 +117,8 @@ def _ending(ended: str) -> str:
 
 def _trouble(summary: RunSummary) -> str:
     """What went wrong, and stopped nothing: joints lost, other faults, commands refused."""
-    lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint is not None))
-    others = [fault for fault in summary.faults if fault.joint is None]
+    lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint and fault.reach == "joint"))
+    others = [fault for fault in summary.faults if fault.reach == "none"]
     said = [f"went on without {', '.join(lost)}"] if lost else []
     if others:
         said.append(f"{'a fault' if len(others) == 1 else f'{len(others)} faults'} ({_sentence(others[0].cause)[:-1]})")

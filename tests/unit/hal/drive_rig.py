@@ -15,12 +15,13 @@ def drives_of(backend: Any, bus: int = 0) -> Any:
 
 
 class DriveRig:
-    """While armed, every joint has the same set-point; otherwise all are passive."""
+    """While armed, every joint has the same set-point; otherwise all are passive, unless they damp in a fault."""
 
     def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
         self.config, self.backend = config, backend
         self.tick, self.isolated = 0, frozenset[int]()
         self.mode, self.target, self.limit_nm = Mode.POSITION, 0.1, 1.0
+        self.damps = False  # in a fault
         self.joints: JointState | None = None
 
     def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
@@ -29,9 +30,9 @@ class DriveRig:
         for _ in range(ticks):
             self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
             count = len(self.joints.angle_rad)
-            modes = [self.mode if lifecycle == "armed" else Mode.PASSIVE] * count
+            mode, target = self._set_point(lifecycle)
             self.backend.enact(
-                SetPoints(modes, [self.target] * count, [self.limit_nm] * count, self.isolated), lifecycle
+                SetPoints([mode] * count, [target] * count, [self.limit_nm] * count, self.isolated), lifecycle
             )
             self.backend.advance()
             found += self.backend.faults()
@@ -39,6 +40,15 @@ class DriveRig:
                 lifecycle = "fault"
             self.tick += 1
         return found
+
+    def _set_point(self, lifecycle: LifecycleState) -> tuple[Mode, float]:
+        match lifecycle:
+            case "armed":
+                return self.mode, self.target
+            case "fault" if self.damps:
+                return Mode.VELOCITY, 0.0
+            case _:
+                return Mode.PASSIVE, self.target
 
     def go_wrong(self, text: str, *, begins: bool = True) -> None:
         """Begin or end a fault, such as `mute:joint_2@0-9`."""

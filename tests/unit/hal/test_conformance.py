@@ -72,16 +72,18 @@ def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
     given = ["--snakesim-backend", "./workbench.py:Workbench", "--snakesim-mute", "./workbench.py:mute"]
     ran = run_suite(*given, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout
-    assert ran.stdout.count("skipped:") == 1
+    assert ran.stdout.count("skipped:") == 2
     assert "joint_1 is described with every mode" in ran.stdout  # so there is none that it lacks
+    assert "2 clauses, on Workbench: this bench has no emulated drives" in ran.stdout
     rows = [line for line in (tmp_path / "table.md").read_text().splitlines() if line.endswith("| pass |")]
-    assert len(rows) == len(clauses()) - 1
+    assert len(rows) == len(clauses()) - 3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("backend", "said"), [("BusWorkbench", ""), ("RealTimeWorkbench", "not exactly repeatable")])
 def test_a_backend_that_is_late_coarse_and_slow_to_wake_or_keeps_real_time_only_passes(backend: str, said: str) -> None:
-    ran = run_suite("--snakesim-backend", f"{BUS}:{backend}", "--snakesim-mute", f"{BUS}:mute", "-q")
+    looks = ("--snakesim-mute", f"{BUS}:mute", "--snakesim-drives", f"{BUS}:WorkbenchDrives")
+    ran = run_suite("--snakesim-backend", f"{BUS}:{backend}", *looks, "-q")
     assert ran.returncode == 0 and said in ran.stdout, ran.stdout
 
 

@@ -19,6 +19,7 @@ from snakesim_hal.drivers.family import FamilyBackend
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
+from tests.contract.drives import DrivesOfAnyFamily
 from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
 
@@ -35,7 +36,7 @@ class Family:
     drives: Callable[[Any], list[Any]]  # of a twin
     follows: Callable[[Any], bool]  # one of them
     settings: Callable[[Any, int], object]  # that the drive of a joint of a twin has in force
-    expired: tuple[str, str]  # the fault of an expired watchdog, and what its cause says
+    expired: str  # what the fault of an expired watchdog says
     overheated: str
     serial: str = ""  # of the drive with this number
     firmware: str = ""
@@ -54,7 +55,7 @@ FAMILIES = {
         lambda twin: twin.axes,
         lambda axis: axis.state == State.CLOSED_LOOP,
         law_of,
-        ("drive_fault", "watchdog_timer_expired"),
+        "watchdog_timer_expired",
         "motor_over_temp",
         "38550000000{}",
         "0.6.11",
@@ -66,7 +67,7 @@ FAMILIES = {
         lambda twin: twin.controllers,
         lambda controller: controller.mode == MoteusMode.POSITION,
         law_of,
-        ("drive_fault", "its watchdog expired"),
+        "its watchdog expired",
         "fault 38, over-temperature",
         "3033363665115510{:08X}",
         "",
@@ -78,7 +79,7 @@ FAMILIES = {
         lambda twin: twin.servos,
         lambda servo: servo.on and servo.table[at.WATCHDOG] != at.TRIPPED,
         lambda twin, joint: (twin.servos[joint].table[at.GAINS : at.GAINS + 6], twin.servos[joint].table[at.WATCHDOG]),
-        ("drive_not_armed", "watchdog"),
+        "stopped by its bus watchdog",
         "overheating",
     ),
 }
@@ -97,6 +98,11 @@ class Robot(DriveRig):
     @property
     def twin(self) -> Any:
         return drives_of(self.backend)._twin
+
+    def freeze_host(self, seconds: float) -> None:
+        """Time passes at the drives, and the driver does nothing meanwhile."""
+        DrivesOfAnyFamily(self.backend).freeze_driver(seconds, lambda _seconds: None)
+        self.tick += round(seconds * self.config.rate_hz)
 
     def following(self) -> list[bool]:
         return [self.family.follows(drive) for drive in self.family.drives(self.twin)]
@@ -181,10 +187,54 @@ def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_
     robot.twin()
     assert robot.following() == [False] * JOINTS
     faults = robot.run(SHOWN, "armed")
-    what, cause = robot.family.expired
-    assert {fault.what for fault in faults} == {what} and all(cause in fault.cause for fault in faults)
+    assert {fault.what for fault in faults} == {"drive_fault"}
+    assert all(robot.family.expired in fault.cause for fault in faults)
     robot.backend._drives.bring_up()
     assert robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
+
+
+def test_drives_that_stopped_while_their_bus_was_cut_are_read_before_anything_clears_them(robot: Robot) -> None:
+    """The driver ran all the time, and commanded them to damp and to be idle; nothing of it got through."""
+    robot.run(30, "armed")
+    robot.go_wrong("cut:bus_1@0-9")
+    assert "interface_down" in {fault.what for fault in robot.run(30, "armed")}
+    assert robot.following() == [False] * JOINTS, "stopped by their watchdogs"
+    robot.go_wrong("cut:bus_1@0-9", begins=False)
+    robot.damps = True
+    faults = robot.run(SHOWN, "fault")
+    assert {(fault.what, fault.joint) for fault in faults} == {("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)}
+    assert all(robot.family.expired in fault.cause for fault in faults) and robot.following() == [False] * JOINTS
+    assert robot.run(10, "disarmed") == [] and robot.run(30, "armed") == [] and robot.following() == [True] * JOINTS
+
+
+def test_a_stop_that_cannot_be_read_yet_is_not_cleared_meanwhile(robot: Robot) -> None:
+    """The host was frozen, and one drive does not answer after it: its watchdog's stop is reported once it does."""
+    robot.run(20, "armed")
+    robot.go_wrong("mute:joint_2@0-9")
+    robot.freeze_host(1.0)
+    assert robot.following() == [False] * JOINTS
+    robot.damps = True
+    first = robot.run(30, "fault")
+    named = {fault.joint for fault in first if robot.family.expired in fault.cause}
+    assert named == {"joint_1", "joint_3", "joint_4"}, first
+    robot.go_wrong("mute:joint_2@0-9", begins=False)
+    found = robot.run(SHOWN, "fault")
+    assert [fault.joint for fault in found if robot.family.expired in fault.cause] == ["joint_2"], found
+    assert robot.following() == [False] * JOINTS
+
+
+def test_no_drive_is_enabled_by_the_damping_of_a_fault_that_comes_before_it_has_started(robot: Robot) -> None:
+    robot.run(5, "disarmed")
+    robot.damps = True
+    robot.run(10, "fault")
+    assert robot.following() == [False] * JOINTS, "a fault of a robot that was not armed"
+    robot.run(5, "disarmed")
+    drives = drives_of(robot.backend)
+    drives.command = lambda *_told, **_more: None  # the enabling is lost on its way
+    robot.run(1, "armed")
+    del drives.command
+    robot.run(30, "fault")
+    assert robot.following() == [False] * JOINTS
 
 
 @on_can

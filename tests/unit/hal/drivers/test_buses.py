@@ -11,6 +11,7 @@ from snakesim_can_backend.odrive.protocol import State
 from snakesim_hal.drivers.mixed import MixedBackend, MixedSettings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Mode, Pace
+from tests.contract.drives import DrivesOfAnyFamily
 from tests.harness.wait import wait_until
 from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
@@ -18,17 +19,18 @@ from tests.unit.hal.rig import run_config
 AXES, SERVOS = [0, 1], [2, 3]  # joints
 HEAD = {"family": "odrive"}, {"joint_3": {"family": "dynamixel"}, "joint_4": {"family": "dynamixel"}}
 LONG_S = 1.0  # a watchdog that a busy computer does not reach
+SHORT_S = 0.2
 
 
 class Robot(DriveRig):
-    """ODrive axes, and two servos at the head."""
+    """Drives of one family, by default ODrive axes, and two servos at the head."""
 
-    def __init__(self, pace: Pace = "lockstep", **families: Any) -> None:
-        fixed = {name: {"bring_up_limit_s": 2.0} | families.get(name, {}) for name in ("odrive", "dynamixel")}
+    def __init__(self, pace: Pace = "lockstep", body: str = "odrive", **families: Any) -> None:
+        fixed = {name: {"bring_up_limit_s": 2.0} | families.get(name, {}) for name in (body, "dynamixel")}
         config = run_config(
             backend="mixed",
             robot__chain__modules=4,
-            robot__drive=HEAD[0],
+            robot__drive=HEAD[0] | {"family": body},
             robot__joints=HEAD[1],
             rate_hz=100,
             pace=pace,
@@ -50,6 +52,14 @@ class Robot(DriveRig):
 
     def servos_follow(self) -> set[bool]:
         return {servo.on for servo in self.servos._twin.servos}
+
+    def enabled(self) -> list[bool]:
+        """Of every drive, in truth."""
+        return DrivesOfAnyFamily(self.backend).enabled()
+
+    def freeze_driver(self, seconds: float) -> None:
+        """The driver's threads can do nothing for so long; its drives' time passes."""
+        DrivesOfAnyFamily(self.backend).freeze_driver(seconds, time.sleep)
 
 
 Opens = Callable[..., Robot]
@@ -186,6 +196,26 @@ def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(open
     )
     wait_until(lambda: robot.axes_follow() == robot.servos_follow() == {False}, "both", 10.0)
     assert not any(axis.errors for axis in robot.axes._twin.axes), "not by their watchdogs"
+
+
+@pytest.mark.parametrize("body", ["odrive", "moteus"])
+def test_drives_that_stop_while_the_driver_is_frozen_are_read_first_and_stay_off(opened: Opens, body: str) -> None:
+    """Without a look at them the bus would let its drives go, which clears what their watchdogs have latched."""
+    robot = opened("realtime", body, **{body: {"watchdog_s": SHORT_S}, "dynamixel": {"watchdog_s": SHORT_S}})
+    wait_until(lambda: (robot.run(1, "armed") and False) or all(robot.enabled()), "arms", 20.0)
+    robot.freeze_driver(3 * SHORT_S)
+    assert robot.enabled() == [False] * 4
+    robot.damps, named = True, set[str | None]()
+
+    def all_are_named() -> bool:
+        found = robot.run(1, "fault")
+        assert robot.enabled() == [False] * 4
+        named.update(fault.joint for fault in found if fault.what == "drive_fault" and "watchdog" in fault.cause)
+        return named == {f"joint_{i + 1}" for i in range(4)}
+
+    wait_until(all_are_named, "a fault of every drive", 10.0)
+    wait_until(lambda: (robot.run(1, "disarmed") and False) or not robot.backend._following, "cleared", 10.0)
+    wait_until(lambda: (robot.run(1, "armed") and False) or all(robot.enabled()), "arms again", 20.0)
 
 
 def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened: Opens) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scenario import Start
+from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
 from snakesim_operator.results.propulsion import propulsion_intervals
@@ -18,6 +19,8 @@ from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.verdict import Verdict, verdict
 from snakesim_operator.results.summary import summarise
+from snakesim_operator.run.conclusion import explain
+from snakesim_operator.run.ending import Ending
 from tests.unit.operator.results.recorded import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
 
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")
@@ -102,6 +105,20 @@ def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
     stop = Fault(tick=600, what="leak", cause="joint_4 reports water inside", joint="joint_4")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause)
     assert "Stopped by a fault" in page.text and "at joint_4: joint_4 reports water inside." in page.text
+
+
+@pytest.mark.parametrize("joint", [None, "joint_3"])
+def test_a_run_that_went_on_with_a_fault_that_stopped_nothing(record: RunRecord, joint: str | None) -> None:
+    """The host noted it before the first arming; the run was complete."""
+    noting = Authority(record.description)
+    noting.note(Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint))
+    host = msgspec.structs.replace(record.host, faults=noting.faults, ended="complete")
+    page = read(changed(record, host=host))
+    assert "Stopped by a fault" not in page.text and "went on without" not in page.text
+    assert "a fault (supply and heat are unknown, and ignored), 2 commands refused" in page.text
+    ending = Ending()
+    explain(ending, host, record.config)
+    assert ending.reason is None, "or `snakesim run` ends with exit code 1"
 
 
 def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:

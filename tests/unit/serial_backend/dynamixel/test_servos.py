@@ -52,7 +52,7 @@ def test_servos_stop_by_their_own_watchdog_when_the_driver_is_gone(robot: Robot)
     robot.twin()
     assert {servo.table[at.WATCHDOG] for servo in robot.twin.servos} == {at.TRIPPED}
     found = robot.run(NOTICED, "armed")
-    assert {fault.what for fault in found} == {"drive_not_armed"} and "watchdog" in found[0].cause
+    assert {fault.what for fault in found} == {"drive_fault"} and "watchdog" in found[0].cause
     robot.run(5, "fault")
     robot.mode, robot.target = Mode.POSITION, 0.1
     assert robot.run(10, "disarmed") == [] and robot.run(60, "armed") == []

@@ -1,0 +1,67 @@
+"""The emulated drives of a backend under test, for clauses about what drives do without their driver."""
+
+from contextlib import ExitStack
+from typing import Any
+
+from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
+from snakesim_can_backend.moteus.twin import MoteusTwin
+from snakesim_can_backend.odrive.protocol import State
+from snakesim_can_backend.odrive.twin import OdriveTwin
+from snakesim_can_backend.protocol.definitions import ModuleState
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
+from tests.unit.can_backend.loop import chain_of
+
+POLL_S = 0.02
+
+
+class DrivesOfAnyFamily:
+    """Drives of the driver kit, on one bus or on several: a `snakesim_hal.conformance.bench.EmulatedDrives`."""
+
+    def __init__(self, backend: Any) -> None:
+        self._backend, self._lines = backend, backend._drives.lines
+
+    def enabled(self) -> list[bool]:
+        found: dict[int, bool] = {}
+        for line in self._lines:
+            found |= dict(zip(line.bus.joints, enabled_drives(line.drives._twin), strict=True))
+        return [found[joint] for joint in range(len(found))]
+
+    def freeze_driver(self, seconds: float, sleep: Any) -> None:
+        with ExitStack() as held:
+            for line in self._lines:
+                if hasattr(line, "_has"):  # a bus in a thread: it can do nothing without this
+                    held.enter_context(line._has)
+            self._backend._clock.robot_ns += round(seconds * 1e9)
+            sleep(seconds)
+            for line in self._lines:
+                line.drives._twin()
+
+
+class DrivesOfModules:
+    """Joint modules on a virtual bus."""
+
+    def __init__(self, backend: Any) -> None:
+        self._chain = chain_of(backend)
+
+    def enabled(self) -> list[bool]:
+        driven = ModuleState.ARMED, ModuleState.STOPPING
+        return [slot.module.state in driven for slot in self._chain.slots]
+
+    def freeze_driver(self, seconds: float, sleep: Any) -> None:
+        sleep(seconds)
+        assert self._chain._sync_time is not None
+        self._chain._step_to(self._chain._sync_time + round(seconds * 1e6))
+
+
+def enabled_drives(twin: Any) -> list[bool]:
+    """Of the emulated drives of one family, those that would follow a set-point."""
+    match twin:
+        case OdriveTwin():
+            return [axis.state == State.CLOSED_LOOP for axis in twin.axes]
+        case MoteusTwin():
+            return [controller.mode == MoteusMode.POSITION for controller in twin.controllers]
+        case DynamixelTwin():
+            return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in twin.servos]
+        case _:
+            raise TypeError(f"drives of an unknown family: {twin}")

@@ -1,0 +1,111 @@
+"""Which drives may be driven after a stop of their own or a pause of the driver, and for how long they brake."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal.drivers.braking import Braking
+from snakesim_hal.drivers.drive_guard import DriveGuard
+from snakesim_hal.drivers.findings import Finding
+from snakesim_hal.wire.messages import Mode
+
+MS = 1_000_000
+GAP_NS, GRACE_NS = 50 * MS, 50 * MS
+BOTH = frozenset({0, 1})
+NONE = frozenset[int]()
+
+
+class Bench:
+    """A guard of two drives, and its clock."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self.guard = DriveGuard(lambda: self.now_ns, gap_ns=GAP_NS, grace_ns=GRACE_NS)
+
+    def armed(self) -> frozenset[int]:
+        return self.guard.drives_to_command(BOTH, may_enable=True)
+
+    def in_fault(self) -> frozenset[int]:
+        return self.guard.drives_to_command(BOTH, may_enable=False)
+
+    def finds(self, joint: int | None) -> None:
+        self.guard.note_findings([Finding("drive_fault", "it is too hot", joint)])
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_pause_of_the_driver_is_remembered_until_states_were_read(bench: Bench) -> None:
+    bench.now_ns = 10_000 * MS  # bring-up may take long
+    bench.guard.mark_active()
+    bench.now_ns += GAP_NS
+    bench.guard.mark_active()
+    assert not bench.guard.was_away
+    bench.now_ns += GAP_NS + 1
+    bench.guard.mark_active()
+    bench.guard.mark_active()
+    assert bench.guard.was_away
+    bench.guard.states_were_read()
+    assert not bench.guard.was_away
+
+
+def test_only_an_armed_robot_enables_drives_and_a_fault_goes_on_with_those_that_are_driven(bench: Bench) -> None:
+    assert bench.in_fault() == NONE
+    assert bench.armed() == BOTH and bench.in_fault() == BOTH
+    assert bench.guard.drives_to_command(frozenset({0}), may_enable=False) == {0}
+    assert bench.in_fault() == {0}, "the other one was let go"
+
+
+def test_a_driven_drive_with_a_finding_is_let_go_until_it_is_reset_alone(bench: Bench) -> None:
+    bench.armed()
+    bench.finds(None)
+    assert bench.armed() == BOTH, "a finding of the bus"
+    bench.finds(1)
+    assert bench.armed() == {0} and bench.in_fault() == {0}
+    bench.guard.reset(frozenset({0}))
+    assert bench.armed() == {0}, "another joint was reset"
+    bench.guard.reset(BOTH)
+    assert bench.armed() == BOTH
+
+
+def test_what_a_drive_still_reports_right_after_a_reset_costs_nothing(bench: Bench) -> None:
+    bench.armed()
+    bench.guard.reset(BOTH)
+    bench.now_ns += GRACE_NS
+    bench.finds(1)
+    assert bench.armed() == BOTH
+    bench.now_ns += 1
+    bench.finds(1)
+    assert bench.armed() == {0}
+
+
+def test_drives_that_the_bus_let_go_by_itself_stay_off_until_a_reset(bench: Bench) -> None:
+    assert not bench.guard.let_go(), "none was driven"
+    assert bench.armed() == BOTH and bench.guard.let_go()
+    assert bench.armed() == NONE and bench.in_fault() == NONE
+    bench.guard.reset(BOTH)
+    assert bench.armed() == BOTH
+
+
+VELOCITIES = np.array([0.3, -0.3, 0.04])
+EVERYBODY = frozenset({0, 1, 2})
+
+
+def test_a_joint_brakes_until_it_is_at_rest_and_for_its_watchdogs_time_at_most() -> None:
+    braking, modes = Braking([100 * MS, 200 * MS, 100 * MS], holds=False), [Mode.VELOCITY] * 3
+    for _ in range(2):  # a fault, and the next one
+        assert braking.joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
+        assert braking.joints(EVERYBODY, modes, VELOCITIES, 99 * MS) == {0, 1}
+        assert braking.joints(EVERYBODY, modes, VELOCITIES, 100 * MS) == {1}
+        assert braking.joints(EVERYBODY, modes, 10 * VELOCITIES, 100 * MS) == {1}, "none begins again"
+        assert braking.joints(EVERYBODY, modes, VELOCITIES, 200 * MS) == NONE
+        braking.reset()
+
+
+def test_what_holds_holds_without_an_end_and_what_is_passive_is_let_go() -> None:
+    braking = Braking([100 * MS] * 3, holds=True)
+    assert braking.joints(EVERYBODY, [Mode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
+    assert braking.joints(EVERYBODY, [Mode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
+    modes = [Mode.PASSIVE, Mode.POSITION, Mode.POSITION]
+    assert braking.joints(EVERYBODY, modes, VELOCITIES, 10_000 * MS) == {1, 2}
