@@ -62,7 +62,7 @@ class Child:
             f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n" + "\n".join(lines)
         )
         self._program.chmod(0o755)
-        self._patch.setattr(own_twins.sys, "executable", str(self._program))
+        self._patch.setattr(sys, "executable", str(self._program))
 
     def noted(self) -> dict[str, Any]:
         return json.loads(self._noted.read_text())
@@ -162,6 +162,6 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(child: Child, tmp_path
 def test_a_child_that_cannot_be_started_is_an_error_of_the_backend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(own_twins.sys, "executable", str(tmp_path / "no python"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "no python"))
     with pytest.raises(BackendError, match=r"the module twins cannot be started: .*No such file"):
         TwinProcess(RUN, ON_VCAN, None, stepped=True)
