@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
 def _serve(arguments: argparse.Namespace) -> int:
     loaded = _configuration(arguments)
     settings = _settings(arguments, loaded)
-    _check_channels(settings.channels, on_real_bus=arguments.on_real_bus)
+    _check_names(settings.channels, on_real_bus=arguments.on_real_bus)
     shares(loaded.config, settings)
     for text in settings.faults:
         parse(text, loaded.config.robot.chain.modules)
@@ -86,6 +86,7 @@ def _serve(arguments: argparse.Namespace) -> int:
         send_pose = None
         if arguments.pose != NO_POSE:
             send_pose = opened.enter_context(closing(PoseSender(arguments.pose)))
+        check_channels(settings.channels)
         wires: list[Wire] = []
         for channel in settings.channels:
             wires.append(opened.enter_context(closing(open_wire(channel, FROM_HOST, settings.bit_rate))))
@@ -121,14 +122,13 @@ def _settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings:
     )
 
 
-def _check_channels(channels: Sequence[str], *, on_real_bus: bool) -> None:
+def _check_names(channels: Sequence[str], *, on_real_bus: bool) -> None:
     for channel in channels:
         if not is_emulated(channel) and not on_real_bus:
             raise ConfigError(
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
                 "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus"
             )
-    check_channels(channels)
 
 
 class Loop:

@@ -58,7 +58,7 @@ class Child:
         self._program.write_text(
             f"#!{sys.executable}\n"
             "import json, os, pathlib, signal, sys, time\n"
-            "config = json.loads(pathlib.Path(sys.argv[3]).read_text())\n"
+            "config = json.loads(pathlib.Path(sys.argv[4]).read_text())\n"
             f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n" + "\n".join(lines)
         )
         self._program.chmod(0o755)
@@ -72,7 +72,7 @@ class Child:
         noted = self.noted()
         with pytest.raises(ProcessLookupError):
             os.kill(noted["pid"], 0)
-        assert not Path(noted["arguments"][2]).exists()
+        assert not Path(noted["arguments"][3]).exists()
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: py
     twins = TwinProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
     noted = child.noted()
     arguments = noted["arguments"]
-    assert arguments[:2] == ["-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
+    assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
     assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())

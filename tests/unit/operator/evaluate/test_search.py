@@ -34,20 +34,22 @@ FIRST = {
 def quick_runs() -> Iterator[None]:
     """Every run has a result at once: its propulsion, and something for its seed."""
 
-    @contextmanager
-    def no_workers(*_arguments: Any) -> Iterator[None]:
-        yield None
+    class InstantWorkers:
+        def size(self) -> int:
+            return 2
 
-    def solve(_client: None, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
-        for case in cases:
-            config = msgspec.json.decode(case.config)
-            value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
-            yield case, Outcome(numbers={"path_distance_m": value, "advance_m": value})
+        def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+            for case in cases:
+                config = msgspec.json.decode(case.config)
+                value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
+                yield case, Outcome(numbers={"path_distance_m": value, "advance_m": value})
+
+    @contextmanager
+    def instant_workers(*_arguments: Any) -> Iterator[InstantWorkers]:
+        yield InstantWorkers()
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(search, "workers", no_workers)
-        patched.setattr(search, "size", lambda _client: 2)
-        patched.setattr(search, "solve", solve)
+        patched.setattr(search, "workers", instant_workers)
         yield
 
 

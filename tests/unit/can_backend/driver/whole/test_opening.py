@@ -126,7 +126,7 @@ def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest
     with pytest.raises(ConfigError, match="channel 'nocan7'"):
         CanBackend.check(config(), CanSettings(channels=["nocan7"]))
     asked: list[str] = []
-    monkeypatch.setattr(backend_module, "check_channel", asked.append)
+    monkeypatch.setattr(backend_module, "check_channels", asked.extend)
     assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
     assert CanBackend.check(config(), CanSettings(channels=["vcan0"], twins="process")) == ("lockstep", "realtime")
     assert asked == ["can0", "can1", "vcan0"]

@@ -48,7 +48,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     real = CanSettings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
     end = InProcessTwins(TwinServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
-    monkeypatch.setattr(backend_module, "check_channel", lambda _channel: None)
+    monkeypatch.setattr(backend_module, "check_channels", lambda _channels: None)
     monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
     monkeypatch.setattr(modules, "TwinProcess", NoProcess)
     opened: list[CanBackend] = []
