@@ -86,6 +86,7 @@ def _serve(arguments: argparse.Namespace) -> int:
         send_pose = None
         if arguments.pose != NO_POSE:
             send_pose = opened.enter_context(closing(PoseSender(arguments.pose)))
+        check_channels(settings.channels)
         wires: list[Wire] = []
         for channel in settings.channels:
             wires.append(opened.enter_context(closing(open_wire(channel, FROM_HOST, settings.bit_rate))))
@@ -128,7 +129,6 @@ def _check_channels(channels: Sequence[str], *, on_real_bus: bool) -> None:
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
                 "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus"
             )
-    check_channels(channels)
 
 
 class Loop:
