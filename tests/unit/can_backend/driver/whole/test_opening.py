@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualPeer
-from snakesim_can_backend.driver import backend as backend_module
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.modules import answer_limit_s
@@ -126,7 +125,7 @@ def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest
     with pytest.raises(ConfigError, match="channel 'nocan7'"):
         CanBackend.check(config(), CanSettings(channels=["nocan7"]))
     asked: list[str] = []
-    monkeypatch.setattr(backend_module, "check_channels", asked.extend)
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", asked.append)
     assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
     assert CanBackend.check(config(), CanSettings(channels=["vcan0"], twins="process")) == ("lockstep", "realtime")
     assert asked == ["can0", "can1", "vcan0"]

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire
-from snakesim_can_backend.driver import backend as backend_module
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.commands import question
@@ -48,7 +47,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     real = CanSettings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
     end = InProcessTwins(TwinServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
-    monkeypatch.setattr(backend_module, "check_channels", lambda _channels: None)
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", lambda _channel: None)
     monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
     monkeypatch.setattr(modules, "TwinProcess", NoProcess)
     opened: list[CanBackend] = []
