@@ -1,8 +1,10 @@
-"""Joint check: moves one joint after another a little and back, from tail to head, while the others hold.
+"""Joint check: moves one joint after another a little to one side, back, to the other side and back, from tail to head.
 
-What the motors, the encoders and the IMUs say of it is judged afterwards, from the record: `snakesim joints check`.
+The other joints hold. The load of each gear reverses on the way, so that its backlash shows. What the motors, the
+encoders and the IMUs measure is judged afterwards, from the record: `snakesim joints check`.
 """
 
+from enum import Enum, auto
 from typing import Annotated
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
@@ -13,64 +15,114 @@ from snakesim_hal.wire.quantities import about, bounded
 MARGIN_RAD = 0.02  # left before a limit
 
 
+class _Phase(Enum):
+    """What the joint does whose motion it is."""
+
+    REST = auto()
+    OUT = auto()
+    BACK = auto()
+
+
 class JointCheck:
-    """Each joint towards the middle of its range, until its encoder says that it moved, and back."""
+    """Each joint away from its nearer limit until its encoder says that it moved, and back; then to the other side."""
 
     NEEDS = "joints"
 
     class Settings(FileStruct, frozen=True):
         """How far, how fast, and when to give up."""
 
-        move_rad: Annotated[float, bounded(0.01, 0.2, "rad"), about("how far each joint moves")] = 0.035
-        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("of a target")] = 0.15
+        move_rad: Annotated[float, bounded(0.01, 0.2, "rad"), about("how far each joint moves to either side")] = 0.06
+        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("of a target")] = 0.3
         give_up_rad: Annotated[
             float,
             bounded(0.02, 0.5, "rad"),
             about("a joint that has not moved when its target is so far away is left, and the next one follows"),
         ] = 0.15
-        rest_s: Annotated[float, bounded(0.02, 5.0, "s"), about("between two joints")] = 0.15
+        rest_s: Annotated[float, bounded(0.02, 5.0, "s"), about("before each of its two motions, and after")] = 0.15
 
     def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot, self._settings = robot, settings
+        self._robot = robot
+        self._settings = settings
         self._start_rad: list[float] = []
-        self._before_rad = 0.0  # of the joint whose turn it is: without current, it may not be where it was
-        self._joint = 0
-        self._offset_rad, self._out, self._rest_s = 0.0, True, settings.rest_s
+        self._joint = 0  # whose motion it is
+        self._sides: list[int] = []  # that it has still to move to: +1, -1
+        self._phase = _Phase.REST
+        self._rested_s = 0.0
+        self._offset_rad = 0.0  # of its target from its start
+        self._before_rad = 0.0  # its angle before the motion: without current, it may not be where it was
 
     def update(self, view: View) -> Action:
-        """The next target of the joint whose turn it is."""
+        """Return the next target of the joint whose motion it is; all others hold."""
         if not self._start_rad:
             self._start_rad = list(view.joints.angle_rad)
-        joints, target = self._robot.joints, list(self._start_rad)
-        if self._joint == len(joints):
-            return Action(positions(self._robot, target), Report(why="every joint was moved"))
-        name = joints[self._joint].name
-        if self._rest_s > 0:
-            self._rest_s -= view.period_s
-            self._before_rad = view.joints.angle_rad[self._joint]
-            return Action(positions(self._robot, target), Report(why=f"resting before {name}"))
-        target[self._joint] += self._away() * self._advance(view)
-        return Action(positions(self._robot, target), Report(why=f"moving {name}", reference_rad=target))
+            self._sides = self._sides_of(self._joint)
+        if self._joint == len(self._robot.joints):
+            return self._hold("every joint was moved")
+        name = self._robot.joints[self._joint].name
+        match self._phase:
+            case _Phase.REST:
+                self._rest(view)
+                return self._hold(f"resting beside the motion of {name}")
+            case _Phase.OUT:
+                self._move_out(view)
+            case _Phase.BACK:
+                self._move_back(view)
+        targets = list(self._start_rad)
+        if self._joint < len(targets) and self._sides:
+            targets[self._joint] += self._sides[0] * self._offset_rad
+        return Action(positions(self._robot, targets), Report(why=f"moving {name}", reference_rad=targets))
 
-    def _away(self) -> int:
-        """The direction that leads further from the nearer limit."""
-        joint = self._robot.joints[self._joint]
-        return 1 if 2 * self._start_rad[self._joint] <= joint.angle_min_rad + joint.angle_max_rad else -1
+    def _hold(self, why: str) -> Action:
+        return Action(positions(self._robot, self._start_rad), Report(why=why))
 
-    def _advance(self, view: View) -> float:
-        """The offset of the next tick; passes on to the next joint when it is back."""
-        settings, joint, start_rad = self._settings, self._robot.joints[self._joint], self._start_rad[self._joint]
-        room_rad = (
-            joint.angle_max_rad - start_rad if self._away() > 0 else start_rad - joint.angle_min_rad
-        ) - MARGIN_RAD
-        step_rad = settings.speed_rad_s * view.period_s
-        if self._out:
-            self._offset_rad += step_rad
-            moved = abs(view.joints.angle_rad[self._joint] - self._before_rad) >= settings.move_rad
-            self._out = not moved and self._offset_rad < min(settings.give_up_rad, room_rad - MARGIN_RAD)
-        else:
-            self._offset_rad -= step_rad
-            if self._offset_rad <= 0:
-                self._joint, self._offset_rad, self._out = self._joint + 1, 0.0, True
-                self._rest_s = settings.rest_s
-        return self._offset_rad
+    def _rest(self, view: View) -> None:
+        """Wait before a motion, and after the last one of a joint."""
+        self._rested_s += view.period_s
+        if self._rested_s < self._settings.rest_s:
+            return
+        self._rested_s = 0.0
+        if not self._sides:
+            self._begin_joint(self._joint + 1)
+            if self._joint == len(self._robot.joints):
+                return
+        self._before_rad = view.joints.angle_rad[self._joint]
+        self._phase = _Phase.OUT
+
+    def _begin_joint(self, joint: int) -> None:
+        self._joint = joint
+        if joint < len(self._robot.joints):
+            self._sides = self._sides_of(joint)
+
+    def _move_out(self, view: View) -> None:
+        """Move the target on until the joint has moved as far as it should, or cannot."""
+        settings = self._settings
+        self._offset_rad += settings.speed_rad_s * view.period_s
+        moved_rad = abs(view.joints.angle_rad[self._joint] - self._before_rad)
+        furthest_rad = min(settings.give_up_rad, self._room_rad(self._joint, self._sides[0]))
+        if moved_rad >= settings.move_rad:
+            self._phase = _Phase.BACK
+        elif self._offset_rad >= furthest_rad:
+            # A joint that does not follow is not asked a second time.
+            del self._sides[1:]
+            self._phase = _Phase.BACK
+
+    def _move_back(self, view: View) -> None:
+        self._offset_rad -= self._settings.speed_rad_s * view.period_s
+        if self._offset_rad <= 0:
+            self._offset_rad = 0.0
+            del self._sides[0]
+            self._phase = _Phase.REST
+
+    def _sides_of(self, joint: int) -> list[int]:
+        """Return the sides to which a joint moves: first away from the nearer limit, then towards it if it has room."""
+        limits = self._robot.joints[joint]
+        away = 1 if 2 * self._start_rad[joint] <= limits.angle_min_rad + limits.angle_max_rad else -1
+        has_room = self._room_rad(joint, -away) > self._settings.move_rad + MARGIN_RAD
+        return [away, -away] if has_room else [away]
+
+    def _room_rad(self, joint: int, side: int) -> float:
+        """Return how far a joint's target may go from its start to a side."""
+        limits = self._robot.joints[joint]
+        start_rad = self._start_rad[joint]
+        distance_rad = limits.angle_max_rad - start_rad if side > 0 else start_rad - limits.angle_min_rad
+        return distance_rad - MARGIN_RAD

@@ -12,6 +12,7 @@ import msgspec
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import (
+    Backlash,
     Drive,
     Friction,
     Gear,
@@ -40,6 +41,8 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     armature_kg_m2: RotorInertia | None = None
     response_time_s: Lag | None = None
     torque_constant_nm_per_a: TorqueConstant | None = None
+    # Whole play of its gear, between the encoder on the motor and the link. A robot file has none.
+    backlash_rad: Backlash | None = None
 
 
 def built(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:

@@ -15,6 +15,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
 from snakesim_hal.model.plugins import PLANTS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.backlash import BacklashPlant, without_rotors
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.plant import Plant
 from snakesim_hal.physics.thermal import Thermal
@@ -35,7 +36,13 @@ def make_plant(config: RunConfig, settings: Any, backend: str) -> Plant:
     factory: Any = find_plugin(PLANTS, settings.plant)
     source, where = f"plant {settings.plant!r}", f"backends.{backend}.plant_settings"
     own = plugin_settings(factory, settings.plant_settings, source, where)
-    return factory(as_built(config, settings.mounted), own)
+    truth = as_built(config, settings.mounted)
+    backlash_rad = {name: one.backlash_rad for name, one in settings.mounted.items() if one.backlash_rad}
+    if not backlash_rad:
+        return factory(truth, own)
+    joints = built(config.robot, settings.mounted)
+    plant = factory(without_rotors(truth, joints, backlash_rad), own)
+    return BacklashPlant(plant, joints, backlash_rad, config.seed)
 
 
 def serve_until_stopped(ready: str, twin: Callable[[], object], wait: Callable[[float], object]) -> None:

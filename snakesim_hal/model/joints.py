@@ -31,6 +31,7 @@ Text = Annotated[str, Meta(max_length=100)]
 Sign = Literal[1, -1]
 Zero = Annotated[float, bounded(-1e4, 1e4, "rad")]
 Gear = Annotated[float, above(1e4, "1")]
+Backlash = Annotated[float, from_zero(0.5, "rad")]
 
 
 class Limits(FileStruct, frozen=True, kw_only=True):

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import add_network
+from snakesim_hal.arguments import add_network, number
 from snakesim_operator.tools.robot_selection import selection_of
 
+ALLOWED_BACKLASH_RAD = 0.01  # 0.6 degrees; a sound gear and the noise of its gyros show half of it
 TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
 JOG = (
     "Move one joint slowly, while a key is held; the motors of the others stay off. It arms the robot, checked or not."
@@ -27,11 +28,26 @@ def add_commands(commands: Any) -> None:
     ):
         command = _by_hand(verbs, verb, _direction_or_limits, about)
         command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+    gear = _by_hand(
+        verbs, "gear", _gear, "turn joints by hand by a known angle: whether their gears are as the file says"
+    )
+    gear.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+    gear.add_argument(
+        "--degrees",
+        type=number(10.0, 180.0, "degrees"),
+        default=45.0,
+        help="by which you turn each joint, along a template or a set square (default: 45)",
+    )
     _add_jog(verbs)
+    _add_check(verbs)
+
+
+def _add_check(verbs: Any) -> None:
     judge = verbs.add_parser(
         "check",
-        help="judge a run of `snakesim run joint_check`: signs, gears, ids, zeros, dead joints",
-        epilog="Exit code: 0 every joint is as the file says, 1 one is not or could not be judged, 2 wrong input.",
+        help="judge a run of `snakesim run joint_check`: signs, gears, backlash, ids, zeros, dead joints",
+        epilog="Exit code: 0 sign, order, zero and gear of every joint were confirmed, 1 one is wrong or unknown, "
+        "2 wrong input.",
     )
     judge.add_argument("run", type=Path, help="folder of the run")
     judge.add_argument(
@@ -39,14 +55,26 @@ def add_commands(commands: Any) -> None:
         type=Path,
         nargs="?",
         metavar="FILE",
-        help="your robot file: write into it that it was checked, if it was",
+        help="your robot file: write into it that it was checked, if all of it was confirmed",
     )
     judge.add_argument(
         "--by-hand",
         action="store_true",
-        help="what it cannot judge you have turned with `joints direction`, and is right",
+        help="you turned the joints whose sign and order it cannot judge with `joints direction`, and they are right",
+    )
+    judge.add_argument(
+        "--gear-by-hand",
+        action="store_true",
+        help="you measured the gears that it cannot judge with `joints gear`, they are right, and have no backlash",
     )
     judge.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
+    judge.add_argument(
+        "--allow-backlash",
+        type=number(0.0, 0.5, "rad"),
+        default=ALLOWED_BACKLASH_RAD,
+        metavar="RAD",
+        help=f"as much may be lost in a gear when its load reverses (default: {ALLOWED_BACKLASH_RAD:g} rad)",
+    )
     judge.set_defaults(act=_check)
 
 
@@ -91,7 +119,19 @@ def _direction_or_limits(arguments: argparse.Namespace) -> int:
     return act(arguments.file, selection_of(arguments), arguments.joints)
 
 
-def _check(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.commissioning.check import check
+def _gear(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import gear
 
-    return check(arguments.run, arguments.file, straight=arguments.straight, by_hand=arguments.by_hand)
+    return gear(arguments.file, selection_of(arguments), arguments.joints, arguments.degrees)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.check import CheckRequest, check
+
+    request = CheckRequest(
+        straight=arguments.straight,
+        direction_by_hand=arguments.by_hand,
+        gear_by_hand=arguments.gear_by_hand,
+        allowed_backlash_rad=arguments.allow_backlash,
+    )
+    return check(arguments.run, arguments.file, request)

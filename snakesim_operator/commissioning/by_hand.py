@@ -1,8 +1,9 @@
-"""`snakesim joints zero|direction|limits`: how a person moves a robot, whose motors are off, tells what its file says.
+"""`snakesim joints zero|direction|gear|limits`: what a person finds out by moving a robot by hand.
 
 Nothing here commands a joint. The robot's host must run, and be disarmed all the time.
 """
 
+import math
 import select
 import sys
 import time
@@ -23,7 +24,8 @@ from snakesim_hal.network.session import Session, open_session
 from snakesim_hal.terminal import overwrite_lines, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Configuration, JointState, Status
-from snakesim_operator.commissioning.capture import NotStillError, Travel, turned, zeros
+from snakesim_operator.commissioning.capture import NotStillError, Travel, Turn, TurnWatch, zeros
+from snakesim_operator.commissioning.judge import NEAR
 from snakesim_operator.commissioning.robot_edit import change_joints, joints_on_drives, must_be_own
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
@@ -64,7 +66,15 @@ class Hand:
         self._status = status
 
     def angles_rad(self, until: Callable[[], bool]) -> Iterator[Floats]:
-        """Samples as they come. Raises RefusedError when the robot is armed, silent, or does not know an angle."""
+        """Yield joint angles as they come; raises as `samples`."""
+        for _, angle_rad in self.samples(until):
+            yield angle_rad
+
+    def samples(self, until: Callable[[], bool]) -> Iterator[tuple[float, Floats]]:
+        """Yield time in seconds by the robot's clock and joint angles, as they come.
+
+        Raises RefusedError when the robot is armed, silent, or does not know an angle.
+        """
         heard_s = time.monotonic()
         over = False
         while not over:
@@ -84,7 +94,7 @@ class Hand:
                         joint.name for joint, ok in zip(self.joints, state.valid, strict=True) if not ok
                     )
                     raise RefusedError(f"{unknown}: the angle is not known; see `snakesim status`")
-                yield np.array(state.angle_rad)
+                yield state.stamp_ns * 1e-9, np.array(state.angle_rad)
             time.sleep(0.01)
 
 
@@ -113,43 +123,100 @@ def zero(path: Path, where: RobotSelection, *, asks: bool) -> int:
 def direction(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
     """Ask for a turn of each joint, and set the sign of those that count it the other way round.
 
-    names: joints; none: all. Returns 1 when another joint turned than the one that was asked for.
+    names: joints; none: all. Returns 1 when a joint was skipped, or another one turned than the one that was asked for.
     """
     values: dict[str, dict[str, Any]] = {}
-    wrong: list[str] = []
+    unknown: list[str] = []
     with _hand(path, where, "joints direction") as hand:
         for joint in chosen(hand.joints, names, path):
-            before_rad, turn = next(hand.angles_rad(lambda: False)), None
-            say(f"{joint.name}: turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more; Enter skips it")
-            for angles_rad in hand.angles_rad(_entered):
-                if (turn := turned(before_rad, angles_rad)) is not None:
-                    break
+            asked = f"turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more, and hold it still"
+            turn = _turn_of(hand, joint, asked)
             if turn is None:
-                say("  left as it is")
-            elif hand.joints[turn.joint] is not joint:
-                wrong.append(joint.name)
-                other = hand.joints[turn.joint].name
-                say(f"  {other} reports the turn: look at the ids and the wiring of {joint.name} and {other}")
-            elif not turn.alone:
-                wrong.append(joint.name)
-                say("  other joints turned, too: hold them, and repeat this one")
+                unknown.append(joint.name)
             elif turn.by_rad > 0:
                 say(f"  {turn.by_rad:+.2f} rad: as the file says")
             else:
                 say(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
                 values[joint.name] = {"sign": -joint.drive.sign}
     _write(path, values, "turned by hand")
+    return _unknown(unknown, f"snakesim joints direction {path}")
+
+
+def gear(path: Path, where: RobotSelection, names: Sequence[str], degrees: float) -> int:
+    """Ask for a turn of each joint by an angle, and compare it with what its drive measures. Nothing is written.
+
+    names: joints; none: all. Returns 1 when a gear is not as the file says, or is unknown.
+    """
+    unknown: list[str] = []
+    wrong: list[str] = []
+    with _hand(path, where, "joints gear") as hand:
+        for joint in chosen(hand.joints, names, path):
+            asked = f"turn what is ahead of it {DIRECTIONS[joint.axis]} by {degrees:g} degrees, and hold it still"
+            turn = _turn_of(hand, joint, asked)
+            if turn is None:
+                unknown.append(joint.name)
+                continue
+            ratio = abs(turn.by_rad) / math.radians(degrees)
+            said = f"  {math.degrees(abs(turn.by_rad)):.0f} of {degrees:g} degrees"
+            if abs(ratio - 1) < NEAR:
+                say(f"{said}: as the file says")
+            else:
+                say(
+                    f"{said}: gear = {joint.drive.gear * ratio:.3g} or so; write what its data sheet says into the file"
+                )
+                wrong.append(joint.name)
     if wrong:
-        say(f"not settled: {', '.join(wrong)}")
-    return 1 if wrong else 0
+        say(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")
+    return max(_unknown(unknown, f"snakesim joints gear {path}"), 1 if wrong else 0)
+
+
+def _turn_of(hand: Hand, joint: Joint, asked: str) -> Turn | None:
+    """Ask for a turn of a joint, and wait until the robot rests after it.
+
+    Returns None, and says why, when the joint was skipped, or another one turned.
+    """
+    watch = TurnWatch()
+    asked_already = False
+    turn: Turn | None = None
+    for time_s, angle_rad in hand.samples(_entered):
+        turn = watch.take(time_s, angle_rad)
+        if turn is not None:
+            break
+        if watch.ready and not asked_already:
+            say(f"{joint.name}: {asked}; Enter skips it")
+            asked_already = True
+    if turn is None:
+        say("  skipped")
+        return None
+    turning = hand.joints[turn.joint]
+    if turning is not joint:
+        say(f"  {turning.name} reports the turn: look at the ids and the wiring of {joint.name} and {turning.name}")
+        return None
+    if not turn.alone:
+        say("  other joints turned, too: hold them, and repeat this one")
+        return None
+    return turn
+
+
+def _unknown(names: Sequence[str], command: str) -> int:
+    """Say which joints are still unknown, and how to find out. Returns the exit code."""
+    if not names:
+        return 0
+    say(f"still unknown: {', '.join(names)}; type `{command} {' '.join(names)}`")
+    return 1
 
 
 def limits(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
-    """Watch how far each joint is moved, until Enter, and write that as its limits. names: joints; none: all."""
+    """Watch how far each joint is moved, until Enter, and write that as its limits.
+
+    names: joints; none: all. Returns 1 when one of them was not moved from end to end.
+    """
     with _hand(path, where, "joints limits") as hand:
         watched = chosen(hand.joints, names, path)
         say("Move each joint by hand from end to end, slowly; then press Enter.")
-        travel, drawn, due_s = None, 0, 0.0
+        travel: Travel | None = None
+        drawn = 0
+        due_s = 0.0
         for angles_rad in hand.angles_rad(_entered):
             travel = travel or Travel(angles_rad)
             travel.take(angles_rad)
@@ -157,14 +224,19 @@ def limits(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
                 due_s = time.monotonic() + DRAWN_EVERY_S
                 drawn = overwrite_lines(_shown(hand.joints, travel, angles_rad), drawn)
     values: dict[str, dict[str, Any]] = {}
+    unknown: list[str] = []
     for i, joint in enumerate(hand.joints):
-        found = None if travel is None or joint not in watched else travel.limits(i)
-        if found is not None:
+        if joint not in watched:
+            continue
+        found = None if travel is None else travel.limits(i)
+        if found is None:
+            say(f"{joint.name:<10} was not moved from end to end: left as it is")
+            unknown.append(joint.name)
+        else:
             values[joint.name] = {"angle_min_rad": found[0], "angle_max_rad": found[1]}
             say(f"{joint.name:<10} {found[0]:+.3f} to {found[1]:+.3f} rad")
-        elif joint in watched:
-            say(f"{joint.name:<10} was not moved from end to end: left as it is")
-    return _write(path, values, "end to end by hand")
+    _write(path, values, "end to end by hand")
+    return _unknown(unknown, f"snakesim joints limits {path}")
 
 
 def _shown(joints: Sequence[Joint], travel: Travel, now_rad: Floats) -> list[str]:

@@ -14,6 +14,8 @@ from snakesim_hal.model.joints import Joint
 
 STILL_RAD = 0.01  # a joint that nobody touches moves less, noise included
 TURNED_RAD = 0.15  # about 9 degrees: meant, not a shake
+RESTS_RAD = 0.02  # a robot that rests, or that a hand holds still, moves less within `RESTS_S`: 0.04 rad/s
+RESTS_S = 0.5
 BESIDE = 0.5  # share of it that another joint may move along
 MARGIN_RAD = 0.02  # between the end that a hand found and the limit that is written
 LEAST_TRAVEL_RAD = 0.2
@@ -42,13 +44,66 @@ class Turn:
 
 
 def turned(before_rad: Floats, now_rad: Floats) -> Turn | None:
-    """The joint that turned most; None while none turned far enough."""
+    """Return the joint that turned most; None while none turned far enough."""
     by_rad = now_rad - before_rad
     most = int(np.argmax(np.abs(by_rad)))
     if abs(by_rad[most]) < TURNED_RAD:
         return None
     others = np.delete(np.abs(by_rad), most)
     return Turn(most, float(by_rad[most]), bool((others < BESIDE * abs(by_rad[most])).all()))
+
+
+class RestWatch:
+    """Whether all joints have moved less than `RESTS_RAD` for `RESTS_S`."""
+
+    def __init__(self) -> None:
+        self._since_s: float | None = None  # None: there was no sample yet
+        self._lowest_rad: Floats = np.zeros(0)  # since then
+        self._highest_rad: Floats = np.zeros(0)
+
+    def rests(self, time_s: float, angle_rad: Floats) -> bool:
+        """Take the next sample, and return whether the robot rests.
+
+        Args:
+            time_s: of the sample, by the robot's clock.
+            angle_rad: joint angles, (n_joints,).
+        """
+        if self._since_s is None:
+            self._begin(time_s, angle_rad)
+            return False
+        self._lowest_rad = np.minimum(self._lowest_rad, angle_rad)
+        self._highest_rad = np.maximum(self._highest_rad, angle_rad)
+        if np.max(self._highest_rad - self._lowest_rad) >= RESTS_RAD:
+            self._begin(time_s, angle_rad)
+            return False
+        return time_s - self._since_s >= RESTS_S
+
+    def _begin(self, time_s: float, angle_rad: Floats) -> None:
+        self._since_s = time_s
+        self._lowest_rad = angle_rad.copy()
+        self._highest_rad = angle_rad.copy()
+
+
+class TurnWatch:
+    """One turn by hand, from rest to rest: a turn that is not over yet is not attributed to any joint."""
+
+    def __init__(self) -> None:
+        self._watch = RestWatch()
+        self._before_rad: Floats | None = None  # at rest; None: the robot still moves
+
+    @property
+    def ready(self) -> bool:
+        """Whether the robot has come to rest, so that a joint may be turned."""
+        return self._before_rad is not None
+
+    def take(self, time_s: float, angle_rad: Floats) -> Turn | None:
+        """Take the next sample, and return the turn once the robot rests after it. Arguments as of `RestWatch`."""
+        if not self._watch.rests(time_s, angle_rad):
+            return None
+        if self._before_rad is None:
+            self._before_rad = angle_rad.copy()
+            return None
+        return turned(self._before_rad, angle_rad)
 
 
 class Travel:

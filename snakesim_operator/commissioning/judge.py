@@ -1,233 +1,251 @@
-"""Judges each joint of a joint check: whether the link ahead of it turns as its encoder says. Pure.
+"""Judges each joint of a joint check: whether it is mounted as the robot file says. Pure.
 
-While joint j moves, every link is asked how far it turned, as a share of joint j's own motion by its encoder: by its
-gyro, or by motion capture for the base, each at the instants of its own samples. The difference of the shares of the
-links on both sides of joint k is what turned up at joint k. On a robot that is as its file says, that is 1 at k = j,
-and elsewhere only what the encoder there saw, too, because held joints give way a little.
+Five properties of a joint are judged, each from its own evidence, and each is confirmed, wrong or unknown:
+
+    drive   it follows its targets, and measures no torque that brakes while it drives
+    order   the links on both sides of it turn, and not those of a joint whose module may be exchanged with its own
+    sign    they turn in the direction in which its encoder counts
+    gear    they turn as far as its encoder counts, and lose nothing when the load reverses
+    zero    its angle is what gravity says, or 0 on a robot that was laid straight
+
+What no evidence was found for is unknown, with a sentence on how it could be confirmed. It never counts as confirmed.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.model.checked import PROPERTIES, JointProperty
 from snakesim_hal.model.joints import Drive
+from snakesim_operator.commissioning.arguments import ALLOWED_BACKLASH_RAD
+from snakesim_operator.commissioning.link_shares import (
+    MOVES_RAD_S,
+    find_order,
+    link_shares,
+    swap_candidates,
+)
+from snakesim_operator.commissioning.lost_motion import LostMotion, find_lost_motion
+from snakesim_operator.commissioning.measured import Measured, Select
 
-LEAST_MOVED_RAD = 0.012  # a third of the default way
+AS_TOLD = "as the robot file says"
+LEAST_MOVED_RAD = 0.012  # a fifth of the default way to one side
 FOLLOWED = 0.3  # of its target's way, and of its target's time; a joint without current is moved by others, at times
-MOVES_RAD_S = 0.02  # slower samples tell nothing
-LEAST_SAMPLES = 8
 NEAR = 0.12  # of a share, to the expected one
-MISFIT = 0.1  # sum of squared shares that no IMU should have seen, from which two modules may have been swapped
-BETTER = 0.25  # of the misfit is left, if they were
-LEAST_TORQUE_NM = 0.1
+LEAST_TORQUE_NM = 0.1  # mean along the motion; a light link's inertia may be a tenth of it against the motion
 STRAIGHT_RAD = 0.08  # a robot that was laid straight by hand is straight within that
 LEVEL_RAD = 0.05  # gravity tells angles to that
 LEAST_GRAVITY_M_S2 = 5.0  # across the axis of a joint, to tell its angle
-UNKNOWN = "unknown: the links on both sides need an IMU or motion capture, at 30 Hz or more"
+State = Literal["confirmed", "wrong", "unknown"]
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A run of the joint check; rows are ticks."""
+class Finding:
+    """What was found of one property of a joint."""
 
-    names: Sequence[str]
-    axes: Sequence[str]  # "yaw" or "pitch"
-    drives: Sequence[Drive]  # as the robot file says
-    angle_rad: Floats  # (n, joints)
-    velocity_rad_s: Floats
-    torque_nm: Floats
-    target_rad: Floats
-    link_rate_rad_s: Floats  # (n, links, 3), in the link's frame; NaN where no IMU reported
-    link_force_m_s2: Floats  # (n, links, 3): specific force, in the link's frame; at rest 1 g upwards
-    base_turn_rad: Floats  # (n, 3): of link 0 from its first known pose, in its frame; NaN without motion capture
+    state: State
+    reason: str = ""  # what is wrong and what to write, or why it is unknown and how it could be confirmed
+    by_hand: bool = False  # confirmed by a person
+
+
+CONFIRMED = Finding("confirmed")
+NO_MOTION = "it did not move; correct its drive, and run the check again"
+NO_END = "its motion did not come: the run ended before; run the check again with a longer --duration"
+NO_LINK_TURNS = "no link turns with it; correct its gear, and run the check again"
+NO_LINK = "the links on both sides need an IMU or motion capture, at 30 Hz or more; or "
+BY_DIRECTION = NO_LINK + "turn it with `snakesim joints direction`, then add --by-hand"
+BY_GEAR = NO_LINK + "measure it with `snakesim joints gear`, then add --gear-by-hand"
+NOT_STRAIGHT = "lay the robot straight, run the check again, and add --straight"
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What is said of one joint."""
+    """What was found of one joint."""
 
     joint: str
-    verdict: str
-    as_told: bool = False
-    moved_rad: float | None = None  # by its encoder; None: it was not its turn
+    findings: Mapping[JointProperty, Finding]
+    moved_rad: float | None = None  # by its encoder; None: its motion did not come
     turned: float | None = None  # share of that which turned up at this joint, without its drive; None: unknown
+    torque_nm: float | None = None  # mean along the motion; None: not measured
+
+    def properties(self, state: State) -> list[JointProperty]:
+        """Return the properties that were found to be so."""
+        return [name for name in PROPERTIES if self.findings[name].state == state]
 
     @property
-    def unknown(self) -> bool:
-        """Whether nothing was found wrong, and nothing right."""
-        return self.verdict == UNKNOWN
+    def as_told(self) -> bool:
+        """Whether every property was confirmed."""
+        return len(self.properties("confirmed")) == len(PROPERTIES)
+
+    @property
+    def verdict(self) -> str:
+        """What is wrong; otherwise what is unknown; otherwise that it is as the file says."""
+        if wrong := self.properties("wrong"):
+            return "; ".join(self.findings[name].reason for name in wrong)
+        if unknown := self.properties("unknown"):
+            return f"unknown: {', '.join(unknown)}"
+        return AS_TOLD
+
+    def confirmed_by_hand(self, properties: Iterable[JointProperty]) -> "Judged":
+        """Return the same with those of its unknown properties confirmed by a person. What is wrong stays wrong."""
+        findings = dict(self.findings)
+        for name in properties:
+            if findings[name].state == "unknown":
+                findings[name] = Finding("confirmed", by_hand=True)
+        return replace(self, findings=findings)
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """What was measured while one joint moved, as shares of that joint's motion by its encoder; NaN: unknown."""
+def judged(
+    run: Measured, *, straight: bool = False, allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD
+) -> list[Judged]:
+    """Return what was found of every joint, tail to head.
 
-    links: Floats  # (links, joints): of each link, about the axis of each joint
-    seen: Floats  # (joints,): in each joint's encoder
-
-    def turned(self) -> Floats:
-        """(joints,): what turned up at each joint, from the links on both sides of it."""
-        return np.diagonal(self.links[1:]) - np.diagonal(self.links)
-
-    def with_modules(self, order: NDArray[np.intp]) -> "_Motion":
-        """The module of joint order[i] in joint i's place: its encoder, and its IMU, on the link ahead of the joint."""
-        return _Motion(self.links[[0, *(order + 1)]], self.seen[order])
-
-    def misfit(self) -> float:
-        """What the IMUs saw otherwise than the encoders."""
-        return float(np.nansum((self.turned() - self.seen) ** 2))
-
-
-def judged(run: Measured, *, straight: bool = False) -> list[Judged]:
-    """Every joint, tail to head. straight: the robot lay straight at the start, so all angles should have been zero."""
-    motions = [_motion(run, j) for j in range(len(run.names))]
-    order = _order(motions)
+    Args:
+        run: the measurements of a joint check.
+        straight: the robot lay straight at the start, so that all angles should have been zero.
+        allowed_backlash_rad: as much may be lost in a gear when its load reverses.
+    """
+    joints = range(len(run.names))
+    # A joint that brakes while it drives moves all the same, so that its links can be judged.
+    motions = [link_shares(run, joint) if _followed(run, joint) else None for joint in joints]
+    order = find_order(motions)
+    links = [0, *(order + 1)]
+    in_place = replace(
+        run, link_rate_rad_s=run.link_rate_rad_s[:, links], link_force_m_s2=run.link_force_m_s2[:, links]
+    )
     rows: list[Judged] = []
-    for j, (motion, k) in enumerate(zip(motions, order.tolist(), strict=True)):
-        if isinstance(motion, Judged):
-            rows.append(motion)
-        elif k != j:
-            said = f"moves the link of {run.names[k]}: their ids or cables are swapped"
-            rows.append(Judged(run.names[j], said, False, _moved_rad(run, j)))
+    for joint in joints:
+        motion = motions[joint]
+        torque_nm = _torque_along_motion(run, joint)
+        turned = float("nan")
+        findings: dict[JointProperty, Finding] = {"drive": _judge_drive(run, joint, torque_nm)}
+        if order[joint] != joint:
+            other = run.names[int(order[joint])]
+            findings["order"] = Finding("wrong", f"moves the link of {other}: their ids or cables are swapped")
+            after = f"judged once the ids of {run.names[joint]} and {other} are right; run the check again then"
+            findings |= dict.fromkeys(("sign", "gear", "zero"), Finding("unknown", after))
+        elif motion is None:
+            why = NO_MOTION if run.moved_by_target(joint).any() else NO_END
+            findings |= dict.fromkeys(("order", "sign", "gear"), Finding("unknown", why))
+            findings["zero"] = _judge_zero(in_place, joint, straight=straight)
         else:
-            rows.append(_judge(run, j, motion.with_modules(order), straight=straight))
+            turned = float(motion.with_modules(order).turned()[joint])
+            candidates = [run.names[other] for other in swap_candidates(motions, order, joint)]
+            lost = find_lost_motion(in_place, joint)
+            findings["order"] = _judge_order(turned, candidates)
+            findings["sign"] = _judge_sign(turned, run.drives[joint])
+            findings["gear"] = _judge_gear(turned, lost, run.drives[joint], allowed_backlash_rad)
+            findings["zero"] = _judge_zero(in_place, joint, straight=straight)
+        rows.append(
+            Judged(
+                joint=run.names[joint],
+                findings=findings,
+                moved_rad=run.moved_rad(joint) if run.moved_by_target(joint).any() else None,
+                turned=None if np.isnan(turned) else turned,
+                torque_nm=torque_nm,
+            )
+        )
     return rows
 
 
-def _judge(run: Measured, j: int, motion: _Motion, *, straight: bool) -> Judged:
-    turned = float(motion.turned()[j])
-    verdict = _verdict(turned, run.drives[j])
-    if not verdict:
-        verdict = _zero(run, j, straight=straight)
-    known = None if np.isnan(turned) else turned
-    return Judged(run.names[j], verdict or "as the robot file says", not verdict, _moved_rad(run, j), known)
+def _followed(run: Measured, joint: int) -> bool:
+    """Return whether a joint's encoder followed its target."""
+    moved = run.moved_by_target(joint)
+    if not moved.any():
+        return False
+    way_rad = float(np.ptp(run.target_rad[moved, joint]))
+    moves = np.abs(run.velocity_rad_s[moved, joint]) > MOVES_RAD_S
+    return run.moved_rad(joint) >= max(LEAST_MOVED_RAD, FOLLOWED * way_rad) and bool(np.mean(moves) >= FOLLOWED)
 
 
-def _motion(run: Measured, j: int) -> _Motion | Judged:
-    """What links and encoders did while joint j moved, or why that says nothing."""
-    name, turn, speed = run.names[j], _turn_of(run, j), run.velocity_rad_s[:, j]
-    if not turn.any():
-        return Judged(name, "its turn did not come: the run ended before")
-    moved_rad, moves = _moved_rad(run, j), turn & (np.abs(speed) > MOVES_RAD_S)
-    way_rad = float(np.ptp(run.target_rad[turn, j]))
-    if moved_rad < max(LEAST_MOVED_RAD, FOLLOWED * way_rad) or np.mean(moves[turn]) < FOLLOWED:
-        return Judged(name, "did not move: motor, brake, power, or a link that is held", moved_rad=moved_rad)
-    if float(np.mean(run.torque_nm[moves, j] * np.sign(speed[moves]))) < -LEAST_TORQUE_NM:
-        return Judged(name, "its torque has the wrong sign: it measures a brake while it drives", moved_rad=moved_rad)
-    seen = np.array([_share(rate, speed, moves) for rate in run.velocity_rad_s.T])
-    return _Motion(_link_shares(run, j, turn, moves), seen)
+def _torque_along_motion(run: Measured, joint: int) -> float | None:
+    """Return the mean of a joint's torque, positive where it drives; None where it is not measured."""
+    moves = run.moved_by_target(joint) & (np.abs(run.velocity_rad_s[:, joint]) > MOVES_RAD_S)
+    if "torque" not in run.drives[joint].measures or not moves.any():
+        return None
+    return float(np.mean(run.torque_nm[moves, joint] * np.sign(run.velocity_rad_s[moves, joint])))
 
 
-def _moved_rad(run: Measured, j: int) -> float:
-    return float(np.ptp(run.angle_rad[_turn_of(run, j), j]))
+def _judge_drive(run: Measured, joint: int, torque_nm: float | None) -> Finding:
+    if not run.moved_by_target(joint).any():
+        return Finding("unknown", NO_END)
+    if not _followed(run, joint):
+        return Finding("wrong", "did not move: motor, brake, power, or a link that is held")
+    if torque_nm is not None and torque_nm < -LEAST_TORQUE_NM:
+        return Finding("wrong", "its torque has the wrong sign: it measures a brake while it drives")
+    return CONFIRMED
 
 
-def _turn_of(run: Measured, j: int) -> NDArray[np.bool_]:
-    return np.abs(run.target_rad[:, j] - np.median(run.target_rad[:, j])) > 1e-6
-
-
-def _link_shares(run: Measured, j: int, turn: NDArray[np.bool_], moves: NDArray[np.bool_]) -> Floats:
-    """(links, joints): how much of joint j's motion each link made about the axis of each joint; NaN: unknown.
-
-    A joint's axis is the same in both of its links' frames, so that their shares about it may be subtracted.
-    """
-    component = [2 if axis == "yaw" else 1 for axis in run.axes]
-    speed, angle = run.velocity_rad_s[:, j], run.angle_rad[:, j]
-    by_axis = {at: [_share(rate, speed, moves) for rate in run.link_rate_rad_s[:, :, at].T] for at in set(component)}
-    shares = np.array([by_axis[at] for at in component]).T
-    if np.isnan(shares[0]).all():
-        shares[0] = [
-            _share(_about_mean(run.base_turn_rad[:, at], turn), _about_mean(angle, turn), turn) for at in component
-        ]
-    return shares
-
-
-def _about_mean(signal: Floats, where: NDArray[np.bool_]) -> Floats:
-    return signal - np.mean(signal[where])
-
-
-def _share(rate: Floats, speed: Floats, moves: NDArray[np.bool_]) -> float:
-    """Least squares: how much of `speed` is in `rate`; NaN when too little was measured."""
-    known = moves & ~np.isnan(rate)
-    if known.sum() < LEAST_SAMPLES:
-        return float("nan")
-    return float(rate[known] @ speed[known] / (speed[known] @ speed[known]))
-
-
-def _order(motions: Sequence[_Motion | Judged]) -> NDArray[np.intp]:
-    """Whose module stands in the place of each joint's: swaps of two, as long as one makes the motions of both fit.
-
-    Motions are asked together: one alone may tell little, when the floor lets few links turn.
-    """
-    order = np.arange(len(motions))
-    pairs = [(j, k) for j in range(len(motions)) for k in range(j + 1, len(motions))]
-    while pairs:
-        fits = [_misfit(motions, _with_swap(order, *pair)) for pair in pairs]
-        best = pairs[int(np.argmin(fits))]
-        swapped, own = _with_swap(order, *best), [motions[j] for j in best]
-        before = _misfit(own, order)
-        if before < MISFIT or _misfit(own, swapped) > BETTER * before:
-            break
-        order = swapped
-        pairs = [pair for pair in pairs if not {*pair} & {*best}]
-    return order
-
-
-def _misfit(motions: Sequence[_Motion | Judged], order: NDArray[np.intp]) -> float:
-    return sum(motion.with_modules(order).misfit() for motion in motions if isinstance(motion, _Motion))
-
-
-def _with_swap(order: NDArray[np.intp], j: int, k: int) -> NDArray[np.intp]:
-    swapped = order.copy()
-    swapped[[j, k]] = order[[k, j]]
-    return swapped
-
-
-def _verdict(turned: float, drive: Drive) -> str:
-    """What is wrong with its sign or gear; empty: nothing."""
-    if np.isnan(turned):
-        return UNKNOWN
-    if abs(turned - 1) < NEAR:
-        return ""
+def _judge_order(turned: float, candidates: Sequence[str]) -> Finding:
+    """Judge whether a joint's module is in its place. candidates: joints whose modules may be there instead."""
     if abs(turned) < NEAR:
-        return "its drive turns and no link does: coupling, or a gear that slips"
-    way = "the other way" if turned < 0 else ""
-    far = "" if abs(abs(turned) - 1) < NEAR else f"{abs(turned):.2f} as far as its drive says"
-    sign = f"sign = {-drive.sign}" if way else ""
-    gear = f"gear = {drive.gear / abs(turned):.3g}" if far else ""
-    return f"turns {', '.join(filter(None, (way, far)))}: {', '.join(filter(None, (sign, gear)))}"
+        return Finding("unknown", NO_LINK_TURNS)
+    if candidates:
+        return Finding("unknown", f"its module may be exchanged with that of {', '.join(candidates)}: {BY_DIRECTION}")
+    return CONFIRMED
 
 
-def _zero(run: Measured, j: int, *, straight: bool) -> str:
-    """What is wrong with its zero; empty: nothing, or nothing that could be told."""
-    at_rest = ~np.logical_or.reduce([_turn_of(run, k) for k in range(len(run.names))])
-    drive, measured_rad = run.drives[j], float(np.mean(run.angle_rad[at_rest, j]))
-    expected_rad = _by_gravity(run, j, at_rest) if run.axes[j] == "pitch" else None
+def _judge_sign(turned: float, drive: Drive) -> Finding:
+    if np.isnan(turned):
+        return Finding("unknown", BY_DIRECTION)
+    if abs(turned) < NEAR:
+        return Finding("unknown", NO_LINK_TURNS)
+    if turned < 0:
+        return Finding("wrong", f"turns the other way: sign = {-drive.sign}")
+    return CONFIRMED
+
+
+def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_backlash_rad: float) -> Finding:
+    if np.isnan(turned):
+        return Finding("unknown", BY_GEAR)
+    if abs(turned) < NEAR:
+        return Finding("wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash")
+    ratio = abs(turned)
+    reasons: list[str] = []
+    if lost is not None and lost.lost_rad > max(allowed_backlash_rad, lost.noise_rad):
+        ratio = abs(lost.ratio)
+        found = f"{lost.lost_rad:.3f} rad ({np.rad2deg(lost.lost_rad):.1f} degrees)"
+        reasons.append(
+            f"backlash of {found}: its drive turns that much further than its link when the load reverses, "
+            f"{allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash"
+        )
+    if abs(ratio - 1) >= NEAR:
+        backlash = ", or backlash, as it moved to one side only or its gyros are noisy" if lost is None else ""
+        reasons.append(f"turns {ratio:.2f} as far as its drive says: gear = {drive.gear / ratio:.3g}{backlash}")
+    return Finding("wrong", "; ".join(reasons)) if reasons else CONFIRMED
+
+
+def _judge_zero(run: Measured, joint: int, *, straight: bool) -> Finding:
+    """Judge a joint's zero by gravity if that tells its angle, otherwise by the pose in which the robot was laid."""
+    at_rest = run.at_rest()
+    drive = run.drives[joint]
+    measured_rad = float(np.mean(run.angle_rad[at_rest, joint]))
+    expected_rad = _angle_by_gravity(run, joint, at_rest) if run.axes[joint] == "pitch" else None
     allowed_rad = LEVEL_RAD
     if expected_rad is None:
         if not straight:
-            return ""
-        expected_rad, allowed_rad = 0.0, STRAIGHT_RAD
+            return Finding("unknown", NOT_STRAIGHT)
+        expected_rad = 0.0
+        allowed_rad = STRAIGHT_RAD
     off_rad = measured_rad - expected_rad
     if abs(off_rad) <= allowed_rad:
-        return ""
-    return f"its zero is off by {off_rad:+.3f} rad: zero_rad = {drive.zero_rad + drive.sign * drive.gear * off_rad:.3f}"
+        return CONFIRMED
+    zero_rad = drive.zero_rad + drive.sign * drive.gear * off_rad
+    return Finding("wrong", f"its zero is off by {off_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
 
 
-def _by_gravity(run: Measured, j: int, at_rest: NDArray[np.bool_]) -> float | None:
-    """A pitch joint's angle from the direction of gravity in both of its links; None where that is not known."""
+def _angle_by_gravity(run: Measured, joint: int, at_rest: Select) -> float | None:
+    """Return a pitch joint's angle from the direction of gravity in both of its links; None where that is not known."""
     tilts: list[float] = []
-    for link in (j, j + 1):
-        x, _, z = _mean(run.link_force_m_s2[at_rest, link])
-        if not np.hypot(x, z) > LEAST_GRAVITY_M_S2:
+    for link in (joint, joint + 1):
+        forces = run.link_force_m_s2[at_rest, link]
+        known = forces[~np.isnan(forces[:, 0])]
+        if not len(known):
+            return None
+        x, _, z = np.mean(known, axis=0)
+        if np.hypot(x, z) <= LEAST_GRAVITY_M_S2:
             return None
         tilts.append(float(np.arctan2(x, z)))
-    return float(np.arctan2(np.sin(tilts[0] - tilts[1]), np.cos(tilts[0] - tilts[1])))
-
-
-def _mean(rows: Floats) -> Floats:
-    known = rows[~np.isnan(rows[:, 0])]
-    return np.mean(known, axis=0) if len(known) else np.full(3, np.nan)
+    difference_rad = tilts[0] - tilts[1]
+    return float(np.arctan2(np.sin(difference_rad), np.cos(difference_rad)))

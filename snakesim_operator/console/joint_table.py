@@ -36,7 +36,8 @@ def _checked(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     checked = config.robot.checked
     if checked is None:
         return "<div>not checked yet: this run is the start check</div>"
-    by_hand = f"; by hand: {', '.join(checked.by_hand)}" if checked.by_hand else ""
+    parts = [f"{name} of {', '.join(joints)}" for name, joints in checked.by_hand.items()]
+    by_hand = f"; by hand: {'; '.join(parts)}" if parts else ""
     on = f"{checked.backend} {checked.hardware}".strip()
     return f"<div>{plain(f'checked by {checked.by} on {checked.on}, on {on}{by_hand}')}</div>"
 

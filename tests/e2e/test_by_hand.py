@@ -1,4 +1,4 @@
-"""`snakesim joints zero|direction|limits`, on a host whose drives somebody turns by hand."""
+"""`snakesim joints zero|direction|gear|limits`, on a host whose drives somebody turns by hand."""
 
 import json
 import subprocess
@@ -120,6 +120,10 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
                 seen(home, endpoint, angle_rad + ZERO_RAD[0])
             assert "1 joints changed" in enter(process)
         assert "joint_2 reports the turn" in swapped(home, endpoint)
+        with told(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
+            assert line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
+            hold(home, [1.2, 0.4, np.pi / 4, 0.0])
+            assert "45 of 45 degrees: as the file says" in line(process) and process.wait(20) == 0
         hold(home, [0.0] * JOINTS)
         seen(home, endpoint, ZERO_RAD[0])
         assert snakesim("joints", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0

@@ -5,12 +5,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.checked import Checked, mounting_digest, why_unchecked
+from snakesim_hal.model.checked import PROPERTIES, Checked, mounting_digest, why_unchecked
 from snakesim_hal.wire.messages import Description
 from tests.unit.hal.rig import description, robot_file
 
 JOINTS = robot_file().joint_table
-CHECKED = Checked(by="anna", on="2026-11-24", joints=mounting_digest(JOINTS), backend="can", hardware="can0")
+CHECKED = Checked(
+    by="anna",
+    on="2026-11-24",
+    joints=mounting_digest(JOINTS),
+    backend="can",
+    hardware="can0",
+    confirmed=list(PROPERTIES),
+)
 
 
 def robot(serials: str = "", **fields: Any) -> Description:
@@ -29,6 +36,7 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
         (None, robot(emulated=True), ""),
         (None, robot(), "nobody has checked"),
         (CHECKED, robot(), ""),
+        (msgspec.structs.replace(CHECKED, confirmed=["drive", "order", "sign"]), robot(), "of every joint: gear, zero"),
         (CHECKED, robot(hardware="can1"), "it is on can can1 now, can can0 since anna checked it on 2026-11-24"),
         (CHECKED, robot(",".join(SERIALS)), "joint_1 has drive S0, and had unknown"),
         (msgspec.structs.replace(CHECKED, serials=SERIALS), robot(",".join(SERIALS), hardware="can1"), ""),

@@ -1,4 +1,4 @@
-"""What the start check says of measurements that emulated modules cannot give."""
+"""What the start check finds in measurements that are known in closed form."""
 
 from dataclasses import replace
 
@@ -6,75 +6,161 @@ import numpy as np
 import pytest
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import Drive
-from snakesim_operator.commissioning.judge import Measured, judged
+from snakesim_operator.commissioning.check import report_lines
+from snakesim_operator.commissioning.judge import AS_TOLD, Judged, judged
+from snakesim_operator.commissioning.measured import Measured
 
-TICKS, WAY = 200, 0.04
-AS_TOLD = "as the robot file says"
+PERIOD_S = 0.01
+WAY_RAD = 0.06
+REST, LEG = 20, 40  # ticks
+MOTION = 2 * (LEG + REST)
+JOINTS = 3  # yaw, pitch, yaw
+TICKS = REST + JOINTS * MOTION
+SWING = np.concatenate((WAY_RAD * np.sin(np.linspace(0, np.pi, LEG)), np.zeros(REST)))
+TO_AND_FRO = np.concatenate((SWING, -SWING))
 
 
-def two_joints(pitched_rad: float = 0.0) -> Measured:
-    """A yaw joint and a pitch joint that move one after the other, 100 ticks each; the tail link stays where it is."""
-    angle = np.zeros((TICKS, 2))
-    stroke = WAY * np.sin(np.linspace(0, np.pi, 60))
-    angle[20:80, 0], angle[120:180, 1] = stroke, stroke
-    speed: Floats = np.diff(angle, axis=0, append=0.0) / 0.01
-    rates = np.zeros((TICKS, 3, 3))
-    rates[:, 1:, 2] = speed[:, :1]
-    rates[:, 2, 1] = speed[:, 1]
-    force = np.zeros((TICKS, 3, 3))
+def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: float = 0.0) -> Measured:
+    """Joints that move one after the other to both sides, on IMUs at every tick; the tail link stays where it is.
+
+    backlash_rad, gear: of joint_1, in truth; pitched_rad: of joint_2 in truth, while its encoder says 0.
+    """
+    angle = np.zeros((TICKS, JOINTS))
+    for joint in range(JOINTS):
+        begin = REST + joint * MOTION
+        angle[begin : begin + MOTION, joint] = TO_AND_FRO
+    by_links = angle.copy()
+    by_links[:, 0] = behind_backlash(angle[:, 0], backlash_rad) / gear
+    rate: Floats = np.diff(by_links, axis=0, append=0.0) / PERIOD_S
+    link_rates = np.zeros((TICKS, JOINTS + 1, 3))
+    link_rates[:, 1:, 2] += rate[:, :1]
+    link_rates[:, 2:, 1] += rate[:, 1:2]
+    link_rates[:, 3:, 2] += rate[:, 2:3]
+    force = np.zeros((TICKS, JOINTS + 1, 3))
     force[:, :, 2] = 9.81
-    force[:, 2] = 9.81 * np.array((-np.sin(pitched_rad), 0.0, np.cos(pitched_rad)))
+    force[:, 2:] = 9.81 * np.array((-np.sin(pitched_rad), 0.0, np.cos(pitched_rad)))
+    velocity: Floats = np.diff(angle, axis=0, append=0.0) / PERIOD_S
     return Measured(
-        names=["joint_1", "joint_2"],
-        axes=["yaw", "pitch"],
-        drives=[Drive(), Drive(sign=-1, zero_rad=0.3)],
+        period_s=PERIOD_S,
+        names=["joint_1", "joint_2", "joint_3"],
+        axes=["yaw", "pitch", "yaw"],
+        drives=[Drive(), Drive(sign=-1, zero_rad=0.3), Drive()],
         angle_rad=angle,
-        velocity_rad_s=speed,
-        torque_nm=0.5 * np.sign(speed),
+        velocity_rad_s=velocity,
+        torque_nm=0.5 * np.sign(velocity),
         target_rad=angle,
-        link_rate_rad_s=rates,
+        link_rate_rad_s=link_rates,
         link_force_m_s2=force,
         base_turn_rad=np.full((TICKS, 3), np.nan),
     )
 
 
+def behind_backlash(drive_rad: Floats, backlash_rad: float) -> Floats:
+    """The link that a drive moves once it has crossed the backlash."""
+    link_rad = np.zeros_like(drive_rad)
+    now_rad = 0.0
+    for tick, angle_rad in enumerate(drive_rad):
+        now_rad = min(max(now_rad, angle_rad - backlash_rad / 2), angle_rad + backlash_rad / 2)
+        link_rad[tick] = now_rad
+    return link_rad
+
+
 def verdicts(run: Measured) -> list[str]:
-    return [row.verdict for row in judged(run)]
+    return [row.verdict for row in judged(run, straight=True)]
+
+
+def states(row: Judged) -> dict[str, str]:
+    return {name: row.findings[name].state for name in PROPERTIES if row.findings[name].state != "confirmed"}
+
+
+def without_imus(run: Measured, *links: int) -> Measured:
+    rates = run.link_rate_rad_s.copy()
+    forces = run.link_force_m_s2.copy()
+    rates[:, links] = np.nan
+    forces[:, links] = np.nan
+    return replace(run, link_rate_rad_s=rates, link_force_m_s2=forces)
 
 
 def test_a_sound_robot_is_as_its_file_says() -> None:
-    assert verdicts(two_joints()) == [AS_TOLD, AS_TOLD]
+    assert verdicts(measurements()) == [AS_TOLD] * JOINTS
+
+
+def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_wrong() -> None:
+    run = without_imus(measurements(), *range(JOINTS + 1))
+    run = replace(run, angle_rad=run.angle_rad + np.array((0.15, 0.0, 0.0)))
+    rows = [row.confirmed_by_hand(["order", "sign"]) for row in judged(run, straight=True)]
+    assert states(rows[0]) == {"gear": "unknown", "zero": "wrong"}
+    assert rows[0].verdict == "its zero is off by +0.150 rad: zero_rad = 0.150"
+    assert states(rows[1]) == {"gear": "unknown"} and not rows[1].as_told
+    lines = report_lines(rows)
+    assert "0 of 3 joints are as the robot file says; 1 wrong; 2 unknown" in lines[JOINTS]
+    assert lines[JOINTS + 1].startswith("unknown: gear of every joint: ")
+    assert "`snakesim joints gear`" in lines[JOINTS + 1]
+
+
+def test_zeros_are_unknown_until_the_robot_lies_straight_or_gravity_tells_them() -> None:
+    first, second, third = judged(measurements())
+    assert states(first) == states(third) == {"zero": "unknown"} and "--straight" in first.findings["zero"].reason
+    assert second.as_told  # a pitch joint
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
+    run = measurements(backlash_rad=0.035)
+    rows = judged(run, straight=True, allowed_backlash_rad=0.04 if allowed else 0.01)
+    assert [row.as_told for row in rows[1:]] == [True, True]
+    verdict = rows[0].verdict
+    if allowed:
+        assert "backlash" not in verdict
+    else:
+        assert verdict.startswith("backlash of 0.03") and "gear =" not in verdict and "--allow-backlash" in verdict
+
+
+def test_a_gear_of_another_ratio_is_no_backlash() -> None:
+    assert verdicts(measurements(gear=1.5)) == ["turns 0.67 as far as its drive says: gear = 1.5", AS_TOLD, AS_TOLD]
 
 
 def test_gravity_tells_the_zero_of_a_pitch_joint_that_is_not_straight() -> None:
-    run = two_joints(pitched_rad=0.2)  # the encoder says 0
-    first, second = verdicts(run)
-    assert first == AS_TOLD
-    assert second == "its zero is off by -0.200 rad: zero_rad = 0.500"
-    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2)))) == [AS_TOLD, AS_TOLD]
+    run = measurements(pitched_rad=0.2)  # the encoder says 0
+    assert verdicts(run) == [AS_TOLD, "its zero is off by -0.200 rad: zero_rad = 0.500", AS_TOLD]
+    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [AS_TOLD] * JOINTS
 
 
 def test_a_torque_against_the_motion_that_it_drives_has_the_wrong_sign() -> None:
-    run = two_joints()
-    wrong = replace(run, torque_nm=run.torque_nm * np.array((-1.0, 1.0)))
+    run = measurements()
+    wrong = replace(run, torque_nm=run.torque_nm * np.array((-1.0, 1.0, 1.0)))
     assert verdicts(wrong)[0].startswith("its torque has the wrong sign")
-    assert verdicts(wrong)[1] == AS_TOLD
+    assert verdicts(wrong)[1:] == [AS_TOLD, AS_TOLD]
 
 
 @pytest.mark.parametrize("link", [0, 1])
 def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
-    run = two_joints()
-    run.link_rate_rad_s[:, link] = np.nan
-    rows = judged(run)
-    assert rows[0].turned is None and not rows[0].as_told and rows[0].verdict.startswith("unknown")
+    row = judged(without_imus(measurements(), link), straight=True)[0]
+    assert row.turned is None and not row.as_told
+    assert states(row) == {"sign": "unknown", "gear": "unknown"}
+
+
+def test_two_imus_do_not_tell_a_joint_from_others_that_would_turn_the_same_links() -> None:
+    run = replace(measurements(), axes=["yaw", "yaw", "yaw"])
+    row = judged(without_imus(run, 2, 3), straight=True)[0]
+    assert states(row) == {"order": "unknown"} and "joint_2, joint_3" in row.findings["order"].reason
+
+
+def test_a_joint_whose_motion_did_not_come_or_that_did_not_move_is_not_confirmed() -> None:
+    run = measurements()
+    ended = replace(run, target_rad=run.target_rad * np.array((1.0, 1.0, 0.0)))
+    unmoved = judged(ended, straight=True)[2]
+    assert states(unmoved) == dict.fromkeys(("drive", "order", "sign", "gear"), "unknown")
+    dead = judged(replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), straight=True)[0]
+    assert dead.verdict.startswith("did not move") and not dead.confirmed_by_hand(["order", "sign", "gear"]).as_told
 
 
 def test_motion_capture_of_the_base_stands_for_its_imu() -> None:
-    run = two_joints()
-    run.link_rate_rad_s[:, 0] = np.nan
-    run.link_rate_rad_s[:, 1:, 2] = 0.0  # the tail link turned, and the body stayed
+    run = without_imus(measurements(), 0)
+    run.link_rate_rad_s[:, 1:, 2] -= run.velocity_rad_s[:, :1]  # the tail link turned, and the body stayed
     turn = np.zeros((TICKS, 3))
     turn[:, 2] = -run.angle_rad[:, 0]
-    assert verdicts(replace(run, base_turn_rad=turn)) == [AS_TOLD, AS_TOLD]
+    assert verdicts(replace(run, base_turn_rad=turn))[0] == AS_TOLD
     assert "the other way" in verdicts(replace(run, base_turn_rad=-turn))[0]

@@ -1,0 +1,127 @@
+"""A plant whose drives reach some of its links through gears with backlash, for emulated drives.
+
+An encoder on the motor's side of such a gear turns through the backlash at each reversal, while the link stays where it
+is. The rotor of such a joint therefore has an angle of its own:
+
+    rotor_inertia * rotor_acceleration = motor torque - rotor friction - tooth torque
+
+The tooth torque acts on the link. It is 0 while the teeth are apart, and that of a stiff, damped spring otherwise.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.model.joints import Joint, JointExceptions
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.plant import LinkLoad, Plant
+from snakesim_hal.wire.messages import Imu, Pose
+
+TOOTH_STIFFNESS_NM_PER_RAD = 300.0  # softer than most gears; an explicit step of 1 ms integrates it on a light link
+TOOTH_DAMPING_NM_S_PER_RAD = 0.3  # teeth hardly rebound
+LINK_SIDE_INERTIA_RATIO = 0.1  # of the rotor's inertia: the gear's output stage stays on the link
+
+
+def without_rotors(config: RunConfig, joints: Sequence[Joint], backlash_rad: Mapping[str, float]) -> RunConfig:
+    """Return the configuration of the plant below: rotor inertia and friction are on the motor's side of the gear."""
+    exceptions = dict(config.robot.joints)
+    for joint in joints:
+        if joint.name not in backlash_rad:
+            continue
+        exceptions[joint.name] = msgspec.structs.replace(
+            exceptions.get(joint.name, JointExceptions()),
+            armature_kg_m2=LINK_SIDE_INERTIA_RATIO * joint.motor.armature_kg_m2,
+            friction_nm=0.0,
+            viscous_nm_s_per_rad=0.0,
+        )
+    return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, joints=exceptions))
+
+
+class BacklashPlant:
+    """A `Plant` that wraps another one, and whose joint angles are those that encoders on the rotors measure."""
+
+    def __init__(self, plant: Plant, joints: Sequence[Joint], backlash_rad: Mapping[str, float], seed: int) -> None:
+        """Place every rotor somewhere within its backlash, at rest.
+
+        Args:
+            plant: made from the configuration that `without_rotors` returns.
+            joints: every joint as it is in truth, tail to head.
+            backlash_rad: the whole play of a joint, from one tooth flank to the other, by the joint's name.
+            seed: decides where within its backlash each rotor starts.
+        """
+        self._plant = plant
+        self.step_s = plant.step_s
+        loose = [i for i, joint in enumerate(joints) if joint.name in backlash_rad]
+        motors = [joints[i].motor for i in loose]
+        self._loose = np.array(loose, dtype=np.intp)
+        self._half_rad: Floats = np.array([backlash_rad[joints[i].name] / 2 for i in loose])
+        self._inertia_kg_m2: Floats = np.array([max(motor.armature_kg_m2, 1e-4) for motor in motors])
+        self._friction_nm: Floats = np.array([motor.friction_nm for motor in motors])
+        self._viscous_nm_s: Floats = np.array([motor.viscous_nm_s_per_rad for motor in motors])
+        offset = np.random.default_rng(seed).uniform(-1.0, 1.0, len(loose)) * self._half_rad
+        self._rotor_rad: Floats = plant.angle_rad[self._loose] + offset
+        self._rotor_rad_s: Floats = np.zeros(len(loose))
+        self._tooth_nm: Floats = np.zeros(len(loose))
+
+    def advance(self, torque_nm: Floats) -> None:
+        """Advance rotors and links by `step_s` under these motor torques."""
+        self._turn_rotors(torque_nm[self._loose])
+        passed_on = torque_nm.copy()
+        passed_on[self._loose] = self._tooth_nm
+        self._plant.advance(passed_on)
+
+    def _turn_rotors(self, motor_nm: Floats) -> None:
+        """Advance the rotors, implicitly in the spring and the damper; the links keep their velocity for the step."""
+        link_rad, link_rad_s = self._plant.angle_rad[self._loose], self._plant.velocity_rad_s[self._loose]
+        apart_rad = self._rotor_rad - link_rad
+        pressed_rad = apart_rad - np.clip(apart_rad, -self._half_rad, self._half_rad)
+        touching = pressed_rad != 0.0
+        stiffness = np.where(touching, TOOTH_STIFFNESS_NM_PER_RAD, 0.0)
+        damping = np.where(touching, TOOTH_DAMPING_NM_S_PER_RAD, 0.0)
+        step_s = self.step_s
+        slip_rad_s = self._rotor_rad_s - link_rad_s
+        net_nm = motor_nm - self._viscous_nm_s * self._rotor_rad_s
+        net_nm = net_nm - stiffness * (pressed_rad + step_s * slip_rad_s) - damping * slip_rad_s
+        opposing = self._inertia_kg_m2 + step_s * (self._viscous_nm_s + damping) + step_s**2 * stiffness
+        self._rotor_rad_s = self._rotor_rad_s + step_s * net_nm / opposing
+        stop_rad_s = step_s * self._friction_nm / opposing
+        self._rotor_rad_s = self._rotor_rad_s - np.clip(self._rotor_rad_s, -stop_rad_s, stop_rad_s)
+        self._rotor_rad = self._rotor_rad + step_s * self._rotor_rad_s
+        tooth_nm = stiffness * (pressed_rad + step_s * (self._rotor_rad_s - link_rad_s))
+        tooth_nm = tooth_nm + damping * (self._rotor_rad_s - link_rad_s)
+        pushes = tooth_nm * pressed_rad > 0.0  # teeth do not pull
+        self._tooth_nm = np.where(pushes, tooth_nm, 0.0)
+
+    @property
+    def angle_rad(self) -> Floats:
+        """Joint angles as the encoders on the rotors measure them, (n_joints,)."""
+        angle_rad = self._plant.angle_rad.copy()
+        angle_rad[self._loose] = self._rotor_rad
+        return angle_rad
+
+    @property
+    def velocity_rad_s(self) -> Floats:
+        """Joint velocities as the encoders on the rotors measure them, (n_joints,)."""
+        velocity_rad_s = self._plant.velocity_rad_s.copy()
+        velocity_rad_s[self._loose] = self._rotor_rad_s
+        return velocity_rad_s
+
+    def shaft_torque_nm(self) -> Floats:
+        """Torque through each joint's shaft; behind a gear with backlash, that of its teeth."""
+        torque_nm = self._plant.shaft_torque_nm()
+        torque_nm[self._loose] = self._tooth_nm
+        return torque_nm
+
+    def loads(self) -> list[LinkLoad]:
+        """Loads of the links in contact."""
+        return self._plant.loads()
+
+    def imu(self) -> Imu | None:
+        """Angular velocity and specific force of the links."""
+        return self._plant.imu()
+
+    def pose(self) -> Pose | None:
+        """Pose of the base."""
+        return self._plant.pose()

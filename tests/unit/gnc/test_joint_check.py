@@ -1,0 +1,40 @@
+"""How the joint check moves each joint: to both sides, back, and within its limits."""
+
+from snakesim_gnc.control.controller import View
+from snakesim_gnc.control.joint_check import JointCheck
+from tests.unit.hal.rig import description, state
+
+PERIOD_S = 0.01
+ROBOT = description()
+LIMIT_RAD = ROBOT.joints[0].angle_max_rad
+
+
+def targets(start_rad: float, seconds: float, dead: int | None = None) -> list[list[float]]:
+    """Those of every tick; joints follow at once, but for a dead one."""
+    check = JointCheck(ROBOT, JointCheck.Settings())
+    angles = [start_rad] * len(ROBOT.joints)
+    made: list[list[float]] = []
+    for tick in range(round(seconds / PERIOD_S)):
+        view = View(tick, tick * PERIOD_S, PERIOD_S, state(ROBOT, angles), None, None)
+        made.append(list(check.update(view).set_points.target))
+        angles = [angle if joint == dead else made[-1][joint] for joint, angle in enumerate(angles)]
+    return made
+
+
+def test_every_joint_moves_alone_to_both_sides_and_back() -> None:
+    made = targets(0.1, 2.0 * len(ROBOT.joints))
+    for tick in made:
+        assert sum(abs(target - 0.1) > 1e-9 for target in tick) <= 1
+    for column in zip(*made, strict=True):
+        assert max(column) > 0.1 + 0.055 and min(column) < 0.1 - 0.055 and column[-1] == 0.1
+
+
+def test_a_joint_beside_its_limit_moves_away_from_it_only() -> None:
+    start_rad = LIMIT_RAD - 0.03
+    for column in zip(*targets(start_rad, 2.0 * len(ROBOT.joints)), strict=True):
+        assert max(column) == start_rad and min(column) < start_rad - 0.055
+
+
+def test_a_joint_that_does_not_follow_is_asked_once() -> None:
+    column = [tick[1] for tick in targets(0.0, 2.0 * len(ROBOT.joints), dead=1)]
+    assert max(column) > 0.14 and min(column) == 0.0
