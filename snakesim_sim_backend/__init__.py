@@ -9,11 +9,10 @@
 `sensors/`   everything that the robot senses; `sensor_service` its cameras in a process of their own, for CAN
 `tether`, `truth`, `divergence`  the rope of the static checks, the state without noise, detection of divergence
 
-Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. Nothing heavy is imported here.
+Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. MuJoCo is imported here, before any module of
+this package.
 """
 
-import os
+from snakesim_sim_backend.quiet_import import import_mujoco
 
-# Nothing is shown on a screen. Otherwise MuJoCo would start another Python process to search for a window library:
-# 0.1 s at every start, and a traceback if interrupted by Ctrl-C. Cameras that render open what they need themselves.
-os.environ.setdefault("MUJOCO_GL", "off")
+import_mujoco()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from snakesim.training.search import Generation
 from snakesim_hal.model.whole_file import write_whole
+from snakesim_operator.figures.inherited import PLAIN_TEXT, import_matplotlib
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
@@ -21,6 +22,14 @@ def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
 
 
 def _draw(file: Path, generations: Sequence[Generation]) -> None:
+    import_matplotlib()
+    from matplotlib import rc_context
+
+    with rc_context(PLAIN_TEXT):
+        _draw_plain(file, generations)
+
+
+def _draw_plain(file: Path, generations: Sequence[Generation]) -> None:
     from matplotlib.figure import Figure  # no window, whatever the display
 
     figure = Figure(figsize=(6, 3.5), layout="constrained")

@@ -36,6 +36,9 @@ def _plot(arguments: argparse.Namespace) -> int:
     from snakesim_operator import extras
 
     extras.check("plot", "`snakesim plot`")
+    from snakesim_operator.figures.inherited import import_matplotlib
+
+    import_matplotlib()
     from snakesim_operator.figures.drawn import plot
 
     return plot(

@@ -5,10 +5,12 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from snakesim_hal.arrays import Floats
+from snakesim_operator.figures.inherited import PLAIN_TEXT
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.time_axis import zero_s
 
 STYLE: Any = {
+    **PLAIN_TEXT,
     "font.size": 8.0,
     "axes.spines.top": False,
     "axes.spines.right": False,

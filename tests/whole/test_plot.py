@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.harness.command import snakesim as started
 from tests.whole.command import run_to_summary, snakesim
 
 pytest.importorskip("matplotlib", reason="needs the extra `plot`")
@@ -35,6 +36,15 @@ def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     assert snakesim("plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
     white = "fill: #ffffff"  # the ground, or all that is written on it
     assert 0 < light.count(white) < out.read_text().count(white)
+
+
+def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Path) -> None:
+    """A notebook's window library, and TeX without a TeX."""
+    (run / "matplotlibrc").write_text("text.usetex: True\n")
+    inherited = {"MPLBACKEND": "module://of_a_notebook", "MATPLOTLIBRC": str(run), "PATH": "/nowhere"}
+    ended = started("plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, more=inherited)
+    assert ended.code == 0, ended.err
+    assert "joint_13" in words(run / "inherited.svg")
 
 
 def test_the_papers_figures_come_from_one_command(run: Path) -> None:

@@ -1,0 +1,24 @@
+"""Keeps out what matplotlib inherits from the user's environment and that figures in files cannot be drawn with."""
+
+import importlib
+import os
+import sys
+from typing import Any
+
+BACKEND = "MPLBACKEND"
+PLAIN_TEXT: Any = {"text.usetex": False}  # LaTeX may be missing, and takes the `_` of our names for a subscript
+
+
+def import_matplotlib() -> None:
+    """Import matplotlib, unless the program has done so, whatever window library MPLBACKEND names.
+
+    Notebooks and editors leave a value there that other environments do not know; then the import fails.
+    """
+    if "matplotlib" in sys.modules:
+        return
+    asked = os.environ.pop(BACKEND, None)
+    try:
+        importlib.import_module("matplotlib")
+    finally:
+        if asked is not None:
+            os.environ[BACKEND] = asked
