@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from tests.faults.results import ROOT, Store, machine
 from tests.faults.row import TRIALS, Backend, Request, Result, Row, Trial, judge
@@ -124,7 +124,7 @@ def _reported(row: Row, backend: str, store: Store) -> list[str]:
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), metavar="NAME", help=f"of {', '.join(ROWS)}")
-    parser.add_argument("--backends", nargs="+", choices=["sim", "can", "both"], help="only on these")
+    parser.add_argument("--backends", nargs="+", choices=get_args(Backend), metavar="NAME", help="only on these")
     parser.add_argument("--trials", type=int, default=TRIALS, help=f"of each row and backend ({TRIALS})")
     parser.add_argument("--write", action="store_true", help="write docs/faults.md from all results")
     parser.add_argument("--json", type=Path, default=Store().path, help="raw results (docs/faults.json)")

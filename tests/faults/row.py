@@ -8,7 +8,8 @@ from typing import Literal
 
 import msgspec
 
-Backend = Literal["sim", "can", "both"]
+Backend = Literal["sim", "can", "both", "odrive", "moteus", "dynamixel", "mixed"]
+DRIVE_TYPES: tuple[Backend, ...] = ("can", "odrive", "moteus", "dynamixel", "mixed")
 Place = Literal["here", "namespaces", "guest"]
 TRIALS = 20  # of each row and backend in a whole table
 

@@ -1,16 +1,18 @@
 """Every row of the fault table, in its order. The fault, what is expected, the deadline, and how it is measured."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from snakesim_hal.injection import KINDS
 from snakesim_hal.wire import keys
-from tests.faults.row import Backend, Measure, Place, Row
+from tests.faults.row import DRIVE_TYPES, Backend, Measure, Place, Row
 from tests.faults.rows import (
     attacks,
     commands,
     consumers,
     controller,
+    drives,
     guest,
     isolation,
     modules,
@@ -123,6 +125,23 @@ def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * P
     )
 
 
+def drive_row(
+    name: str, fault: str, kind: str, limit_periods: int, why: str, others: Sequence[str], modules_say: Sequence[str]
+) -> Row:
+    """A drive of every type, or its bus. others, modules_say: what drivers of drives and of joint modules name it."""
+    limit_ms = limit_periods * drives.PERIOD_MS
+    measure = partial(drives.at_host, kind, {"can": modules_say, "others": others})
+    return Row(
+        name,
+        fault,
+        "fault, which names the joint if it is one; every motor off after the braking; none on again before the clear",
+        f"{limit_ms:.0f} ms to the safe action: {why}",
+        limit_ms,
+        "ms",
+        dict.fromkeys(DRIVE_TYPES, measure),
+    )
+
+
 def consumer_row(name: str, fault: str, measure: Measure) -> Row:
     """Somebody who listens."""
     expected = "no control cycle is missed because of it, the robot goes on"
@@ -177,6 +196,59 @@ HEADINGS: tuple[Heading, ...] = (
             watchdog_row("host_silent", "the host says nothing any more, at one module", guest.watchdog, 100.0),
             watchdog_row("host_killed", "host: SIGKILL", guest.host_killed, IN_GUEST_MS, "guest"),
             watchdog_row("host_frozen", "host: SIGSTOP", guest.host_frozen, IN_GUEST_MS, "guest"),
+        ),
+    ),
+    Heading(
+        "drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
+        "drives stop by themselves; fault names the joint; no drive is enabled again before clear and arming",
+        "a watchdog, 100 ms; at 50 Hz (T = 20 ms) for the driver 3 T, and 100 ms for what drives report by themselves",
+        (
+            Row(
+                "drive_host_frozen",
+                "host: SIGSTOP for 1 s, then SIGCONT",
+                "every drive off by its own watchdog; each stop a fault that names its joint; none enabled again",
+                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before clear and arming",
+                0.0,
+                "drives enabled again",
+                dict.fromkeys(DRIVE_TYPES, drives.host_frozen),
+                "namespaces",
+            ),
+            drive_row(
+                "drive_silent",
+                "a drive says nothing",
+                "mute",
+                4,
+                "three questions without an answer",
+                ["drive_silent"],
+                ["module_silent"],
+            ),
+            drive_row(
+                "drive_restarted",
+                "a drive restarts",
+                "reboot",
+                4,
+                "it is silent meanwhile",
+                ["drive_silent", "drive_not_armed"],
+                ["module_restarted"],
+            ),
+            drive_row(
+                "drive_overheated",
+                "a drive's winding is too hot",
+                "overheat",
+                8,
+                "drives report errors ten times a second, or one of them a period is asked",
+                ["drive_fault"],
+                ["module_overheat"],
+            ),
+            drive_row(
+                "drive_bus_lost",
+                "the bus is cut for 0.3 s",
+                "cut",
+                3,
+                "as for every bus",
+                ["interface_down"],
+                ["interface_down"],
+            ),
         ),
     ),
     Heading(

@@ -1,0 +1,125 @@
+"""Emulated drives of any type in a process of their own, which notes when each of them was enabled and let go.
+
+`python -m tests.faults.drives_process CONFIG NOTES --pose HOST:PORT`: on the buses that the configuration names.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from snakesim_can_backend.bus.adapter import open_wire
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.family.backend import CanDriveBackend
+from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.twin.server import TwinServer
+from snakesim_hal.drivers.drive_backend import Clock
+from snakesim_hal.drivers.drive_settings import body_of
+from snakesim_hal.drivers.family import FamilyBackend, Part
+from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.twin_body import TwinBody, make_plant
+from snakesim_hal.model.plugins import BACKENDS, find_plugin
+from snakesim_hal.model.scenario import RunConfig, load
+from snakesim_hal.plugin_check import backend_settings
+from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.terminal import say
+from snakesim_serial_backend.dynamixel.backend import twin_of
+from snakesim_serial_backend.dynamixel.command import named
+from snakesim_serial_backend.wire import Pty
+from tests.contract.drives import enabled_drives
+
+PAUSE_S = 0.0005
+READY = "drives ready"
+DRIVEN = (ModuleState.ARMED, ModuleState.STOPPING)
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Drives on their buses: what lets them run, and which of them are enabled, tail to head."""
+
+    run: Callable[[], object]
+    enabled: Callable[[], list[bool]]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Until a stop signal."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("config")
+    parser.add_argument("notes", type=Path)
+    parser.add_argument("--pose", required=True)
+    parser.add_argument("--parent", type=int, required=True)
+    given = parser.parse_args(argv)
+    die_with_parent(given.parent)
+    running = [True]
+    on_stop_signal(running.clear)
+    with ExitStack() as opened, given.notes.open("w", buffering=1) as notes:
+        drives = open_drives(load(given.config).config, given.pose, opened)
+        tune_garbage_collector()
+        with contextlib.suppress(OSError):  # real drives do not wait for a busy computer
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVICE_PRIORITY))
+        say(READY)
+        before: list[bool] = []
+        while running:
+            drives.run()
+            if (now := drives.enabled()) != before:
+                before = now
+                notes.write(json.dumps([time.monotonic_ns(), now]) + "\n")
+            time.sleep(PAUSE_S)
+    return 0
+
+
+def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
+    """Open the buses of a configuration, and put its drives on them."""
+    backend: Any = find_plugin(BACKENDS, config.backend)
+    settings = backend_settings(config, backend)
+    if backend is CanBackend:
+        return _modules(config, settings, pose, opened)
+    parts: list[Part] = backend.parts(config, settings)
+    body, clock = body_of(config, settings, config.backend, pose), Clock(config)
+    twins = [_twin(part, body.part(list(part.joints)), clock, opened) for part in parts]
+
+    def run() -> None:
+        for twin in twins:
+            twin()
+
+    def enabled() -> list[bool]:
+        found: dict[int, bool] = {}
+        for part, twin in zip(parts, twins, strict=True):
+            found |= dict(zip(part.joints, enabled_drives(twin), strict=True))
+        return [found[joint] for joint in range(len(found))]
+
+    return Drives(run, enabled)
+
+
+def _twin(part: Part, body: TwinBody, clock: Clock, opened: ExitStack) -> Any:
+    """The emulated drives of one family, all on its first bus."""
+    family: type[FamilyBackend] = part.family
+    joints = list(part.joints.values())
+    if issubclass(family, CanDriveBackend):
+        wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
+        return opened.enter_context(closing(family.twin(joints, part.settings, body, [wire] * len(joints), clock.ns)))
+    ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
+    return twin_of(joints, part.settings, body, ptys * len(joints), clock)
+
+
+def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> Drives:
+    wires = [opened.enter_context(closing(open_wire(c, FROM_HOST, settings.bit_rate))) for c in settings.channels]
+    send_pose = opened.enter_context(closing(PoseSender(pose)))
+    plant = make_plant(config, settings, config.backend)
+    chain = ModuleChain(config, settings, plant, stepped=False, send_pose=send_pose)
+    server = TwinServer(wires, chain)
+    return Drives(
+        lambda: server.run_due(time.monotonic_ns()), lambda: [slot.module.state in DRIVEN for slot in chain.slots]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
