@@ -12,13 +12,14 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, JointState, Status
-from snakesim_operator.console.operations import Log
+from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.page import Page
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import expected_of
 from snakesim_operator.console_port import open_port
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, running
+from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left, processes_of
 from tests.harness.wait import wait_until
 from tests.unit.operator.console.rig import ReadyStop
@@ -71,6 +72,11 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         assert not page.errors, page.errors
 
 
+STOP_BOX = "document.querySelector('#second-stop').getBoundingClientRect()"
+NOTICE_BOX = "document.querySelector('[class*=Notification-root]').getBoundingClientRect()"
+TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab.offsetTop)).size"
+
+
 def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
     with page_server(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
@@ -90,16 +96,21 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
             assert page.value("ends") == count
 
 
-def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_the_panel() -> None:
-    config = load("triplet").config
+def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_all_else() -> None:
+    """And a wide screen shows the tabs in one line."""
+    config, log = load("triplet").config, Log()
     with page_server(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
-        Page(server, None, None, Log(), recorded="a run").show(expected_of(config))
+        Page(server, None, Operations(Link(free_endpoint(), "planar13"), log), log).show(expected_of(config))
         page = browser.open(address, 400, 800, 0.5)
         page.wait_for("planar13")
         for tab in ("Joints", "State", "Signals", "Log"):
             page.click(tab)
             wait_until(lambda: page.value(PANEL_WIDTHS) == [400, 400], f"a panel as wide as the phone in tab {tab}")
-        assert page.value("document.querySelector('#second-stop').getBoundingClientRect().bottom") < 100
+        assert page.value(f"{STOP_BOX}.bottom") < 100
+        assert "Stops the robot even if EMERGENCY STOP does not react. Self-test: ready" in page.text()
+        assert page.value(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), "a notice, such as of missing WebGL, is not covered"
+        page.size(1400, 860)
+        wait_until(lambda: page.value(TAB_LINES) == 1, "tabs in one line")
 
 
 @pytest.mark.slow
