@@ -19,7 +19,7 @@ from typing import Self
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.allowed_faults import faults_of_host
-from snakesim_hal.errors import ConfigError, RefusedError, SnakesimError
+from snakesim_hal.errors import ConfigError, RefusedError, ServiceError, SnakesimError
 from snakesim_hal.fault_plan import planned
 from snakesim_hal.host.host import Host
 from snakesim_hal.host_process import open_backend
@@ -182,15 +182,21 @@ class InProcessRun:
     def _let_act(self) -> None:
         for name, loop in list(self._loops.items()):
             try:
-                with self._limit:
-                    loop.act()
+                self._act_in_time(loop)
             except SnakesimError as error:  # its process would end here, and the host would go on
                 report_error(error, f"snakesim {name}")
                 self._errors[name] = error
-                self._end_service(name, str(error))
-            except StepTooLongError as error:
-                traceback.print_exc()
-                self._end_service(name, self._explain(error))
+                self.failed.append(f"{name} ended: {error}")
+                del self._loops[name]
+                self._parts[name].close()
+
+    def _act_in_time(self, loop: ServiceLoop) -> None:
+        try:
+            with self._limit:
+                loop.act()
+        except StepTooLongError as error:
+            traceback.print_exc()
+            raise ServiceError(self._explain(error)) from None
 
     def _explain(self, error: StepTooLongError) -> str:
         """Return why a part was interrupted, and what to do about it."""
@@ -200,8 +206,3 @@ class InProcessRun:
             f"{place_of(error)} took longer than {self._limit.limit_s:g} s in one tick; if it needs so long, allow it "
             "with --set start_limit_s=600"
         )
-
-    def _end_service(self, name: str, why: str) -> None:
-        self.failed.append(f"{name} ended: {why}")
-        del self._loops[name]
-        self._parts[name].close()

@@ -170,13 +170,24 @@ def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
 
 def _optimise(arguments: argparse.Namespace) -> int:
     _check_extra()
+    from snakesim_hal.process import stop_signals_raise
+    from snakesim_hal.terminal import say
     from snakesim_operator.evaluate.optimise import Request, optimise
+    from snakesim_operator.run.conclusion import INTERRUPTED
     from snakesim_operator.run.folder import named_after
 
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}
     given["rows"] = _numbers(arguments.rows or "", "--rows")
     given["seed"] = 1 if arguments.seed is None else arguments.seed
-    return optimise(Request(**{**given, "storage": arguments.storage or named_after("optimise").with_suffix(".db")}))
+    storage = arguments.storage or named_after("optimise").with_suffix(".db")
+    with stop_signals_raise():
+        try:
+            return optimise(Request(**{**given, "storage": storage}))
+        except KeyboardInterrupt:  # no trial that is done is lost
+            if storage.is_file():
+                say(f"stopped: {storage} keeps the trials that are done; the same command goes on with")
+                say(f"  --storage {shlex.quote(str(storage))}")
+            return INTERRUPTED
 
 
 def _check_extra() -> None:

@@ -16,7 +16,6 @@ from optuna.trial import Trial, TrialState
 
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import compose, parse_set
-from snakesim_hal.process import stop_signals_raise
 from snakesim_hal.terminal import say
 from snakesim_operator.dask_cluster import check_address
 from snakesim_operator.evaluate.case import GAVE_UP, Case, Outcome, code_digest
@@ -32,7 +31,6 @@ from snakesim_operator.evaluate.search_file import (
 )
 from snakesim_operator.evaluate.suite import Suite, also_set, cases_of, read_suite, rows_of, seeds_of
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.progress import in_minutes
 
 Span = FloatDistribution | IntDistribution
@@ -57,21 +55,7 @@ class Request:
 
 
 def optimise(request: Request) -> int:
-    """Search until so many trials have a result, or have been tried.
-
-    Returns: 0; 1 when no trial has a result; 130 when it was stopped, which loses no trial that is done.
-    """
-    with stop_signals_raise():
-        try:
-            return _search(request)
-        except KeyboardInterrupt:
-            if request.storage.is_file():
-                say(f"stopped: {request.storage} keeps the trials that are done; the same command goes on with")
-                say(f"  --storage {shlex.quote(str(request.storage))}")
-            return INTERRUPTED
-
-
-def _search(request: Request) -> int:
+    """Search until so many trials have a result, or have been tried. Returns 0, or 1 when no trial has a result."""
     space = dict(map(_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(
