@@ -43,6 +43,7 @@ class Request:
 
 
 def optimise(request: Request) -> int:
+    """Go on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
     space: dict[str, BaseDistribution] = dict(map(_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(
