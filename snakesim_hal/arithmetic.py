@@ -9,9 +9,11 @@ NumPy is not imported at the top here, as `pin` must come before it.
 """
 
 import hashlib
+import importlib.util
 import math
 import os
 import random
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
@@ -23,11 +25,20 @@ COMMON: Mapping[str, str] = {
     "NumPy": "072d8a45",
     "C library": "e4139a39",
 }
-"""What `measured` finds in the common arithmetic; `make golden` prints it."""
+"""What `measured` finds in the common arithmetic, with the wheels of NumPy 2.2 to 2.4; `make golden` prints it."""
+COMMON_WITH = "NumPy 2.2 to 2.4"
+OTHER_WHEELS: Mapping[str, str] = {"3f7c15b6": "NumPy 2.5"}
+"""Hashes of the BLAS in other wheels, with the same processor code: such a BLAS rounds alike on all computers."""
 ONE_THREAD: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 NEEDED = {"avx2", "fma"}  # flags of the processor
-# The code in NumPy for wider processors, as NumPy 2.4 and earlier versions call it; each ignores the other's names.
-WIDER = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_KNL AVX512_KNM"
+# The code in NumPy for wider processors, by the version that began to call it so. NumPy warns of names that it does not
+# know, and where warnings are errors it cannot be imported then.
+WIDER_BEFORE_2_3 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_KNL AVX512_KNM"
+WIDER: Mapping[tuple[int, int], str] = {
+    (2, 4): "X86_V4 AVX512_ICL AVX512_SPR",
+    (2, 3): f"{WIDER_BEFORE_2_3} AVX512_SPR",
+    (0, 0): WIDER_BEFORE_2_3,
+}
 CPUINFO = Path("/proc/cpuinfo")
 
 
@@ -36,7 +47,7 @@ def environment() -> dict[str, str]:
     """Variables that make a process compute in the common arithmetic; none for a processor that cannot."""
     if os.uname().machine != "x86_64" or not (flags := _processor_flags()) >= NEEDED:
         return {}
-    wider = WIDER if "avx512f" in flags else ""
+    wider = _names_of_wider_code(_numpy_version()) if "avx512f" in flags else ""
     # Empty is as good as unset; NumPy refuses to be told what to enable and what to disable.
     return {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": wider, "NPY_ENABLE_CPU_FEATURES": ""}
 
@@ -57,14 +68,31 @@ def is_pinned() -> bool:
 
 
 def foreign(parts: Mapping[str, str]) -> list[str]:
-    """The parts of a measured arithmetic that differ from the common one."""
-    return [part for part, digest in COMMON.items() if part in parts and parts[part] != digest]
+    """Name the parts of a measured arithmetic that differ from the common one, such as "BLAS", "BLAS of NumPy 2.5"."""
+    differing: list[str] = []
+    for part, digest in COMMON.items():
+        found = parts.get(part, digest)
+        if found in OTHER_WHEELS:
+            differing.append(f"{part} of {OTHER_WHEELS[found]}")
+        elif found != digest:
+            differing.append(part)
+    return differing
 
 
 def digest_text(digest: str, differing: Sequence[str]) -> str:
-    """A run's digest for people. differing: what `foreign` says of the arithmetic in which it was computed."""
-    own = f", its computer's own: {' and '.join(differing)} round otherwise there than on most" if differing else ""
-    return digest[:16] + own
+    """Return a run's digest for people.
+
+    Args:
+        digest: The whole digest.
+        differing: What `foreign` returns of the arithmetic in which it was computed.
+    """
+    own = [part for part in differing if part in COMMON]
+    if own:
+        verb = "rounds" if len(own) == 1 else "round"
+        return f"{digest[:16]}, its own: {' and '.join(own)} {verb} otherwise than on most computers with {COMMON_WITH}"
+    if differing:
+        return f"{digest[:16]}, as on most computers with the {differing[0]}, which rounds otherwise than {COMMON_WITH}"
+    return digest[:16]
 
 
 @cache
@@ -143,6 +171,24 @@ def _digest(results: Iterable[Any]) -> str:
     for result in results:
         digest.update(np.ascontiguousarray(result).tobytes())
     return digest.hexdigest()[:8]
+
+
+def _names_of_wider_code(numpy_version: tuple[int, int]) -> str:
+    return next(names for since, names in WIDER.items() if numpy_version >= since)
+
+
+def _numpy_version() -> tuple[int, int]:
+    """Return major and minor number of the installed NumPy without importing it; the newest ones if unknown."""
+    newest = next(iter(WIDER))
+    found = importlib.util.find_spec("numpy")
+    if found is None or found.origin is None:
+        return newest
+    try:
+        text = Path(found.origin).with_name("version.py").read_text(errors="replace")
+    except OSError:
+        return newest
+    number = re.search(r'^version = "(\d+)\.(\d+)', text, re.MULTILINE)
+    return newest if number is None else (int(number[1]), int(number[2]))
 
 
 def _processor_flags() -> set[str]:

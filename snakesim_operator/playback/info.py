@@ -73,7 +73,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     duration_s: float
     ticks: int
     command_digest: str | None
-    own_arithmetic: list[str]  # what rounds otherwise than on most computers: then the digest is its computer's own
+    own_arithmetic: list[str]  # what rounds otherwise than on most computers with the lock's NumPy
     lifecycle: str | None
     settings: list[SettingsChange]
     dropped: dict[str, int]

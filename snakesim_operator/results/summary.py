@@ -176,7 +176,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
     lacks: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
     own_arithmetic: Annotated[
-        list[str], Meta(description="what rounds otherwise here than on most computers: then the digest is its own")
+        list[str],
+        Meta(description="what rounds otherwise than on most computers with NumPy 2.2 to 2.4: then the digest differs"),
     ] = []
     config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
 

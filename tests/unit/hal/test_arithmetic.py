@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
@@ -67,5 +68,35 @@ def test_a_digest_of_other_arithmetic_is_said_to_be_the_computers_own() -> None:
     other = {**arithmetic.COMMON, "BLAS": "00000000", "C library": "00000000"}
     assert arithmetic.foreign(other) == ["BLAS", "C library"]
     said = arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign(other))
-    assert said == "0123456789abcdef, its computer's own: BLAS and C library round otherwise there than on most"
+    otherwise = "round otherwise than on most computers with NumPy 2.2 to 2.4"
+    assert said == f"0123456789abcdef, its own: BLAS and C library {otherwise}"
     assert arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign({})) == "0123456789abcdef"
+
+
+def test_a_newer_wheel_is_named_and_no_computer_is_blamed_for_it() -> None:
+    of_2_5 = {**arithmetic.COMMON, "BLAS": "3f7c15b6"}
+    assert arithmetic.foreign(of_2_5) == ["BLAS of NumPy 2.5"]
+    said = arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign(of_2_5))
+    assert said.startswith("0123456789abcdef, as on most computers with the BLAS of NumPy 2.5, which rounds otherwise")
+
+
+@pytest.mark.parametrize(
+    ("version", "first", "last"),
+    [("2.2.6", "AVX512F", "AVX512_KNM"), ("2.3.5", "AVX512F", "AVX512_SPR"), ("2.5.1", "X86_V4", "AVX512_SPR")],
+)
+def test_numpy_is_given_only_names_that_its_version_knows(
+    computer: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, first: str, last: str
+) -> None:
+    (tmp_path / "version.py").write_text(f'\nversion = "{version}"\n')
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda _: ModuleSpec("numpy", None, origin=f"{tmp_path}/__init__.py")
+    )
+    computer.write_text(INTEL)
+    names = arithmetic.environment()["NPY_DISABLE_CPU_FEATURES"].split()
+    assert (names[0], names[-1]) == (first, last)
+
+
+def test_numpy_can_be_imported_where_warnings_are_errors() -> None:
+    code = "import snakesim; import numpy"
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
