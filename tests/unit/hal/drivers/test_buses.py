@@ -196,6 +196,15 @@ def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(open
     )
     wait_until(lambda: robot.axes_follow() == robot.servos_follow() == {False}, "both", 10.0)
     assert not any(axis.errors for axis in robot.axes._twin.axes), "not by their watchdogs"
+    found = robot.run(1, "armed")
+
+    def both_are_reported() -> bool:
+        found.extend(robot.run(1, "fault"))
+        return len(found) >= 2
+
+    wait_until(both_are_reported, "a fault of each bus", 10.0)
+    assert {fault.what for fault in found} == {"no_setpoints"} and "one lease" in found[0].cause
+    assert robot.axes_follow() == robot.servos_follow() == {False}, "set-points of an armed robot enabled them again"
 
 
 @pytest.mark.parametrize("body", ["odrive", "moteus"])
