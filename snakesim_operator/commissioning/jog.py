@@ -1,8 +1,9 @@
 """`snakesim joints jog`: one joint moves slowly while a key is held; the others stay without current.
 
 A terminal says nothing of a key that is let go, only that it repeats no more: the joint goes on for `HELD_S` after
-each sign of the key. So at first it makes a small step, and moves on once the key repeats. Whatever ends this process
-ends the motion: the host's lease runs out within 100 ms.
+each sign of the key. So at first it makes a small step, and moves on once the key repeats. Keys that have waited, as
+behind a network that stalled, let it go. Whatever ends this process ends the motion: the host's lease runs out within
+100 ms.
 """
 
 import signal
@@ -39,6 +40,7 @@ HELD_S = 0.15  # a key repeats 20 to 30 times a second
 AHEAD_RAD = 0.1  # of the measured angle: a joint that is held winds nothing up
 READY_S = 10.0
 STEPS = {"up": 1, "right": 1, "+": 1, "down": -1, "left": -1, "-": -1}
+LET_GO = ""  # no key: a key that may have waited in a stalled terminal moves nothing, and lets the joint go
 HELP = "hold up or +: forwards   hold down or -: backwards   any other key: let it go   q: quit"
 
 
@@ -148,7 +150,7 @@ class _Jogging:
         while not self._over and not keyboard.gone:
             for key in keyboard.keys(0.0):
                 self._over |= key == "q"
-                jog.key(key)
+                jog.key(key if not keyboard.late else LET_GO)
             if (now := self._turn()).lifecycle != "armed":
                 self._ready()
                 raise RefusedError(f"the robot is {now.lifecycle}: {self._status.why}")

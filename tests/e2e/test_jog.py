@@ -21,6 +21,7 @@ from tests.whole.command import snakesim
 
 REPEAT_S = 0.03  # of a key
 TRIES = 4
+HELD_BACK = 270  # keys that come at once, as after a stall of some seconds
 BACKEND = "./told.py:Told"
 UP = b"\x1b[A"
 TOLD = """
@@ -105,6 +106,12 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
             return False
         assert half["limit_nm"][1] == pytest.approx(0.3 * 7.0)
         assert told(home)["target"][1] == half["target"][1]
+        os.write(terminal, HELD_BACK * UP)
+        held_back = told(home)["tick"]
+        wait_until(lambda: told(home)["tick"] > held_back + 25, "half a second")
+        if ended():
+            return False
+        assert told(home)["target"][1] == half["target"][1], "moved by keys that a network has held back"
         os.write(terminal, b"q")
         return process.wait(20) == 0
 

@@ -5,8 +5,8 @@ import math
 import os
 import signal
 import sys
-import threading
 import time
+from concurrent.futures import Future, wait
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError
@@ -16,9 +16,9 @@ from snakesim_hal.process import on_stop_signal, user_name
 from snakesim_hal.terminal import overwrite_lines, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Intent, Status, World
-from snakesim_operator.tools.stop import estop
+from snakesim_operator.tools.prepared_stop import PreparedStop
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
-from snakesim_operator.tools.teleop.joystick import Joystick, open_joystick
+from snakesim_operator.tools.teleop.joystick import STICK_AGE_S, Joystick, open_joystick
 from snakesim_operator.tools.teleop.keyboard import Keyboard
 from snakesim_operator.tools.teleop.steering import HEADING_STEP_RAD, TURN_RAD_S, Steering
 
@@ -26,6 +26,7 @@ PERIOD_S = 0.05
 SHOWN_EVERY = 4  # periods
 KEY_AGE_S = 15.0  # after this long without a key, nobody may be at the keyboard
 SILENT_S = 1.0  # without a clock
+STOP_WAIT_S = 20.0  # at the end, for an emergency stop that is under way
 HELP = "up, down: speed   left, right: direction   s: stop   SPACE: EMERGENCY STOP   q: quit"
 
 
@@ -73,8 +74,11 @@ class Teleop:
         self._body_w_rad: float | None = None
         self._other = ""
         self._ending = ""  # why it ends
-        self._stopping: list[str] = []  # what the emergency stop said
-        self._stopped = False
+        self._ignores_keys = False  # the newest keys came late
+        # The emergency stop, whose means exist before it is needed.
+        self._stop = PreparedStop(RobotSelection(link.endpoint, link.namespace, link.session), link)
+        self._stop.connect(session)
+        self._stopping: Future[str] | None = None
 
     def go(self) -> int:
         """Returns 0 when the operator ended it."""
@@ -91,7 +95,10 @@ class Teleop:
                 drawn = overwrite_lines(self._screen_lines(), drawn)
             turn += 1
             time.sleep(max(PERIOD_S - (time.monotonic() - began), 0.0))
-        if self._steering.touched_s is not None and not self._stopped:  # sooner than by expiry
+        if self._stopping is not None:  # its threads end with this process
+            wait([self._stopping], STOP_WAIT_S)
+            self._stop.close()
+        elif self._steering.touched_s is not None:  # sooner than by expiry
             self._steering.stop(time.monotonic())
             self._sent_ns = -1
             self._send()
@@ -107,8 +114,14 @@ class Teleop:
 
     def _read_operator(self) -> None:
         now_s, steering = time.monotonic(), self._steering
-        for key in self._keyboard.keys(0.0) if self._keyboard is not None else []:
+        found = self._keyboard.keys(0.0) if self._keyboard is not None else []
+        late = self._keyboard is not None and self._keyboard.late
+        if found:
+            self._ignores_keys = late
+        for key in found:
             match key:
+                case "up" | "down" | "left" | "right" if late:
+                    pass
                 case " ":
                     self._stop_at_once()
                 case "q":
@@ -122,23 +135,40 @@ class Teleop:
                 case _:
                     pass
         if self._stick is not None:
-            if self._stick.take(0.0):
-                self._stop_at_once()
-            if self._stick.forward or self._stick.right or steering.touched_s is not None:
-                steering.push(self._stick.forward, now_s)
-            if self._stick.right:
-                steering.turn(-self._stick.right * TURN_RAD_S * PERIOD_S, self._body_w_rad, now_s)
+            self._read_stick(self._stick)
         if self._lost():
             self._end(
                 "the joystick is gone" if self._stick is not None and self._stick.lost else "the terminal is gone"
             )
 
+    def _read_stick(self, stick: Joystick) -> None:
+        """Ask for what the stick asks for, from the time of its newest event on, unless that is too long ago."""
+        if stick.take(0.0):
+            self._stop_at_once()
+        if stick.is_silent(time.monotonic()):
+            return
+        if stick.forward or stick.right or self._steering.touched_s is not None:
+            self._steering.push(stick.forward, stick.moved_s)
+        if stick.right:
+            self._steering.turn(-stick.right * TURN_RAD_S * PERIOD_S, self._body_w_rad, stick.moved_s)
+
+    def _is_left(self) -> bool:
+        """Whether the operator has done nothing for so long that nobody may be there."""
+        touched_s = self._steering.touched_s
+        limit_s = KEY_AGE_S if self._stick is None else STICK_AGE_S
+        return touched_s is not None and time.monotonic() - touched_s > limit_s
+
     def _stop_at_once(self) -> None:
-        """By all ways, beside this loop; and nothing is asked for any more."""
-        if not self._stopped:
-            self._stopped = True
-            at = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
-            threading.Thread(target=estop, args=(at, self._stopping.append), name="estop").start()
+        """Stop by all ways, beside this loop, again at each press; and nothing is asked for any more."""
+        self._stopping = self._stop.request(self._me)
+
+    def _stop_in_words(self) -> str:
+        """What came of the newest emergency stop."""
+        stopping = self._stopping
+        if stopping is None or not stopping.done():
+            return "sent"
+        error = stopping.exception()
+        return stopping.result() if error is None else f"NOT STOPPED, press SPACE again: {error}"
 
     def _read_robot(self) -> None:
         if clocks := self._clocks.drain():
@@ -156,9 +186,10 @@ class Teleop:
     def _send(self) -> None:
         """An intent for each new robot time, once the operator has asked for something, and while he is there."""
         clock = self._clock
-        if self._stopped or self._steering.touched_s is None or clock is None or clock.stamp_ns == self._sent_ns:
+        nothing_asked = self._stopping is not None or self._steering.touched_s is None
+        if nothing_asked or clock is None or clock.stamp_ns == self._sent_ns:
             return
-        if self._stick is None and time.monotonic() - self._steering.touched_s > KEY_AGE_S:
+        if self._is_left():
             self._steering.speed_m_s = 0.0
         self._sent_ns = clock.stamp_ns
         self._intents.put(self._steering.intent(clock.stamp_ns))
@@ -173,15 +204,19 @@ class Teleop:
         body = "unknown" if self._body_w_rad is None else _degrees(self._body_w_rad)
         asked = f"asked: {steering.speed_m_s:+.2f} m/s, {towards}; body: {body}"
         silent_s = time.monotonic() - self._clock_s
-        if self._stopped:
-            asked = f"EMERGENCY STOP: {'; '.join(self._stopping) or 'sent'}. Then: snakesim clear, snakesim arm"
+        if self._stopping is not None:
+            asked = f"EMERGENCY STOP: {self._stop_in_words()}. Then: snakesim clear, snakesim arm"
         elif silent_s > SILENT_S:
             held_up = "" if status is None or _heard(self._status_s) else status.held_up
             asked = f"{held_up or f'the robot has given no clock for {silent_s:.0f} s'}: nothing can be asked for"
         elif steering.touched_s is None:
             asked = "nothing asked for yet: the mission goes on"
-        elif self._stick is None and time.monotonic() - steering.touched_s > KEY_AGE_S:
+        elif self._is_left() and self._stick is None:
             asked = f"no key for {KEY_AGE_S:.0f} s: stopped; press one to go on"
+        elif self._is_left():
+            asked = f"no event of the joystick for {STICK_AGE_S:.0f} s: stopped; move it to go on"
+        if self._ignores_keys:
+            asked = f"{asked}   (keys that came late were ignored)"
         return [*lines, asked, f"also steering: {self._other}" if self._other else "", HELP]
 
 

@@ -2,9 +2,14 @@
 
 Read directly, 24 bytes an event: the package `evdev` has no wheels, and would need a compiler and kernel headers.
 Source: linux/input.h and linux/input-event-codes.h.
+
+A device sends an event when something changes, and nothing otherwise. So a stick that is held still, a pad that is
+switched off and a receiver that has lost its pad look alike. Each event has the time at which the kernel got it. What
+the stick asks for counts for STICK_AGE_S from then on.
 """
 
 import fcntl
+import math
 import os
 import select
 import struct
@@ -21,6 +26,12 @@ BUTTONS = range(0x120, 0x140)  # BTN_JOYSTICK to BTN_THUMBR; every one of them i
 ABSINFO = struct.Struct("6i")  # value, minimum, maximum, fuzz, flat, resolution
 DEAD_ZONE = 0.12  # of the way to either side
 MAX_EVENTS = 256  # in one read
+CLOCK_MONOTONIC = 1  # of which events have the time, once the device was asked for it
+STICK_AGE_S = 5.0  # after this long without an event the stick counts as released
+
+
+def _write_ioctl(number: int, size: int) -> int:
+    return 1 << 30 | size << 16 | ord("E") << 8 | number
 
 
 def _read_ioctl(number: int, size: int) -> int:
@@ -50,6 +61,7 @@ class Joystick:
         self.handle, self._x, self._y = handle, x, y
         self.right = self.forward = 0.0  # from -1 to 1
         self.lost = False  # unplugged, or its driver is gone
+        self.moved_s = -math.inf  # when the kernel got the newest event, monotonic
 
     def take(self, wait_s: float) -> bool:
         """Take in what happened, at the latest after a time. Returns whether a button was pressed."""
@@ -66,7 +78,8 @@ class Joystick:
         if not data:
             self.lost, self.right, self.forward = True, 0.0, 0.0
             return False
-        for _, _, kind, code, value in EVENT.iter_unpack(data[: len(data) // EVENT.size * EVENT.size]):
+        for seconds, microseconds, kind, code, value in EVENT.iter_unpack(data[: len(data) // EVENT.size * EVENT.size]):
+            self.moved_s = seconds + 1e-6 * microseconds
             if kind == EV_ABS and code == ABS_X:
                 self.right = self._x.share(value)
             elif kind == EV_ABS and code == ABS_Y:
@@ -76,6 +89,10 @@ class Joystick:
             elif kind == EV_KEY and code in BUTTONS and value == 1:
                 pressed = True
         return pressed
+
+    def is_silent(self, now_s: float) -> bool:
+        """Whether there was no event for so long that the operator, or the pad, may be gone."""
+        return now_s - self.moved_s > STICK_AGE_S
 
     def close(self) -> None:
         """Close the device."""
@@ -93,7 +110,7 @@ def open_joystick(device: Path | None) -> Joystick:
             why = f"{path}: {error.strerror}"
             continue
         axes = _axes(handle)
-        if axes is not None:
+        if axes is not None and _has_monotonic_times(handle):
             return Joystick(handle, *axes)
         os.close(handle)
         why = f"{path}: has no stick with axes X and Y, and buttons"
@@ -101,6 +118,15 @@ def open_joystick(device: Path | None) -> Joystick:
         f"--joystick: {why}. Plug one in, name its device, or get the permission: sudo usermod -aG input $USER, "
         f"and log in again"
     )
+
+
+def _has_monotonic_times(handle: int) -> bool:
+    """Ask for events with the time of the monotonic clock, which nobody sets; whether the device does that."""
+    try:
+        fcntl.ioctl(handle, _write_ioctl(0xA0, 4), struct.pack("i", CLOCK_MONOTONIC))
+    except OSError:
+        return False
+    return True
 
 
 def _axes(handle: int) -> tuple[Axis, Axis] | None:

@@ -24,7 +24,7 @@ class Steering:
         self.push((self.speed_m_s + steps * SPEED_STEP_M_S) / self._fastest_m_s, now_s)
 
     def push(self, share: float, now_s: float) -> None:
-        """Ask for a share of the fastest speed, from -1 to 1."""
+        """Ask for a share of the fastest speed, from -1 to 1. now_s: when the operator did."""
         self.speed_m_s = round(max(-1.0, min(1.0, share)) * self._fastest_m_s, 3) + 0.0
         self.touched_s = now_s
 

@@ -14,6 +14,7 @@ from snakesim_operator.tools.teleop.joystick import (
     EV_KEY,
     EV_SYN,
     EVENT,
+    STICK_AGE_S,
     SYN_DROPPED,
     Axis,
     Joystick,
@@ -29,8 +30,10 @@ class Device:
         os.set_blocking(handle, False)
         self.stick = Joystick(handle, Axis(-32768, 32767), Axis(0, 255))
 
-    def sends(self, kind: int, code: int, value: int) -> bool:
-        os.write(self._write, EVENT.pack(1, 2, kind, code, value) + EVENT.pack(1, 2, EV_SYN, 0, 0))
+    def sends(self, kind: int, code: int, value: int, at_s: float = 1.000002) -> bool:
+        seconds, microseconds = divmod(round(1e6 * at_s), 1_000_000)
+        time = seconds, microseconds
+        os.write(self._write, EVENT.pack(*time, kind, code, value) + EVENT.pack(*time, EV_SYN, 0, 0))
         return self.stick.take(1.0)
 
     def unplug(self) -> None:
@@ -69,6 +72,15 @@ def test_lost_events_and_a_lost_device_let_go_of_the_stick(device: Device) -> No
     device.unplug()
     device.stick.take(1.0)
     assert device.stick.lost and device.stick.forward == 0.0
+
+
+def test_a_stick_is_silent_once_its_newest_event_is_old_however_late_it_is_read(device: Device) -> None:
+    assert device.stick.is_silent(0.0), "nothing has come yet"
+    device.sends(EV_ABS, ABS_Y, 0, at_s=10.5)
+    assert device.stick.forward == pytest.approx(1.0) and not device.stick.is_silent(10.5 + STICK_AGE_S)
+    assert device.stick.is_silent(10.6 + STICK_AGE_S), "a receiver without its pad, or a program that was stopped"
+    device.sends(EV_ABS, ABS_Y, 1, at_s=20.0)
+    assert not device.stick.is_silent(20.1)
 
 
 def test_what_is_no_joystick_is_refused_with_the_way_out(tmp_path: Path) -> None:

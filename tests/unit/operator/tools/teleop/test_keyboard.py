@@ -1,0 +1,38 @@
+"""Which keys of a terminal may have waited before they were read."""
+
+import pytest
+
+from snakesim_operator.tools.teleop.keyboard import MAX_AT_ONCE, MAX_UNREAD_S, KeyTiming
+
+PERIOD_S = 0.05  # of teleop
+
+
+def seen(keys_a_look: list[int], period_s: float = PERIOD_S) -> list[bool]:
+    """Whether the keys of each look are late; before the first one nothing was typed."""
+    timing = KeyTiming()
+    timing.are_late(0, 0.0)
+    return [timing.are_late(count, (look + 1) * period_s) for look, count in enumerate(keys_a_look)]
+
+
+@pytest.mark.parametrize(("hz", "period_s"), [(30, 0.05), (30, 0.01), (50, 0.05), (20, 0.01)])
+def test_a_key_that_repeats_is_never_late(hz: int, period_s: float) -> None:
+    looks = round(3.0 / period_s)
+    came = [int((look + 1) * period_s * hz) - int(look * period_s * hz) for look in range(looks)]
+    assert sum(came) >= 3 * hz - 1 and not any(seen(came, period_s))
+
+
+@pytest.mark.parametrize("flushed", [[270], [20] * 14, [8] * 34])
+@pytest.mark.parametrize("period_s", [0.05, 0.01])
+def test_what_a_network_held_back_for_14_seconds_is_late(flushed: list[int], period_s: float) -> None:
+    late = seen([0] * 280 + flushed, period_s)[280:]
+    taken = sum(count for count, is_late in zip(flushed, late, strict=True) if not is_late)
+    assert taken <= 30, "no more than are pressed in half a second"
+    assert late[-1] and all(late[4:])
+
+
+def test_keys_that_nobody_has_read_for_a_while_are_late() -> None:
+    timing = KeyTiming()
+    assert timing.are_late(1, 0.0), "typed before the first look"
+    assert not timing.are_late(1, 0.05)
+    assert timing.are_late(1, 0.05 + MAX_UNREAD_S + 0.01), "a program that was stopped meanwhile"
+    assert not timing.are_late(MAX_AT_ONCE, 0.7) and timing.are_late(MAX_AT_ONCE + 1, 0.8)
