@@ -12,7 +12,8 @@ Durbin (1954) has them.
 is fitted to the measured torque (Gauss and Newton over latency and response time). Residuals hang together from instant
 to instant; so intervals come from how the values scatter when one block of the record after the other is left out
 (Tukey's jackknife), times `WIDER`. How long a drive holds what it measures is not known; up to `LOOP_S` of it is in the
-intervals.
+intervals. A motion that is not that of the model, as behind a gear with backlash, is wrong in all blocks alike; so what
+the torque balance does not explain widens the intervals further.
 """
 
 from collections.abc import Callable
@@ -34,6 +35,10 @@ WIDER = 1.7  # than the jackknife's: on drives with hidden parameters, seeds 0 t
 STEPS = 10  # of the servo's model in a tick
 SLOW_S = 0.2  # of angles against the speeds
 FULL = 0.95  # of the torque limit: beyond, the motor does not do what its servo wants
+MODEL_MISFIT = 0.04  # of the torque, rms: that much the balance does not explain of sound joints, by their ticks
+# What the balance leaves unexplained beyond that may have been absorbed by the values, too: as much of it, times this.
+# On drives with 10 to 45 mrad of backlash somewhere in the body, 1.5 covers the truth of all values.
+ABSORBED = 2.0
 Select = NDArray[np.bool_]
 Misfit = Callable[[float, float], float]  # of latency and response time
 
@@ -75,6 +80,7 @@ class Friction:
     armature_kg_m2: Value
     torque_scale: Value  # real torque, in what is measured
     explained: float  # share of the variance of the torque
+    misfit: float  # share of the torque, rms, that is unexplained and no shortcoming of the model; 0: none
     torque_nm: Floats  # (ticks - 2 HALF, 2) windowed: as measured; by the balance, NaN where it was not judged
 
 
@@ -126,6 +132,9 @@ def friction(moved: Moved, between_nm: Floats, load_nm: Floats, load_by_angle_nm
     if not scaled:
         rows, instruments, wanted = rows[:, :5], instruments[:, :5], wanted - load_nm[used]
     found = _solved(rows[used], wanted, instruments[used], blocks)
+    explained = 1 - float(np.var(found.left) / np.var(torque[used]))
+    misfit = max(1 - explained - MODEL_MISFIT**2, 0.0) ** 0.5
+    found = found.with_bias(ABSORBED * misfit * float(np.std(torque[used])) / _separate(rows[used]))
     scale = Value(1.0, 0.0)
     if scaled:
         share = found.values[5]
@@ -134,7 +143,17 @@ def friction(moved: Moved, between_nm: Floats, load_nm: Floats, load_by_angle_nm
     dry, viscous, armature, *_ = found.known
     shown = np.column_stack((torque, np.full(len(torque), np.nan)))
     shown[used, 1] = torque[used] - found.left
-    return Friction(dry, viscous, armature, scale, 1 - float(np.var(found.left) / np.var(torque[used])), shown)
+    return Friction(dry, viscous, armature, scale, explained, misfit, shown)
+
+
+def _separate(rows: Floats) -> Floats:
+    """Return how large a part of each column, rms, no combination of the other columns makes up."""
+    sizes: list[float] = []
+    for column in range(rows.shape[1]):
+        others = np.delete(rows, column, axis=1)
+        rest = rows[:, column] - others @ np.linalg.lstsq(others, rows[:, column], rcond=None)[0]
+        sizes.append(float(np.sqrt(np.mean(rest**2))))
+    return np.maximum(np.array(sizes), 1e-12)
 
 
 def servo(moved: Moved) -> Servo:
@@ -267,11 +286,17 @@ class Solved:
     spread: Floats  # covariance
     freedom: int
     left: Floats
+    bias: Floats | None = None  # to either side, besides; None: none
 
     @property
     def within(self) -> Floats:
         """Half-widths of their 95 % intervals."""
-        return WIDER * student_95(self.freedom) * np.sqrt(np.diag(self.spread))
+        scattered: Floats = WIDER * student_95(self.freedom) * np.sqrt(np.diag(self.spread))
+        return scattered if self.bias is None else scattered + self.bias
+
+    def with_bias(self, bias: Floats) -> "Solved":
+        """Return the same with intervals that are wider by this to either side."""
+        return replace(self, bias=bias)
 
     @property
     def known(self) -> list[Value]:
@@ -284,7 +309,8 @@ class Solved:
         values = self.values / by
         change = np.eye(len(values)) / by
         change[:, last] -= values / by
-        return Solved(values, change @ self.spread @ change.T, self.freedom, self.left)
+        bias = None if self.bias is None else np.abs(change) @ self.bias
+        return Solved(values, change @ self.spread @ change.T, self.freedom, self.left, bias)
 
 
 def _solved(rows: Floats, wanted: Floats, instruments: Floats, block: NDArray[np.int64]) -> Solved:

@@ -35,7 +35,7 @@ def load_nm(robot: RobotFile, angle_rad: Floats, velocity_rad_s: Floats, acceler
         axis = np.array(AXES[axis_name])
         rear = np.array([links[i].length_m, 0.0, 0.0])
         rise = rise + np.cross(spin, rear) + np.cross(turn, np.cross(turn, rear))
-        rotations.append(_rotations(axis, angle_rad[:, i]))  # from this link's frame to that of the one before
+        rotations.append(rotations_about(axis, angle_rad[:, i]))  # from this link's frame to that of the one before
         turn, spin, rise = (np.einsum("nji,nj->ni", rotations[-1], v) for v in (turn, spin, rise))
         rate = velocity_rad_s[:, i, None] * axis
         spin = spin + np.cross(turn, rate) + acceleration_rad_s2[:, i, None] * axis
@@ -57,8 +57,8 @@ def load_nm(robot: RobotFile, angle_rad: Floats, velocity_rad_s: Floats, acceler
     return torque
 
 
-def _rotations(axis: Floats, angle_rad: Floats) -> Floats:
-    """About a unit axis, (n, 3, 3)."""
+def rotations_about(axis: Floats, angle_rad: Floats) -> Floats:
+    """Return the rotations by angles about a unit axis, (n, 3, 3)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sin, cos = np.sin(angle_rad)[:, None, None], np.cos(angle_rad)[:, None, None]

@@ -11,13 +11,13 @@ from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.commissioning.estimate import Value
-from snakesim_operator.commissioning.identification import Identified, identified
+from snakesim_operator.commissioning.identification import FITS, Identified, identified
 from snakesim_operator.commissioning.identified_page import page
+from snakesim_operator.commissioning.measured import by_imus, imus_of, ticks_of
 from snakesim_operator.results.record import RunRecord
 
 PAGE = "identified.html"
 CONTROLLER = "identify"
-FITS = 0.8  # share of the torque that must be explained, or the robot did not hang as it is supposed to
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
 SHOWN = {
     "friction_nm": ("dry friction", "N·m"),
@@ -31,39 +31,43 @@ SHOWN = {
 
 
 def identify(run: Path, write: Path | None, out: Path | None) -> int:
-    """Print every joint, and write page and robot file. Returns 0 when all of it was found. Raises ConfigError."""
+    """Print every joint, and write page and robot file. Return 0 when all of it was found. Raises ConfigError."""
     if write is not None and find(str(write), "robots") != write:
         raise ConfigError(f"{write}: give the path of your own robot file, such as ./{write}.toml; shipped ones stay")
     record = RunRecord.load(run)
-    columns = _columns(record)
-    found = identified(record.config, columns)
+    judged = _judged_ticks(record)
+    columns: dict[str, Any] = {name: getattr(record, name)[judged] for name in COLUMNS}
+    rates, _ = by_imus(imus_of(record), ticks_of(record), len(record.description.links))
+    found = identified(record.config, columns, rates[judged])
     for one in found:
         _print(one)
+    if np.isnan(rates).all():
+        say("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
     path = out or (run if run.is_dir() else run.parent) / PAGE
     write_text(path, page(record, found))
     say(f"page: {path}")
     if write is not None:
         _write(write, record, found)
-    return 1 if any(one.fits is None or one.fits < FITS for one in found) else 0
+    return 0 if all(one.complete and not one.fails for one in found) else 1
 
 
-def _columns(record: RunRecord) -> dict[str, Any]:
-    """The part in which every value is known and every joint in position mode. Raises ConfigError."""
+def _judged_ticks(record: RunRecord) -> slice:
+    """Return the part in which every value is known and every joint in position mode. Raises ConfigError."""
     if record.config.controller != CONTROLLER:
         raise ConfigError(
             f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
             f"run with `snakesim run identify`"
         )
-    columns = {name: getattr(record, name) for name in COLUMNS}
-    known = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns.values()])
+    columns = [getattr(record, name) for name in COLUMNS]
+    known = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
     known &= (record.mode == Mode.POSITION).all(axis=1)
     known[1:] &= np.abs(np.diff(record.time_s) * record.config.rate_hz - 1) < 0.5
     edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False])).astype(int)))
-    runs = list(zip(edges[::2], edges[1::2], strict=True))
-    if not runs:
+    parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    if not parts:
         raise ConfigError(f"{record.folder}: the joints were never moved by position targets; run it again")
-    start, end = max(runs, key=lambda one: one[1] - one[0])
-    return {name: values[start:end] for name, values in columns.items()}
+    start, end = max(parts, key=lambda part: part[1] - part[0])
+    return slice(start, end)
 
 
 def _print(one: Identified) -> None:
@@ -78,7 +82,7 @@ def _print(one: Identified) -> None:
     for why in one.unknown:
         say(f"  unknown: {why}")
     if one.fits is not None and one.fits < FITS:
-        say("  it does not move as a robot that hangs by its tail: look at clamp, masses and lengths")
+        say("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
 
 
 def _interval(value: Value) -> str:
@@ -88,8 +92,15 @@ def _interval(value: Value) -> str:
 def _write(path: Path, record: RunRecord, found: list[Identified]) -> None:
     from snakesim_operator.commissioning.robot_edit import change_joints
 
-    good = [one for one in found if one.fits is not None and one.fits >= FITS]
-    values = {one.joint: {field: max(of.value, 0.0) for field, of in one.fields.items()} for one in good}
-    if values:
-        change_joints(path, values, f"identified from {record.folder.name}")
+    values: dict[str, dict[str, Any]] = {}
+    for one in found:
+        if one.fields and not one.fails:
+            values[one.joint] = {field: max(value.value, 0.0) for field, value in one.fields.items()}
+    left = [one.joint for one in found if one.joint not in values]
+    if not values:
+        say(f"{path}: nothing was written: the values of no joint are sure")
+        return
+    change_joints(path, values, f"identified from {record.folder.name}")
     say(f"{path}: {len(values)} joints changed; restart the host with it")
+    if left:
+        say(f"{path}: left as they were: {', '.join(left)}")

@@ -56,6 +56,7 @@ NO_LINK_TURNS = "no link turns with it; correct its gear, and run the check agai
 NO_LINK = "the links on both sides need an IMU or motion capture, at 30 Hz or more; or "
 BY_DIRECTION = NO_LINK + "turn it with `snakesim joints direction`, then add --by-hand"
 BY_GEAR = NO_LINK + "measure it with `snakesim joints gear`, then add --gear-by-hand"
+NO_REST = "the robot did not rest before the first motion; run the check again"
 NOT_STRAIGHT = "lay the robot straight, run the check again, and add --straight"
 
 
@@ -219,18 +220,20 @@ def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_ba
 def _judge_zero(run: Measured, joint: int, *, straight: bool) -> Finding:
     """Judge a joint's zero by gravity if that tells its angle, otherwise by the pose in which the robot was laid."""
     at_rest = run.at_rest()
-    drive = run.drives[joint]
-    measured_rad = float(np.mean(run.angle_rad[at_rest, joint]))
-    expected_rad = _angle_by_gravity(run, joint, at_rest) if run.axes[joint] == "pitch" else None
-    allowed_rad = LEVEL_RAD
-    if expected_rad is None:
-        if not straight:
-            return Finding("unknown", NOT_STRAIGHT)
-        expected_rad = 0.0
+    by_gravity_rad = _angle_by_gravity(run, joint, at_rest) if run.axes[joint] == "pitch" else None
+    if by_gravity_rad is not None:
+        off_rad = float(np.mean(run.angle_rad[at_rest, joint])) - by_gravity_rad
+        allowed_rad = LEVEL_RAD
+    elif not straight:
+        return Finding("unknown", NOT_STRAIGHT)
+    elif not run.before_motion().any():
+        return Finding("unknown", NO_REST)
+    else:
+        off_rad = float(np.mean(run.angle_rad[run.before_motion(), joint]))
         allowed_rad = STRAIGHT_RAD
-    off_rad = measured_rad - expected_rad
     if abs(off_rad) <= allowed_rad:
         return CONFIRMED
+    drive = run.drives[joint]
     zero_rad = drive.zero_rad + drive.sign * drive.gear * off_rad
     return Finding("wrong", f"its zero is off by {off_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
 

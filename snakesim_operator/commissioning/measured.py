@@ -19,6 +19,7 @@ from snakesim_operator.results.record import RunRecord
 
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
 NO_MOTION_RAD = 1e-6  # by which a target differs from its rest while its joint is moved
+CLAMPED = 0.9  # of the largest step from the measured angle: such a target is the command limiter's
 PITCH, YAW = 1, 2  # components of a vector in a link's frame
 Select = NDArray[np.bool_]
 
@@ -48,6 +49,10 @@ class Measured:
         """Return the ticks in which no joint's target is away from its rest, (n,)."""
         moved = [self.moved_by_target(joint) for joint in range(len(self.names))]
         return ~np.logical_or.reduce(moved)
+
+    def before_motion(self) -> Select:
+        """Return the ticks before the first joint is moved, (n,)."""
+        return np.logical_and.accumulate(self.at_rest())
 
     def moved_rad(self, joint: int) -> float:
         """Return how far the joint moved by its encoder, from end to end."""
@@ -94,6 +99,7 @@ def measured(
     late = 0 if sensor is None else round(sensor.delay_s * config.rate_hz)
     poses = np.full_like(columns["orientation_wxyz"], np.nan)
     poses[: len(poses) - late] = columns["orientation_wxyz"][late:]
+    target_rad = unclamped(columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad)
     return Measured(
         period_s=config.period_ns * 1e-9,
         names=[joint.name for joint in robot.joints],
@@ -102,11 +108,22 @@ def measured(
         angle_rad=columns["angle_rad"],
         velocity_rad_s=columns["velocity_rad_s"],
         torque_nm=columns["torque_nm"],
-        target_rad=columns["target"],
+        target_rad=target_rad,
         link_rate_rad_s=rates,
         link_force_m_s2=forces,
         base_turn_rad=_turns(poses),
     )
+
+
+def unclamped(target_rad: Floats, angle_rad: Floats, max_step_rad: float) -> Floats:
+    """Return the targets of the check, (n, joints), without those to which the command limiter brought them.
+
+    A joint without current is swung by the motion of others. Once it is `max_step_rad` from its target, the limiter
+    moves the target along with it, which is no motion of the check.
+    """
+    clamped = np.abs(target_rad - angle_rad) > CLAMPED * max_step_rad
+    at_rest_rad = np.nanmedian(np.where(clamped, np.nan, target_rad), axis=0)
+    return np.where(clamped, at_rest_rad, target_rad)
 
 
 def _turns(wxyz: Floats) -> Floats:

@@ -10,7 +10,7 @@ from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import Drive
 from snakesim_operator.commissioning.check import report_lines
 from snakesim_operator.commissioning.judge import AS_TOLD, Judged, judged
-from snakesim_operator.commissioning.measured import Measured
+from snakesim_operator.commissioning.measured import Measured, unclamped
 
 PERIOD_S = 0.01
 WAY_RAD = 0.06
@@ -155,6 +155,20 @@ def test_a_joint_whose_motion_did_not_come_or_that_did_not_move_is_not_confirmed
     assert states(unmoved) == dict.fromkeys(("drive", "order", "sign", "gear"), "unknown")
     dead = judged(replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), straight=True)[0]
     assert dead.verdict.startswith("did not move") and not dead.confirmed_by_hand(["order", "sign", "gear"]).as_told
+
+
+def test_a_dead_joint_that_others_swing_and_whose_target_the_limiter_moves_along_spoils_nothing() -> None:
+    run = measurements()
+    angle_rad = run.angle_rad.copy()
+    angle_rad[:, 2] = np.linspace(0.0, 0.6, TICKS)
+    target_rad = run.target_rad.copy()
+    target_rad[:, 2] = np.maximum(angle_rad[:, 2] - 0.35, 0.0)
+    target_rad = unclamped(target_rad, angle_rad, max_step_rad=0.35)
+    assert target_rad[:, 2] == pytest.approx(0.0)
+    swung = replace(run, angle_rad=angle_rad, target_rad=target_rad, link_rate_rad_s=run.link_rate_rad_s)
+    rows = judged(swung, straight=True)
+    assert [row.findings["zero"].state for row in rows] == ["confirmed"] * JOINTS
+    assert rows[0].as_told and not rows[2].as_told
 
 
 def test_motion_capture_of_the_base_stands_for_its_imu() -> None:
