@@ -58,11 +58,11 @@ class Child:
         self._program.write_text(
             f"#!{sys.executable}\n"
             "import json, os, pathlib, signal, sys, time\n"
-            "config = json.loads(pathlib.Path(sys.argv[3]).read_text())\n"
+            "config = json.loads(pathlib.Path(sys.argv[4]).read_text())\n"
             f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n" + "\n".join(lines)
         )
         self._program.chmod(0o755)
-        self._patch.setattr(own_twins.sys, "executable", str(self._program))
+        self._patch.setattr(sys, "executable", str(self._program))
 
     def noted(self) -> dict[str, Any]:
         return json.loads(self._noted.read_text())
@@ -72,7 +72,7 @@ class Child:
         noted = self.noted()
         with pytest.raises(ProcessLookupError):
             os.kill(noted["pid"], 0)
-        assert not Path(noted["arguments"][2]).exists()
+        assert not Path(noted["arguments"][3]).exists()
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: py
     twins = TwinProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
     noted = child.noted()
     arguments = noted["arguments"]
-    assert arguments[:2] == ["-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
+    assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
     assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
@@ -162,6 +162,6 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(child: Child, tmp_path
 def test_a_child_that_cannot_be_started_is_an_error_of_the_backend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(own_twins.sys, "executable", str(tmp_path / "no python"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "no python"))
     with pytest.raises(BackendError, match=r"the module twins cannot be started: .*No such file"):
         TwinProcess(RUN, ON_VCAN, None, stepped=True)
