@@ -21,8 +21,7 @@ from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
 from snakesim_operator.results.ended import COMPLETE
 from snakesim_operator.results.page.charts import Line, lines
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.verdict import distance_m
-from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.results.summary import RunSummary, distance_m
 
 PLAYBACK_PX = 580
 SPAN_S = (0.0, math.inf)
