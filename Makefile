@@ -34,10 +34,10 @@ help: ## List these targets
 
 setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 
-demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo, with a page to watch it
-	$(bin)/snakesim run triplet --console --pace realtime --duration 8 --out runs/demo $(ARGS)
+demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, with a page to watch it
+	$(bin)/snakesim run peg_row --controller obstacle_aided --console --pace realtime --duration 10 --out runs/demo $(ARGS)
 	@printf '%s\n' 'Next:' '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
-	  '  $(bin)/snakesim run peg_row --console --pace realtime      more pegs: it keeps going' \
+	  '  $(bin)/snakesim run triplet --console --pace realtime      the paper'\''s case study: one joint at a time pushes' \
 	  '  docs/tutorial.md, 3: write a controller                    push it your way'
 
 test: test-here test-vcan ## Run the tests, but for those that are slow

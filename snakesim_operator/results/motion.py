@@ -13,7 +13,7 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_operator.results.advance import Advance
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.time_axis import Interval, end_s
+from snakesim_operator.results.time_axis import Interval, end_s, zero_s
 
 RESTING_M = 0.4 * MOVING_M  # so near to where it then stands, a body has come to rest
 STANDING, MOVING = "standing still", "moving"
@@ -62,19 +62,40 @@ class Motion:
 
 def motion_of(record: RunRecord) -> Motion | None:
     """None when the pose was never measured: then it is unknown whether the body moved."""
-    advance = Advance.of(record)
-    if advance is None:
+    measured = _measured_centre(record)
+    if measured is None:
         return None
+    time_s, centre_w = measured
     whole_s = end_s(record)
-    stands = _stands(advance.time_s, advance.centre_w)
+    stands = _stands(time_s, centre_w)
     standing: list[Interval] = []
     for first, last in _runs(stands):
-        start_s = _rest_begins_s(advance.time_s, advance.centre_w, first)
-        until_s = whole_s if last == len(stands) - 1 else _rest_ends_s(advance.time_s, advance.centre_w, last)
+        start_s = _rest_begins_s(time_s, centre_w, first)
+        until_s = whole_s if last == len(stands) - 1 else _rest_ends_s(time_s, centre_w, last)
         if standing and start_s - standing[-1].end_s < WINDOW_S:  # too short to have moved for a window in between
             start_s = standing.pop().start_s
         standing.append(Interval(start_s, max(until_s, start_s), STANDING))
     return Motion(standing, whole_s)
+
+
+def _measured_centre(record: RunRecord) -> tuple[Floats, Floats] | None:
+    """Times on the axis, (m,), and the centre of mass then, (m, 2): by the pose sensor, else as guidance measured it.
+
+    A pose that guidance estimated by dead reckoning is no measurement.
+    """
+    advance = Advance.of(record)
+    if advance is not None:
+        return advance.time_s, advance.centre_w
+    begin_s = zero_s(record)
+    found = [
+        (world.stamp_ns * 1e-9 - begin_s, *world.centre_w[:2])
+        for world in record.worlds
+        if world.centre_w is not None and world.pose_from == "sensor" and world.stamp_ns * 1e-9 >= begin_s
+    ]
+    if len(found) < 2:
+        return None
+    rows = np.array(found)
+    return rows[:, 0], rows[:, 1:]
 
 
 def _window_begins(time_s: Floats) -> NDArray[np.intp]:

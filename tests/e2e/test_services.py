@@ -185,8 +185,8 @@ def test_control_holds_when_a_service_tells_an_old_pose_again_and_again(home: Pa
     code = ["--set", "services.sensor.code=./lab/frozen.py:Frozen", "--duration", "1"]
     ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
     assert ended.code == 0 and summary.pose_from == "sensor", ended.out
-    assert summary.last_state == "NotLocomoting" and re.search(
-        r"sensor/pose is 0\.\d+ s old", summary.last_reason or ""
+    assert summary.reported_state == "NotLocomoting" and re.search(
+        r"sensor/pose is 0\.\d+ s old", summary.reported_reason or ""
     )
 
 

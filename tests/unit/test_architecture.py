@@ -26,7 +26,7 @@ def test_every_function_of_the_walks_is_where_they_say() -> None:
 def test_from_the_readme_five_hops_lead_to_the_line_that_limits_a_torque() -> None:
     readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
     assert "make demo" in readme and "](docs/architecture.md#walks-through-the-code)" in readme
-    assert "snakesim run triplet" in makefile.partition("\ndemo:")[2].partition("\n\n")[0]
+    assert "snakesim run peg_row" in makefile.partition("\ndemo:")[2].partition("\n\n")[0]
     assert len(HOPS) == 5 and HOPS[-1][1] == "snakesim_hal/safety/gate.py"
     for (name, path, line), following in zip(HOPS, [*HOPS[1:], None], strict=True):
         assert any(line in source for source in sources(path, name)), f"{line!r} is not in {name} of {path}"

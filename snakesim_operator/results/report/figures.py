@@ -47,14 +47,14 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
         for span in (motion.spans if motion else [])
     ]
     drawn += [
-        Bar("state", band.start_s, band.end_s, in_words(band.what), f"--{band.what.lower()}")
+        Bar("control", band.start_s, band.end_s, in_words(band.what), f"--{band.what.lower()}")
         for band in state_bands(record)
     ]
     drawn += [Bar("jam", band.start_s, band.end_s, "jammed", "--bad") for band in jam_bands(record)]
     names = [joint.name for joint in record.description.joints]
     drawn += [Bar(names[i.joint], i.start_s, i.end_s, f"{i.length_s:.1f} s", colour(i.joint)) for i in intervals]
     propelled = [names[joint] for joint in sorted({one.joint for one in intervals}, reverse=True)]
-    rows = [row for row in ("motion", "state", "jam") if any(bar.row == row for bar in drawn)] + propelled
+    rows = [row for row in ("motion", "control", "jam") if any(bar.row == row for bar in drawn)] + propelled
     return bars("States and propulsion joint over time", rows, drawn, end_s(record), faults(record))
 
 

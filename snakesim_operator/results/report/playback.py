@@ -13,6 +13,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.motion import MOVING, STANDING, Motion, motion_of
 from snakesim_operator.results.record import RunRecord
@@ -90,13 +91,14 @@ def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -
     reported = "control reported nothing" if state is None else f"{in_words(state.state)}: {state.reason}"
     if motion is None:
         return reported
-    if motion.stands_at(time_s):
-        agrees = state is not None and state.state != "Locomoting"
-        return reported if agrees else STANDING
-    agrees = state is not None and state.state == "Locomoting"
-    if agrees or state is None:
-        return reported if agrees else MOVING
-    return f"{MOVING}; control reported {reported}"
+    stands = motion.stands_at(time_s)
+    measured = STANDING if stands else MOVING
+    if state is None or state.reason == STANDING_STILL:  # control's own measure, which looks back for a window
+        return measured
+    agrees = stands == (state.state != "Locomoting")
+    if agrees:
+        return reported
+    return measured if stands else f"{measured}; control reported {reported}"
 
 
 def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:

@@ -8,7 +8,7 @@ from snakesim_operator.results.ended import COMPLETE, UNKNOWN
 from snakesim_operator.results.motion import Motion, motion_of
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import longest_reason, reported_while_moving
-from snakesim_operator.results.summary import RunSummary, estimates_of
+from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 from snakesim_operator.results.time_axis import end_s, reported_at_s
 
 MOVED_M = 0.02  # less than this is no locomotion
@@ -61,7 +61,8 @@ def _verdict_of_motion(record: RunRecord, summary: RunSummary, motion: Motion, m
     handed_over = _handed_over(record, summary) or _pushed_off(record)
     if _did_not_locomote(summary):
         kind = "Jammed" if summary.jammed else "Did not locomote"
-        why = summary.last_reason or STANDING_STILL
+        came_back = summary.last_state == "Locomoting"
+        why = "it ended less than 2 cm from where it began" if came_back else summary.last_reason or STANDING_STILL
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {trouble}.{ending}")
     stop = stop_of(record, motion)
     stood = 1.0 - motion.moving_fraction
@@ -74,7 +75,8 @@ def _verdict_of_motion(record: RunRecord, summary: RunSummary, motion: Motion, m
     stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
     contradiction = _reported_while_moving(record, motion)
     backward = (summary.path_distance_m or 0.0) < 0
-    good: Kind = "poor" if ending or backward else "good"
+    is_poor = bool(ending) or backward or distance_m(summary) is None
+    good: Kind = "poor" if is_poor else "good"
     return Verdict(good, f"{moved}{until_end}; {handed_over}{jam}{trouble}.{stopped}{contradiction}{ending}")
 
 
@@ -83,7 +85,7 @@ def _did_not_locomote(summary: RunSummary) -> bool:
     if summary.locomoting_fraction == 0:
         return True
     distances = [abs(one) for one in (summary.path_distance_m, summary.net_displacement_m) if one is not None]
-    return max(distances, default=0.0) < MOVED_M
+    return bool(distances) and max(distances) < MOVED_M
 
 
 def _reported_while_moving(record: RunRecord, motion: Motion) -> str:

@@ -42,11 +42,22 @@ def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, ampl
 
 
 def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
-    blind = changed(record, position_w=record.position_w * np.nan)
+    blind = changed(record, position_w=record.position_w * np.nan, worlds=[])
     assert motion_of(blind) is None
     reported = summarise(blind, "complete")
     assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
     assert reported.reported_state == "NotLocomoting"
+
+
+def test_a_pose_that_a_service_measures_counts_and_one_that_is_reckoned_does_not(record: RunRecord) -> None:
+    """The black box has no pose then; guidance's world model has."""
+    blind = changed(record, position_w=record.position_w * np.nan)
+    for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):
+        worlds = [msgspec.structs.replace(world, pose_from=source) for world in record.worlds]
+        known = changed(blind, worlds=worlds)
+        summary = summarise(known, "complete")
+        assert summary.locomoting_fraction == fraction
+        assert verdict(known, summary).words.startswith("Ran for 10.0 s; the distance is unknown;")
 
 
 def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.CaptureFixture[str]) -> None:
