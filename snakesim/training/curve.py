@@ -6,12 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from snakesim.training.search import Generation
+from snakesim_hal.model.textfiles import exported
 from snakesim_operator.figures.inherited import PLAIN_TEXT, import_matplotlib
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
     """`curve.csv` and `curve.png` in a folder."""
-    with (folder / "curve.csv").open("w", newline="") as file:
+    with exported(folder / "curve.csv") as partial, partial.open("x", newline="") as file:
         table = csv.DictWriter(file, list(asdict(generations[0])))
         table.writeheader()
         table.writerows(asdict(one) for one in generations)
@@ -39,4 +40,5 @@ def _draw_plain(file: Path, generations: Sequence[Generation]) -> None:
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    figure.savefig(file, dpi=120)
+    with exported(file) as partial:
+        figure.savefig(partial, dpi=120)

@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 PARTIAL = ".partial"
@@ -27,6 +29,31 @@ def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
         raise
     if durable:
         sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yield another path, for a library to write a file or a folder there; then it takes the place of `path`.
+
+    The other path has the same suffix, by which libraries choose a format. If anything is raised, `path` is unchanged
+    and nothing is left of the other one.
+    """
+    partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
+    _remove(partial)  # of a process that was killed
+    try:
+        yield partial
+        partial.rename(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            _remove(partial)
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
