@@ -1,23 +1,21 @@
 """The learning curve: a table, and a figure of it."""
 
 import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from snakesim.training.search import Generation
-from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.model.textfiles import exported
 from snakesim_operator.figures.inherited import PLAIN_TEXT, import_matplotlib
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
     """`curve.csv` and `curve.png` in a folder."""
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, list(asdict(generations[0])))
-    table.writeheader()
-    table.writerows(asdict(one) for one in generations)
-    write_whole(folder / "curve.csv", text.getvalue().encode())
+    with exported(folder / "curve.csv") as partial, partial.open("x", newline="") as file:
+        table = csv.DictWriter(file, list(asdict(generations[0])))
+        table.writeheader()
+        table.writerows(asdict(one) for one in generations)
     _draw(folder / "curve.png", generations)
 
 
@@ -42,6 +40,5 @@ def _draw_plain(file: Path, generations: Sequence[Generation]) -> None:
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=120)
-    write_whole(file, picture.getvalue())
+    with exported(file) as partial:
+        figure.savefig(partial, dpi=120)

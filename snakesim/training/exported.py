@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 from snakesim.training.form import FELT_RAD, OBSERVE, RAMP_PER_S, Policy
 from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, opened
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.model.textfiles import exported
 
 LEARNED = "snakesim.learned"
 OPSET, IR = 17, 10  # that onnxruntime 1.20 reads
@@ -70,4 +70,5 @@ def export(file: Path, policy: Policy, values: Mapping[str, float], frame_skip: 
     }
     helper.set_model_props(model, properties)
     onnx.checker.check_model(model)
-    write_whole(file, model.SerializeToString())
+    with exported(file) as partial:
+        onnx.save(model, partial)

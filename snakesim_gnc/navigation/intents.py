@@ -6,6 +6,7 @@ from snakesim_hal.wire.messages import Intent
 
 LONGEST_NS = 5_000_000_000  # upper limit of an intent's validity
 FASTEST_M_S = 10.0  # as a scenario's mission
+SENDERS_KEPT = 64
 AHEAD_NS = 100_000_000  # its sender may have received a newer clock than navigation, which acts a few times a second
 
 
@@ -29,9 +30,11 @@ class Intents:
         self._followed: Intent | None = None
         self._stopped = ""  # why it stands still, after an intent that was followed; empty before any was
         self._heading_w_rad: float | None = None  # stays while it stands still: a stop plans no other path
+        self._newest_ns: dict[str, int] = {}  # stamp of the newest intent that was followed, by its sender
 
     def start_over(self) -> None:
         """Robot time restarts: earlier stamps are void."""
+        self._newest_ns.clear()
         if self._followed is not None:
             self._stop(f"the intent of {self._followed.who} was for another start of the robot")
 
@@ -39,11 +42,9 @@ class Intents:
         """The present speed. newest: the newest intent; now_ns: robot time."""
         refused = ""
         if newest is not None and newest != self._followed:
-            refused = _against(newest, now_ns)
+            refused = _against(newest, now_ns) or self._why_overtaken(newest)
             if not refused:
-                self._followed, self._stopped = newest, ""
-                if newest.go:
-                    self._heading_w_rad = newest.heading_w_rad
+                self._follow(newest)
         if self._followed is not None and (why := _against(self._followed, now_ns)):
             self._stop(why)
         followed, heading = self._followed, self._heading_w_rad
@@ -53,6 +54,25 @@ class Intents:
             return DesiredMotion(0.0, f"{followed.who} wants it to stop", heading)
         asked = followed.speed_m_s
         return DesiredMotion(self._mission_m_s if asked is None else asked, f"as {followed.who} wants it", heading)
+
+    def _follow(self, intent: Intent) -> None:
+        self._followed = intent
+        self._stopped = ""
+        if intent.go:
+            self._heading_w_rad = intent.heading_w_rad
+        self._newest_ns.pop(intent.who, None)
+        self._newest_ns[intent.who] = intent.stamp_ns
+        while len(self._newest_ns) > SENDERS_KEPT:
+            del self._newest_ns[next(iter(self._newest_ns))]
+
+    def _why_overtaken(self, intent: Intent) -> str:
+        """Return why an intent is rejected that its sender gave before another one; empty when it did not.
+
+        Whoever has asked for a stop must not be set in motion by what they asked for earlier, and a network held back.
+        """
+        if intent.go and intent.stamp_ns < self._newest_ns.get(intent.who, intent.stamp_ns):
+            return f"the intent of {intent.who} is older than another one that came before it"
+        return ""
 
     def _stop(self, why: str) -> None:
         self._followed, self._stopped = None, f"{why}; send a new one to go on"

@@ -276,7 +276,9 @@ class Outcomes:
         for reason in reasons:
             terminalreporter.write_line(f"skipped: {reason}")
         if path := config.getoption("--snakesim-table"):
-            Path(path).write_text(markdown(benches, lines, reasons))
+            from snakesim_hal.model.textfiles import write_text
+
+            write_text(Path(path), markdown(benches, lines, reasons))
             terminalreporter.write_line(f"written to {path}")
 
 

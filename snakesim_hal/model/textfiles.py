@@ -11,12 +11,12 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from snakesim_hal.errors import ConfigError, nearest
-from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.model.whole_file import replaced, write_whole
 
 MB = 1024 * 1024
 MAX_BYTES, MAX_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML
@@ -137,6 +137,34 @@ def _check_depth(value: Any, source: str) -> None:
         if not level:
             return
     raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels")
+
+
+@contextlib.contextmanager
+def exported(path: Path) -> Iterator[Path]:
+    """Yield the path where an export is written, file or folder; it becomes `path` when it is whole.
+
+    Through a symbolic link, the file that it leads to is replaced.
+
+    Raises:
+        ConfigError: It cannot be written, for the disk is full for example. No half of it is left then.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(Path(os.path.realpath(path))) as partial:
+            yield partial
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be written: {_reason(error)}. What was there before is unchanged. Make room, or choose "
+            "another place with --out"
+        ) from None
+
+
+def _reason(error: OSError) -> str:
+    """Return why it failed; some libraries raise it with a text of their own, and no more."""
+    number = error.errno if error.errno is not None else re.search(r"errno (\d+)", str(error))
+    if isinstance(number, re.Match):
+        number = int(number[1])
+    return str(error) if number is None else os.strerror(number)
 
 
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:

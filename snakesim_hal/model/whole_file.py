@@ -3,7 +3,9 @@
 import contextlib
 import errno
 import os
+import shutil
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 PARTIAL = ".partial"
@@ -60,6 +62,31 @@ def _permissions(path: Path) -> int | None:
     except FileNotFoundError:
         return None
     return stat.S_IMODE(mode) if stat.S_ISREG(mode) else None
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yield another path, for a library to write a file or a folder there; then it takes the place of `path`.
+
+    The other path has the same suffix, by which libraries choose a format. If anything is raised, `path` is unchanged
+    and nothing is left of the other one.
+    """
+    partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
+    _remove(partial)  # of a process that was killed
+    try:
+        yield partial
+        partial.rename(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            _remove(partial)
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

@@ -4,6 +4,8 @@ A bridge joins it as a client of an explicit endpoint. Nothing that happens ther
 it is another session, samples are dropped rather than waited for, and only the newest of each key is kept.
 """
 
+import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -34,22 +36,37 @@ class RawPublisher:
 
 
 @dataclass(frozen=True)
+class RawSample:
+    """One sample, as it was sent."""
+
+    payload: bytes
+    attachment: bytes
+    arrived_ns: int  # monotonic
+
+
 class RawReader:
-    """The newest payloads of one key."""
+    """The newest samples of one key."""
 
-    _subscriber: Any
+    def __init__(self, depth: int) -> None:
+        """depth: how many are kept."""
+        self._kept: deque[RawSample] = deque(maxlen=depth)
 
-    def drain(self) -> list[bytes]:
-        """What has arrived since the last call, as far as it is kept."""
-        found: list[bytes] = []
-        while (payload := self.newest()) is not None:
-            found.append(payload)
+    def take(self, sample: zenoh.Sample) -> None:
+        """Keep one; in Zenoh's thread."""
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        self._kept.append(RawSample(sample.payload.to_bytes(), attachment, time.monotonic_ns()))
+
+    def drain(self) -> list[RawSample]:
+        """What has arrived since the last call, as far as it is kept, oldest first."""
+        found: list[RawSample] = []
+        while self._kept:
+            found.append(self._kept.popleft())
         return found
 
-    def newest(self) -> bytes | None:
-        """What has arrived since the last call; None: nothing."""
-        sample = self._subscriber.try_recv()
-        return None if sample is None else sample.payload.to_bytes()
+    def newest(self) -> RawSample | None:
+        """The newest one that has arrived since the last call; None: nothing."""
+        found = self.drain()
+        return found[-1] if found else None
 
 
 @dataclass(frozen=True)
@@ -109,10 +126,10 @@ class ForeignNetwork:
         return RawQueryable(queryable)
 
     def reader(self, key: str, depth: int = 1) -> RawReader:
-        """The newest payloads of a key."""
-        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth))
-        self._declared.append(subscriber)
-        return RawReader(subscriber)
+        """The newest samples of a key."""
+        reader = RawReader(depth)
+        self._declared.append(self._zenoh.declare_subscriber(key, reader.take))
+        return reader
 
     def declare_token(self, key: str) -> None:
         """Declare a liveliness token for as long as the session lives."""

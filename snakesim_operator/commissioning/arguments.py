@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_network, number
+from snakesim_operator.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 from snakesim_operator.tools.robot_selection import selection_of
 
-ALLOWED_BACKLASH_RAD = 0.01  # 0.6 degrees; a sound gear and the noise of its gyros show half of it
 TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
 JOG = (
     "Move one joint slowly, while a key is held; the motors of the others stay off. It arms the robot, checked or not."

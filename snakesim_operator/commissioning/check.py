@@ -10,10 +10,10 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.checked import CHECK, PROPERTIES, Checked, JointProperty, mounting_digest
 from snakesim_hal.process import user_name
 from snakesim_hal.terminal import say
-from snakesim_operator.commissioning.arguments import ALLOWED_BACKLASH_RAD
 from snakesim_operator.commissioning.judge import LEAST_TORQUE_NM, Judged, judged
 from snakesim_operator.commissioning.measured import COLUMNS, imus_of, measured, ticks_of
 from snakesim_operator.commissioning.robot_edit import joints_on_drives, must_be_own, write_checked
+from snakesim_operator.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 from snakesim_operator.results.record import RunRecord
 
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from snakesim_hal.model.checked import PROPERTIES, JointProperty
 from snakesim_hal.model.joints import Drive
-from snakesim_operator.commissioning.arguments import ALLOWED_BACKLASH_RAD
 from snakesim_operator.commissioning.link_shares import (
     MOVES_RAD_S,
     find_order,
@@ -28,6 +27,7 @@ from snakesim_operator.commissioning.link_shares import (
 )
 from snakesim_operator.commissioning.lost_motion import LostMotion, find_lost_motion
 from snakesim_operator.commissioning.measured import Measured, Select
+from snakesim_operator.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
 AS_TOLD = "as the robot file says"
 LEAST_MOVED_RAD = 0.012  # a fifth of the default way to one side

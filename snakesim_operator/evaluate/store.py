@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.textfiles import exported
 from snakesim_operator.evaluate.case import GAVE_UP, OF_THE_CLOCK, Case, Number, Outcome
 from snakesim_operator.results.summary import RunSummary
 
@@ -86,8 +87,9 @@ def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Pat
     rows = [{**one.numbers, **case.columns, "error": one.error} for case, one in finished]
     paths = [folder / PARQUET, folder / CSV]
     schema = pa.schema(list(columns.items()))
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema), paths[0])
-    with paths[1].open("w", newline="", encoding="utf-8") as file:
+    with exported(paths[0]) as partial:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), partial)
+    with exported(paths[1]) as partial, partial.open("x", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(columns), extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

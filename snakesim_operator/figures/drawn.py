@@ -1,5 +1,6 @@
 """Signals of a run over time, as a figure for a paper; and the files that figures are written to."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.model.textfiles import exported
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.figures.lines import STYLE, Floats, over_time
@@ -67,11 +69,10 @@ def signals(record: RunRecord, names: Sequence[str], width_in: float, span_s: tu
 
 def written(figure: Figure, path: Path) -> None:
     """Save it, and say where. Raises ConfigError."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another place with --out") from None
+    content = io.BytesIO()  # matplotlib's PDF writer raises errors of its own after one of the disk
+    figure.savefig(content, format=path.suffix[1:])
+    with exported(path) as partial:
+        partial.write_bytes(content.getvalue())
     say(f"written: {path}")
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.textfiles import exported
 from snakesim_hal.terminal import Say, printable
 from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
@@ -50,18 +51,24 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
         raise ConfigError(f"--format {form}: one run at a time; several make a dataset, with --format lerobot")
     path = _free(out or _beside(runs[0], form))
     if form == "mcap":
-        count, lacks = recover(recording_of(runs[0]), path)
+        with exported(path) as partial:
+            count, lacks = recover(recording_of(runs[0]), partial)
         say(f"{count} messages: {path}")
         return exit_code(runs[0], lacks)
     record = RunRecord.load(runs[0])
     if form == "npz":
         names: dict[str, Any] = {"joints": np.array([joint.name for joint in record.description.joints])}
-        np.savez_compressed(path, **arrays(record), **names, lacks=np.array(record.lacks, dtype=str))
+        lacks_of_npz = np.array(record.lacks, dtype=str)
+        with exported(path) as partial, partial.open("xb") as file:
+            np.savez_compressed(file, **arrays(record), **names, lacks=lacks_of_npz)
     elif form == "csv":
-        _write_csv(table(record), path, record.lacks)
+        with exported(path) as partial:
+            _write_csv(table(record), partial, record.lacks)
     else:
         columns = {name: values.tolist() for name, values in table(record).items()}
-        write_parquet(columns, path, {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None)
+        metadata = {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None
+        with exported(path) as partial:
+            write_parquet(columns, partial, metadata)
     say(f"{len(record.time_s)} ticks: {path}")
     return exit_code(runs[0], record.lacks)
 
@@ -72,7 +79,8 @@ def export_dataset(
     """Writes a LeRobot dataset, an episode a run or demonstration, and one more for each gap. Raises ConfigError."""
     path = _free(out or _beside(runs[0], "lerobot"))
     episodes = read_episodes(runs, task, images=images)
-    size = write_lerobot(episodes, path, write_parquet, fps)
+    with exported(path) as partial:
+        size = write_lerobot(episodes, partial, write_parquet, fps)
     for sentence in gaps_in_words(episodes):
         say(sentence)
     say(f"{size.episodes} episodes, {size.frames} frames: {path}")

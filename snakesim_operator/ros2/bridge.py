@@ -24,6 +24,7 @@ from snakesim_operator.ros2 import messages as ros
 from snakesim_operator.ros2 import robot_in_ros
 from snakesim_operator.ros2.frames import Frames, ros_name
 from snakesim_operator.ros2.graph import Node, RosPublisher, RosType, Topic
+from snakesim_operator.ros2.message_age import SenderClocks
 from snakesim_operator.ros2.messages import Transform
 from snakesim_operator.ros2.relay import Relay, RosTime
 from snakesim_operator.ros2.steering import Steering
@@ -83,7 +84,8 @@ class Bridge:
         if not self._options.wall_time:
             self._ros_clock = self._node.publisher(Topic("/clock", ros.CLOCK, depth=1, best_effort=True))
         if self._options.cmd_vel:
-            self._steering = Steering()
+            self._steering, self._senders = Steering(), SenderClocks()
+            self._said = ""  # why a message on cmd_vel was dropped
             self._cmd_vel = self._node.subscription(Topic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1))
             self._intents = self._session.publisher(keys.INTENT, m.Intent)
 
@@ -263,12 +265,16 @@ class Bridge:
 
     def _steer(self) -> None:
         """What ROS asks for; nothing while the robot is silent, because an intent needs its time."""
-        payload = self._cmd_vel.newest()
-        if payload is None or self._clock is None or self._heard_s is None:
+        twist = self._cmd_vel.newest()
+        if twist is None or self._clock is None or self._heard_s is None:
             return
-        intent = self._steering.intent(payload, self._clock.stamp_ns, self._heading_w_rad())
+        age_ns = self._senders.age_ns(twist, time.time_ns(), time.monotonic_ns())
+        intent = self._steering.intent(twist.payload, self._clock.stamp_ns, self._heading_w_rad(), age_ns)
         if intent is not None:
             self._intents.put(intent)
+        elif self._steering.why != self._said:
+            self._said = self._steering.why
+            say(f"a message on cmd_vel {self._said}; it is dropped, with all that are alike")
 
     def _heading_w_rad(self) -> float | None:
         """Direction from the tail to the head joint; None: not known."""

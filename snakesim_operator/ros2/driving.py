@@ -6,6 +6,7 @@ into its safe action.
 
 import contextlib
 import threading
+import time
 
 from snakesim_hal.errors import NotConnectedError, RefusedError, SnakesimError
 from snakesim_hal.injection import CONTROL
@@ -15,7 +16,9 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, JointState, Status
+from snakesim_hal.workers import start_worker
 from snakesim_operator.ros2.joint_commands import JointTargets
+from snakesim_operator.ros2.message_age import SenderClocks
 
 RETRY_S, PRESENT_S, END_S = 2.0, 5.0, 5.0
 
@@ -23,18 +26,22 @@ RETRY_S, PRESENT_S, END_S = 2.0, 5.0, 5.0
 class Driving:
     """Commands every joint in every tick, from the messages of one topic; again after each loss of the robot."""
 
-    def __init__(self, session: Session, messages: RawReader, say: Say) -> None:
-        """Raises RefusedError for a robot that has a controller."""
+    def __init__(self, session: Session, messages: RawReader, say: Say, *, wall_time: bool) -> None:
+        """Take the lease. Raises RefusedError for a robot that has a controller.
+
+        wall_time: whether stamps in ROS are wall-clock time, else robot time.
+        """
         if session.present(keys.alive(CONTROL)):
             raise RefusedError(
                 "--joint-commands: the robot has a controller already, which holds the lease; run it without one: "
                 "--set services.control.external=true"
             )
         self._session, self._messages, self._say = session, messages, say
+        self._wall_time = wall_time
+        self._senders = SenderClocks()
         self._ended = threading.Event()
         self._said = ""
-        self._thread = threading.Thread(target=self._run, name="driving", daemon=True)
-        self._thread.start()
+        self._thread = start_worker("driving", self._run, is_over=self._ended.is_set)
 
     def close(self) -> None:
         """End it, and with it the lease."""
@@ -61,8 +68,11 @@ class Driving:
             clock = commanding.wait()
             if commanding.host_changed():
                 raise NotConnectedError("the robot's host has restarted")
-            for payload in self._messages.drain():
-                if not targets.take(payload, clock.stamp_ns):
+            for message in self._messages.drain():
+                wall_ns = time.time_ns()
+                age_ns = self._senders.age_ns(message, wall_ns, time.monotonic_ns())
+                ros_now_ns = wall_ns if self._wall_time else clock.stamp_ns
+                if not targets.take(message.payload, clock.stamp_ns, ros_now_ns, age_ns):
                     self._tell(f"a message on joint_commands {targets.why}; it is dropped, with all that are alike")
             joints = commanding.read(keys.JOINTS)
             if isinstance(joints, JointState) and (commanding.mine or clock.lifecycle != "armed"):

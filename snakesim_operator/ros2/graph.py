@@ -127,7 +127,7 @@ class Node:
         return RosPublisher(publisher, token)
 
     def subscription(self, topic: Topic) -> RawReader:
-        """The newest messages of a topic, in CDR, as many as its depth."""
+        """The newest messages of a topic, in CDR and with what is attached, as many as its depth."""
         reader = self._network.reader(topic_key(self._domain, topic), topic.depth)
         self._network.declare_token(self._token(SUBSCRIPTION, topic))
         return reader

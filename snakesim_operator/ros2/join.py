@@ -66,7 +66,7 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
                 opened.callback(server.close)
             if arguments.joint_commands:
                 commands = node.subscription(Topic(f"/{made.prefix}joint_commands", JOINT_STATE, depth=KEPT_COMMANDS))
-                opened.callback(Driving(session, commands, say).close)
+                opened.callback(Driving(session, commands, say, wall_time=wall_time).close)
             say(
                 f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
                 f"{'wall-clock' if wall_time else 'robot'} time; Ctrl-C ends it"

@@ -1,20 +1,32 @@
 """From sensor_msgs/JointState on joint_commands to set-points for every joint. Pure except for its own state.
 
-A message names any joints. Each of them follows what it was told for half a second of robot time, then stays where it
-is; so does every joint of which nothing was said since arming. What is said while the robot is not armed is dropped.
+A message names any joints. Each of them follows what it was told for half a second of robot time, from when the message
+was sent on, then stays where it is; so does every joint of which nothing was said since arming. What is said while the
+robot is not armed is dropped.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 from rosbags.serde import SerdeError
 
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import Clock, Description, JointState, Mode
+from snakesim_operator.ros2.message_age import why_too_old
 from snakesim_operator.ros2.messages import JOINT_STATE, STORE
 
 VALID_NS = 500_000_000  # of a joint's command in robot time
 KINDS = ((Mode.POSITION, "position"), (Mode.VELOCITY, "velocity"), (Mode.TORQUE, "effort"))  # the first given counts
+
+
+@dataclass(frozen=True)
+class _Commanded:
+    """A message that can be followed."""
+
+    mode: Mode
+    targets: dict[int, float]  # by joint
+    stamp_ns: int  # of its header, in ROS time; 0: none
 
 
 class JointTargets:
@@ -29,16 +41,34 @@ class JointTargets:
         self.rejected = 0  # messages
         self.why = ""  # the last one was
 
-    def take(self, payload: bytes, now_ns: int) -> bool:
-        """Take in a message, all of it or nothing. now_ns: robot time."""
+    def take(self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0) -> bool:
+        """Take in a message, all of it or nothing; returns whether it was taken.
+
+        Args:
+            payload: The message in CDR.
+            now_ns: Robot time.
+            ros_now_ns: The time in ROS, with which a header's stamp is compared; None: robot time.
+            age_ns: How long ago the message was sent, for one without a stamp.
+        """
         commanded = self._read(payload)
         if isinstance(commanded, str):
-            self.rejected, self.why = self.rejected + 1, commanded
-            return False
-        mode, targets = commanded
-        for i, target in targets.items():
-            self._told[i], self._stays_rad[i] = (mode, target, now_ns + VALID_NS), None
+            return self._reject(commanded)
+        by = "the times of its sender's messages"
+        if commanded.stamp_ns:
+            age_ns = (now_ns if ros_now_ns is None else ros_now_ns) - commanded.stamp_ns
+            by = "the stamp of its header"
+        if why := why_too_old(age_ns, by):
+            return self._reject(why)
+        until_ns = now_ns - max(age_ns, 0) + VALID_NS
+        for i, target in commanded.targets.items():
+            self._told[i] = (commanded.mode, target, until_ns)
+            self._stays_rad[i] = None
         return True
+
+    def _reject(self, why: str) -> bool:
+        self.rejected += 1
+        self.why = why
+        return False
 
     def set_points(self, clock: Clock, joints: JointState) -> SetPoints:
         """For this tick. An arming begins with staying."""
@@ -58,8 +88,8 @@ class JointTargets:
             targets[i] = stays_rad
         return SetPoints(modes, targets, self._limits_nm)
 
-    def _read(self, payload: bytes) -> tuple[Mode, dict[int, float]] | str:
-        """Mode and targets by joint; a text: what is wrong with it."""
+    def _read(self, payload: bytes) -> "_Commanded | str":
+        """What a message commands; a text: what is wrong with it."""
         try:
             found: Any = STORE.deserialize_cdr(payload, JOINT_STATE.name)
         except SerdeError as error:
@@ -80,4 +110,5 @@ class JointTargets:
             if not joint.has(mode):
                 return f"has {word} for {name}, whose drive takes {', '.join(one.name.lower() for one in joint.modes)}"
             targets[self._index[name]] = value
-        return mode, targets
+        stamp_ns = found.header.stamp.sec * 1_000_000_000 + found.header.stamp.nanosec
+        return _Commanded(mode, targets, stamp_ns)

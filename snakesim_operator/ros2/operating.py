@@ -1,5 +1,6 @@
 """Arm, disarm, clear and stop as services of ROS: the same requests as those of `snakesim arm` and the others."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, request_to_arm
 from snakesim_operator.ros2.graph import Node
+from snakesim_operator.ros2.message_age import why_request_too_old
 from snakesim_operator.ros2.server import Server, told
 from snakesim_operator.ros2.service_types import TRIGGER
 from snakesim_operator.tools.command import ask_host
@@ -28,7 +30,22 @@ def operating_servers(session: Session, node: Node, link: Link, prefix: str, *, 
             "disarm": lambda: _ask(session, link, LifecycleRequest(action="disarm", who=WHO), "disarmed"),
             "clear": lambda: _ask(session, link, LifecycleRequest(action="clear", who=WHO), "cleared"),
         }
-    return [Server(node, f"/{prefix}{name}", TRIGGER, _triggered(act)) for name, act in acts.items()]
+    return [
+        Server(
+            node,
+            f"/{prefix}{name}",
+            TRIGGER,
+            _triggered(act),
+            refuse=lambda why: TRIGGER.response(False, why),
+            why_not=_why_not_armed if name == "arm" else lambda _attachment: "",
+        )
+        for name, act in acts.items()
+    ]
+
+
+def _why_not_armed(attachment: bytes) -> str:
+    """A network that stalls may deliver a request long after somebody has given it up."""
+    return why_request_too_old(attachment, time.time_ns())
 
 
 def _triggered(act: Callable[[], str]) -> Callable[[Any], bytes]:

@@ -8,8 +8,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.network.foreign_network import RawQueryable
+from snakesim_hal.network.foreign_network import RawQueryable, RawQuestion
 from snakesim_hal.terminal import Say
+from snakesim_hal.workers import ErrorReport
 from snakesim_operator.ros2.graph import Node, Topic, answering
 from snakesim_operator.ros2.service_types import Service
 
@@ -20,12 +21,34 @@ MAX_REQUEST_BYTES = 65536
 class Server:
     """One service."""
 
-    def __init__(self, node: Node, name: str, service: Service, answer: Answer, depth: int = 10) -> None:
-        """depth: of its queue, as the rmw profile of its kind has it."""
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        service: Service,
+        answer: Answer,
+        depth: int = 10,
+        *,
+        refuse: Callable[[str], bytes] | None = None,
+        why_not: Callable[[bytes], str] = lambda _attachment: "",
+    ) -> None:
+        """Declare the service.
+
+        Args:
+            node: The node that offers it.
+            name: Its name, with its namespace.
+            service: Its type.
+            answer: Makes the response to a request, in a thread of its own.
+            depth: Of its queue, as the rmw profile of its kind has it.
+            refuse: Makes the response that says why not; None: its type has none.
+            why_not: Says why a request with this attachment is refused; empty when it is not.
+        """
         self.name, self._service, self._answer = name, service, answer
+        self._refuse, self._why_not = refuse, why_not
         self._waiting: RawQueryable = node.server(Topic(name, service.type, depth=depth))
         self._thread = ThreadPoolExecutor(1)
         self._answered: Future[None] | None = None
+        self._errors = ErrorReport(name)
         self.rejected = 0  # requests that were none
 
     def turn(self, say: Say) -> None:
@@ -44,7 +67,20 @@ class Server:
         if attached is None or request is None:
             self.rejected += 1
             return
-        self._answered = self._thread.submit(lambda: question.reply(self._answer(request), attached))
+        self._answered = self._thread.submit(lambda: question.reply(self._respond(request, question), attached))
+
+    def _respond(self, request: Any, question: RawQuestion) -> bytes:
+        """The response. An unexpected error is one as well, where its type can say so: a client waits for it."""
+        why_not = self._why_not(question.attachment)
+        if why_not and self._refuse is not None:
+            return self._refuse(why_not)
+        try:
+            return self._answer(request)
+        except Exception as error:
+            if self._refuse is None:
+                raise
+            self._errors.write(error)
+            return self._refuse(f"unexpected error: {type(error).__name__}: {error}")
 
     def close(self) -> None:
         """Wait for what is being answered."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import FILMS, find_plugin
+from snakesim_hal.model.textfiles import exported
 from snakesim_hal.terminal import Say, say
 from snakesim_operator import extras
 from snakesim_operator.results.incomplete import exit_code
@@ -63,7 +64,7 @@ def film(
     for sentence in standstills_in_words(times, speed / fps, record.config.period_ns * 1e-9):
         say(sentence)
     camera: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
-    with contextlib.closing(camera), _written(out, size, fps, record.lacks) as write:
+    with contextlib.closing(camera), exported(out) as partial, _written(partial, size, fps, record.lacks) as write:
         middle = _centre(record, record.row_at(times[0]))
         for i, time_s in enumerate(times):
             row = record.row_at(time_s)
@@ -124,12 +125,23 @@ def _forces(record: RunRecord, time_s: float) -> list[Floats]:
     return found
 
 
+def _check_film(path: Path, pictures: int) -> None:
+    """Raise OSError for a film that is not whole: the encoder is another process, whose failure is not reported."""
+    import imageio_ffmpeg
+
+    try:
+        found, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError:
+        found = 0
+    if found != pictures:
+        raise OSError(f"the encoder has failed, after {found} of {pictures} pictures; the disk may be full")
+
+
 @contextlib.contextmanager
 def _written(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str]) -> Iterator[Write]:
     import imageio_ffmpeg
     from PIL import Image
 
-    out.parent.mkdir(parents=True, exist_ok=True)
     comment = f"incomplete: {'; '.join(lacks)}" if lacks else ""
     if out.suffix == ".mp4":
         rate: Any = fps  # annotated as int, but any number will do
@@ -138,10 +150,18 @@ def _written(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str])
             str(out), size, fps=rate, macro_block_size=2, quality=7, output_params=said
         )
         writer.send(None)
+        sent = 0
+
+        def send(picture: Picture) -> None:
+            nonlocal sent
+            writer.send(np.ascontiguousarray(picture))
+            sent += 1
+
         try:
-            yield lambda picture: writer.send(np.ascontiguousarray(picture))
+            yield send
         finally:
             writer.close()
+        _check_film(out, sent)
         return
     pictures: list[Image.Image] = []
     palette: list[Image.Image] = []  # of the first picture, for all: less to store, and no flicker

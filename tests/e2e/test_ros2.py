@@ -305,6 +305,19 @@ def _steers(ros: RosSide, endpoint: str) -> None:
             30.0,
         )
 
+        def sent(ago_s: float) -> bool:
+            """Whether a Twist that its node sent so long ago becomes an intent."""
+            stamp_ns = time.time_ns() - round(ago_s * 1e9)
+            ros.session.put(key, payload, attachment=struct.pack("<qqB16s", 7, stamp_ns, 16, bytes(range(16))))
+            time.sleep(0.1)
+            return bool(intents.drain())
+
+        wait_until(lambda: sent(0.0), "a Twist of a moment ago", 10.0)
+        time.sleep(0.5)
+        intents.drain()
+        assert not any(sent(14.0 - 0.1 * number) for number in range(5)), "Twists that a network held back"
+        wait_until(lambda: sent(0.0), "the next Twist", 10.0)
+
 
 def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
     """While nothing gets through to ROS the robot goes on, and afterwards so does the bridge."""

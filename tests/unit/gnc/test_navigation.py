@@ -111,3 +111,15 @@ def test_after_another_start_of_the_robot_an_intent_of_before_does_not_count_at_
     fresh = Intents(MISSION_M_S)
     fresh.start_over()
     assert desired(fresh, None, 0.0) == (MISSION_M_S, "")
+
+
+def test_what_a_sender_asked_for_before_its_stop_does_not_set_the_robot_in_motion_again() -> None:
+    intents = Intents(MISSION_M_S)
+    assert desired(intents, intent(1.0, valid_for_ns=5 * SECOND), 1.1)[0] == 0.1
+    assert desired(intents, intent(2.0, go=False, valid_for_ns=5 * SECOND), 2.1) == (0.0, "ann wants it to stop")
+    late = intent(1.5, valid_for_ns=5 * SECOND, speed_m_s=0.3)
+    assert desired(intents, late, 2.2)[0] == 0.0, "held back by the network, and valid by its stamp alone"
+    assert desired(intents, intent(1.5, who="bob"), 2.3) == (0.1, "as bob wants it"), "others have clocks of their own"
+    assert desired(intents, intent(1.9, go=False), 2.4)[0] == 0.0, "a stop counts in any order"
+    intents.start_over()
+    assert desired(intents, intent(0.1), 0.2)[0] == 0.1

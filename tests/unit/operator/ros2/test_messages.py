@@ -235,6 +235,15 @@ class TestSteering:
         stop = Steering().intent(self.twist(), 1, None)
         assert stop is not None and not stop.go and stop.heading_w_rad is None
 
+    def test_a_twist_counts_from_when_it_was_sent_on_and_a_stop_whenever_it_comes(self) -> None:
+        steering = Steering()
+        fresh = steering.intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
+        assert fresh is not None and (fresh.stamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)
+        assert steering.intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
+        assert (steering.rejected, steering.why) == (1, "is older than 0.5 s by the times of its sender's messages")
+        stop = steering.intent(self.twist(), 2 * 10**9, None, age_ns=60 * 10**9)
+        assert stop is not None and not stop.go and stop.stamp_ns == 2 * 10**9
+
     def test_direction_does_not_run_away_from_the_body(self) -> None:
         steering = Steering()
         for i in range(200):

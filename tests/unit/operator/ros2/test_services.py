@@ -67,10 +67,11 @@ class TestJointTargets:
 
     robot = of_robot("planar13")
 
-    def said(self, names: list[str], **numbers: list[float]) -> bytes:
+    def said(self, names: list[str], *, stamp_s: float = 0.0, **numbers: Any) -> bytes:
         kinds: Any = JAZZY.types
         fields = [np.array(numbers.get(word, []), dtype=np.float64) for word in ("position", "velocity", "effort")]
-        header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](0, 0), "")
+        seconds, nanoseconds = divmod(round(stamp_s * 1e9), 10**9)
+        header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](seconds, nanoseconds), "")
         kind = "sensor_msgs/msg/JointState"
         return bytes(JAZZY.serialize_cdr(kinds[kind](header, names, *fields), kind))
 
@@ -98,6 +99,36 @@ class TestJointTargets:
             points = targets.set_points(self.clock(VALID_NS + 1), self.joints(angle_rad))
         assert (points.mode[2], points.target[2]) == (Mode.POSITION, 0.4)
 
+    @pytest.mark.parametrize(
+        ("stamp_s", "ros_now_s", "age_s", "why"),
+        [
+            (10.0, None, 3.0, ""),  # its stamp counts, and nothing else
+            (9.4, None, 0.0, "is older than 0.5 s by the stamp of its header"),
+            (10.2, None, 0.0, "is ahead of the time in ROS by the stamp of its header"),
+            (1.7e9, 1.7e9 + 0.2, 0.0, ""),  # of a real robot: wall-clock time
+            (1.7e9, 1.7e9 + 14.0, 0.0, "is older than 0.5 s"),
+            (1.7e9, None, 0.0, "is ahead of the time in ROS"),  # a node without use_sim_time
+            (0.0, None, 0.3, ""),  # no stamp
+            (0.0, None, 14.0, "is older than 0.5 s by the times of its sender's messages"),
+        ],
+    )
+    def test_an_old_message_moves_nothing(
+        self, stamp_s: float, ros_now_s: float | None, age_s: float, why: str
+    ) -> None:
+        targets = JointTargets(self.robot)
+        targets.set_points(self.clock(0), self.joints(0.1))
+        message, now_ns = self.said(["joint_3"], stamp_s=stamp_s, position=[0.5]), 10 * 10**9
+        ros_now_ns = None if ros_now_s is None else round(ros_now_s * 1e9)
+        taken = targets.take(message, now_ns, ros_now_ns, round(age_s * 1e9))
+        assert taken == (not why) and why in targets.why
+        assert targets.set_points(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
+
+    def test_a_command_ends_half_a_second_after_it_was_sent(self) -> None:
+        targets = JointTargets(self.robot)
+        assert targets.take(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
+        assert targets.set_points(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
+        assert targets.set_points(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
+
     def test_what_was_said_before_arming_moves_nothing(self) -> None:
         targets = JointTargets(self.robot)
         targets.take(self.said(["joint_3"], position=[0.5]), 0)
@@ -114,9 +145,7 @@ class TestJointTargets:
             (["joint_1"], {}, "has no position, velocity or effort"),
         ],
     )
-    def test_a_message_is_taken_whole_or_not_at_all(
-        self, names: list[str], numbers: dict[str, list[float]], why: str
-    ) -> None:
+    def test_a_message_is_taken_whole_or_not_at_all(self, names: list[str], numbers: dict[str, Any], why: str) -> None:
         targets = JointTargets(self.robot)
         assert not targets.take(self.said(names, **numbers), 0) and targets.rejected == 1
         assert why in targets.why and not targets.take(b"\0\1\0\0\1", 0)
