@@ -5,6 +5,7 @@ from typing import Literal
 
 from snakesim_operator.results.ended import COMPLETE, UNKNOWN
 from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.purpose import purpose_of
 from snakesim_operator.results.report.timeline import (
     came_to_rest_s,
     end_s,
@@ -51,6 +52,11 @@ def _verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         said = _control_said(record, at_s)
         before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
         return Verdict("bad", f"{what}{said} Before that: {before}.")
+    purpose = purpose_of(record)
+    if purpose is not None:
+        served, words = purpose
+        said = f"{words} Ran for {summary.duration_s:.1f} s; {_trouble(summary)}.{_ending(summary.ended)}"
+        return Verdict("good" if served and summary.ended == COMPLETE else "poor", said)
     trouble = _trouble(summary)
     ending = _ending(summary.ended)
     distance = distance_m(summary)
