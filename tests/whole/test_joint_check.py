@@ -22,7 +22,8 @@ DEFECTS = {
 def check(out: Path, *sets: str) -> tuple[int, list[str]]:
     truth = [word for text in sets for word in ("--set", f"backends.can.mounted.{text}")]
     short = ("--set", f"robot.chain.modules={JOINTS}", "--duration", "13")
-    run_to_summary(out, "joint_check", "--backend", "can", *short, *truth)
+    run, _ = run_to_summary(out, "joint_check", "--backend", "can", *short, *truth)
+    assert "Every joint was moved. Judge the run with `snakesim joints check " in run.out and "no fault." in run.out
     ended = snakesim("joints", "check", str(out), "--straight", cwd=out.parent)
     return ended.code, ended.out.splitlines()
 

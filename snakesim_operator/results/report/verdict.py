@@ -7,6 +7,7 @@ from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_operator.results.ended import COMPLETE, UNKNOWN
 from snakesim_operator.results.motion import Motion, motion_of
 from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.purpose import purpose_of
 from snakesim_operator.results.report.timeline import longest_reason, reported_while_moving
 from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 from snakesim_operator.results.time_axis import end_s, reported_at_s
@@ -47,6 +48,11 @@ def _verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         said = _control_said(record, at_s)
         before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
         return Verdict("bad", f"{what}{said} Before that: {before}.")
+    purpose = purpose_of(record)
+    if purpose is not None:
+        served, words = purpose
+        said = f"{words} Ran for {summary.duration_s:.1f} s; {_trouble(summary)}.{_ending(summary.ended)}"
+        return Verdict("good" if served and summary.ended == COMPLETE else "poor", said)
     motion = motion_of(record)
     if motion is None:
         rest = f"{_handed_over(record, summary)}{_trouble(summary)}.{_ending(summary.ended)}"

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.checked import PROPERTIES, Checked
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.robot import RobotFile, with_modes
-from snakesim_operator.commissioning.robot_edit import change_joints, joints_on_drives
+from snakesim_operator.commissioning.robot_edit import change_joints, joints_on_drives, write_checked
 
 
 @pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])
@@ -41,3 +42,21 @@ def test_a_change_that_is_not_valid_leaves_the_file_as_it_was(tmp_path: Path) ->
     with pytest.raises(ConfigError, match="gear"):
         change_joints(path, {"joint_1": {"gear": -1.0}}, "by mistake")
     assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
+
+
+def test_what_was_checked_is_read_as_it_was_written_also_what_was_confirmed_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "snake.toml"
+    path.write_text('extends = "planar13"\nname = "snake"\n')
+    checked = Checked(
+        by="anna",
+        on="2026-11-24",
+        joints="5b2c4b1d9e0f7a36",
+        backend="can",
+        confirmed=list(PROPERTIES),
+        by_hand={"sign": ["joint_1"], "gear": ["joint_1", "joint_2"]},
+        straight=True,
+        allowed_backlash_rad=0.02,
+    )
+    for _ in range(2):  # once more, over the first
+        write_checked(path, checked)
+        assert decode(read_part(str(path), "robots"), RobotFile).checked == checked
