@@ -38,7 +38,7 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	$(bin)/snakesim run peg_row --controller obstacle_aided --console --pace realtime --duration 10 --out runs/demo $(ARGS)
 	@printf '%s\n' 'Next:' '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
 	  '  $(bin)/snakesim run triplet --console --pace realtime      the paper'\''s case study: one joint at a time pushes' \
-	  '  docs/tutorial.md, 3: write a controller                    push it your way'
+	  '  docs/tutorial.md, 3: write a controller                       push it your way'
 
 test: test-here test-vcan ## Run the tests, but for those that are slow
 
