@@ -227,7 +227,13 @@ class Robot:
         return {f"control.{one.name}": one for one in parameters_of(in_force(self._session))}
 
     def set(self, changes: Mapping[str, Any]) -> None:
-        """Change parameters of the running controller, all or none. Raises ConfigError, RefusedError."""
+        """Change parameters of the running controller, all or none.
+
+        Raises:
+            ConfigError: There is no such parameter.
+            RefusedError: Control refuses a value.
+            ControllerError: Control has accepted the values and has ended, for the controller cannot go on with them.
+        """
         change(self._session, changes, user_name())
 
     @contextmanager

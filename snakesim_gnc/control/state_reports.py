@@ -77,7 +77,7 @@ class StateReports:
 
     def failure(self, clock: Clock, why: str) -> ControlState:
         """The last message of a controller that cannot go on."""
-        return self._message(clock, "NotLocomoting", why, Report())
+        return msgspec.structs.replace(self._message(clock, "NotLocomoting", why, Report()), failed=True)
 
     def _message(self, clock: Clock, state: LocomotionState, reason: str, report: Report) -> ControlState:
         joint = report.propulsion_joint

@@ -13,13 +13,13 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, did_you_mean, short
+from snakesim_hal.errors import ConfigError, ControllerError, NotConnectedError, RefusedError, did_you_mean, short
 from snakesim_hal.model.scenario import parse_set
-from snakesim_hal.network.session import Session, open_session
+from snakesim_hal.network.session import Reader, Session, open_session
 from snakesim_hal.process import user_name
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlSettings, SettingsRequest
+from snakesim_hal.wire.messages import ControlSettings, ControlState, SettingsRequest
 from snakesim_operator.tools.command import ANSWER_S, SHOWN_S
 from snakesim_operator.tools.robot_selection import RobotSelection
 from snakesim_operator.tools.targets import CONNECT_S, only_robot
@@ -28,6 +28,9 @@ PREFIX = "control."
 MAX_PARAMETERS = 100
 LONGEST_NAME, LONGEST_ABOUT = 40, 200
 PUBLISHED_S = 3.0
+GONE_S = 1.0  # without settings in force, after a controller that published them has been asked
+GOES_ON_S = 0.3  # until the next report of a controller that goes on, in real time; time may stand
+LOOK_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -122,23 +125,69 @@ def in_force(session: Session) -> ControlSettings:
 def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[ControlSettings, ControlSettings]:
     """Have the controller go on with other values, all of them or none. Returns what was in force, and what is now.
 
-    changes: by name, such as `control.lead_s`. Raises ConfigError for a name that there is not, RefusedError with
-    control's reason, NotConnectedError.
+    Args:
+        session: A session on the robot's network.
+        changes: Values by name, such as `control.lead_s`.
+        who: Who asks.
+
+    Raises:
+        ConfigError: There is no such parameter.
+        RefusedError: Control refuses a value, with its reason; or does not show what it has accepted.
+        ControllerError: The controller cannot go on with what it has accepted, so control has ended.
+        NotConnectedError: No controller publishes its settings.
     """
     before = in_force(session)
     values = msgspec.json.decode(before.settings, type=dict[str, Any])
     wanted = {known_name(name, before): value for name, value in changes.items()}
     settings = msgspec.json.encode({**values, **wanted}).decode()
     request = SettingsRequest(who=who, controller=before.controller, settings=settings)
-    answer = session.ask(keys.SETTINGS, request, ANSWER_S)
-    if not answer.ok:
-        raise RefusedError(answer.reason)
+    states = session.reader(keys.CONTROL_STATE, ControlState)
+    try:
+        answer = session.ask(keys.SETTINGS, request, ANSWER_S)
+        if not answer.ok:
+            raise RefusedError(answer.reason)
+        now = _shown(session, before)
+        _check_it_goes_on(states, now, changes)
+    finally:
+        session.stop_reading(states)
+    if now is None:
+        raise RefusedError(f"NOT CONFIRMED: {answer.reason}; but no controller publishes them")
+    return before, now
+
+
+def _shown(session: Session, before: ControlSettings) -> ControlSettings | None:
+    """Return the settings that are in force after others; None when none are published in time."""
     deadline = time.monotonic() + SHOWN_S
     while time.monotonic() < deadline:
-        now = in_force(session)
-        if now.changes > before.changes:
-            return before, now
-    raise RefusedError(f"NOT CONFIRMED: {answer.reason}; but no controller publishes them")
+        now = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, GONE_S)
+        if now is None or now.changes > before.changes:
+            return now
+    return None
+
+
+def _check_it_goes_on(states: Reader[ControlState], now: ControlSettings | None, changes: Mapping[str, Any]) -> None:
+    """Raise ControllerError if the controller cannot go on with these changes.
+
+    While the robot is armed, control reports its state 20 times a second. Otherwise nothing shows it before the arming.
+
+    Args:
+        states: Control's reports since the changes were asked for.
+        now: The settings in force with them; None: control publishes none any more.
+        changes: Values by name.
+    """
+    deadline = time.monotonic() + GOES_ON_S
+    while time.monotonic() < deadline:
+        reported = states.drain()
+        for state in reported:
+            if state.failed:
+                given = ", ".join(f"{name}={in_text(value)}" for name, value in changes.items())
+                raise ControllerError(
+                    f"{given}: accepted, and then control has ended: {state.reason}. The robot stops. Start control "
+                    "again with another value"
+                )
+        if now is not None and any(state.tick > now.tick for state in reported):
+            return
+        time.sleep(LOOK_S)
 
 
 def known_name(name: str, settings: ControlSettings) -> str:
@@ -178,7 +227,7 @@ def get_parameter(name: str, where: RobotSelection) -> int:
 
 
 def set_parameters(texts: list[str], where: RobotSelection) -> int:
-    """`snakesim param set`. Raises ConfigError, RefusedError."""
+    """`snakesim param set`. Raises ConfigError, RefusedError, ControllerError."""
     changes = {override.key: override.value for override in map(parse_set, texts)}
     with open_session(only_robot(where, "param set"), CONNECT_S) as session:
         before, now = change(session, changes, user_name())

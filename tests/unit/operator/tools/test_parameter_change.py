@@ -1,0 +1,73 @@
+"""`change`: new settings of a controller that runs, and of one that cannot go on with them."""
+
+import pytest
+
+from snakesim_gnc.control.live_settings import LiveSettings
+from snakesim_hal.errors import ControllerError, RefusedError
+from snakesim_hal.model.scenario import load
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.local_network import LocalNetwork, LocalSession
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, ControlState
+from snakesim_operator.tools import parameters
+from tests.unit.hal.rig import description
+
+CLOCK = Clock(tick=7, stamp_ns=70, period_ns=10, pace="lockstep", lifecycle="armed", arming=1, lease_epoch=1, newest={})
+CHANGES = {"control.propulsion_n": 20}
+WHY = "controller obstacle_triplet (class ObstacleTriplet): update() raised ZeroDivisionError: division by zero"
+
+
+class Control:
+    """The control service as far as its settings go: it reports its state after every request."""
+
+    def __init__(self, reported: ControlState | None, *, gone: bool = False) -> None:
+        """reported: after a request; None: it is silent. gone: it publishes no settings after it."""
+        self._network = LocalNetwork()
+        session = self._network.session()
+        self._settings = LiveSettings(Client(session, "control"), load("triplet", []).config)
+        self._settings.configure(description())
+        self._settings.turn(CLOCK)
+        self._states = session.publisher(keys.CONTROL_STATE, ControlState)
+        self._reported = reported
+        self._gone = gone
+        self._network.answer = self._answer
+        self.operator: LocalSession = self._network.session()
+
+    def _answer(self) -> None:
+        self._settings.turn(CLOCK)
+        if self._reported is not None:
+            self._states.put(self._reported)
+        if self._gone:
+            self._network.latched.clear()
+
+
+def state(reason: str, *, failed: bool = False) -> ControlState:
+    return ControlState(
+        tick=8, stamp_ns=80, controller="obstacle_triplet", state="NotLocomoting", reason=reason, failed=failed
+    )
+
+
+@pytest.fixture(autouse=True)
+def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("GONE_S", "GOES_ON_S"):
+        monkeypatch.setattr(parameters, name, 0.05)
+
+
+@pytest.mark.parametrize("reported", [state("standing still"), None], ids=["goes on", "time stands"])
+def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | None) -> None:
+    before, now = parameters.change(Control(reported).operator, CHANGES, "ada")
+    assert (before.changes, now.changes, now.who) == (0, 1, "ada")
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_value_that_ends_control_is_named_with_the_reason(gone: bool) -> None:
+    control = Control(state(WHY, failed=True), gone=gone)
+    with pytest.raises(ControllerError) as caught:
+        parameters.change(control.operator, CHANGES, "ada")
+    said = f"control.propulsion_n=20: accepted, and then control has ended: {WHY}. The robot stops. "
+    assert str(caught.value) == f"{said}Start control again with another value"
+
+
+def test_settings_that_vanish_without_a_reason_are_not_confirmed() -> None:
+    with pytest.raises(RefusedError, match="NOT CONFIRMED"):
+        parameters.change(Control(None, gone=True).operator, CHANGES, "ada")
