@@ -3,6 +3,6 @@
 `python -m benchmarks` prints them all; absolute times on a shared machine mean little, so medians of ratios are quoted.
 """
 
-from snakesim_hal.arithmetic import pin
+from snakesim_hal.base.arithmetic import pin
 
 pin()  # before NumPy: so that a run in this process stays in it, where it can be measured

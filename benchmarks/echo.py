@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import zenoh
 
-from snakesim_hal.process import child_environment, python_command
+from snakesim_hal.base.process import child_environment, python_command
 from tests.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"

@@ -15,8 +15,8 @@ does, so that one seed gives one digest; one that has imported NumPy already get
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.arithmetic import pin
-from snakesim_hal.errors import (
+from snakesim_hal.base.arithmetic import pin
+from snakesim_hal.base.errors import (
     ConfigError,
     ControllerError,
     NotConnectedError,

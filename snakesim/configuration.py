@@ -4,9 +4,9 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import Override, RunConfig, load
-from snakesim_hal.plugin_check import check_plugins
+from snakesim_hal.programs.preflight import check_plugins
 
 
 def overrides_of(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:

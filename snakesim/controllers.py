@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.errors import ConfigError, ControllerError
+from snakesim_hal.base.errors import ConfigError, ControllerError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description, JointState
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim.chart import Chart, framed
-from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
 from snakesim_operator.results.ended import COMPLETE
@@ -135,7 +135,7 @@ class Result:
         span_s: tuple[float, float] = SPAN_S,
     ) -> Path:
         """Film the run into FILE.mp4 or FILE.gif. Raises ConfigError without a pose, or the extra `video`."""
-        from snakesim_operator.tools.video import film
+        from snakesim_operator.playback.video import film
 
         film(self.record, Path(path), size=(width, height), fps=fps, speed=speed, span_s=span_s, say=lambda _line: None)
         return Path(path)

@@ -13,13 +13,13 @@ from typing import Any, Self
 
 from snakesim_gnc.control.controller import positions
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, StalledError, did_you_mean
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, did_you_mean
+from snakesim_hal.base.process import user_name
 from snakesim_hal.network.commanding import READ, Commanding
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.network.session_file import read_session
-from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import (
@@ -34,12 +34,12 @@ from snakesim_hal.wire.messages import (
     request_to_arm,
 )
 from snakesim_hal.wire.own_sample import message_of
+from snakesim_operator.base.robot_selection import RobotSelection
+from snakesim_operator.base.targets import find_robots
 from snakesim_operator.recording.process import record
-from snakesim_operator.tools.command import ask_meanwhile
-from snakesim_operator.tools.parameters import Parameter, change, in_force, parameters_of
-from snakesim_operator.tools.robot_selection import RobotSelection
-from snakesim_operator.tools.stop import estop
-from snakesim_operator.tools.targets import find_robots
+from snakesim_operator.robot_commands.command import ask_meanwhile
+from snakesim_operator.robot_commands.parameters import Parameter, change, in_force, parameters_of
+from snakesim_operator.robot_commands.stop import estop
 
 CONNECT_S, FIRST_S, SILENCE_S, READY_S, RECORDING_S = 5.0, 1.0, 2.0, 10.0, 10.0
 LOOK_S = 0.0005

@@ -12,7 +12,7 @@ import msgspec
 from snakesim.configuration import checked, overrides_of
 from snakesim.controllers import Given, named
 from snakesim.result import Result
-from snakesim_hal.errors import ConfigError, ControllerError, SnakesimError, short
+from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, short
 from snakesim_hal.model.plugins import CONTROLLERS, offered
 from snakesim_hal.model.scenario import Override, RunConfig
 from snakesim_operator.results.record import SUMMARY, RunRecord

@@ -33,16 +33,16 @@ from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.arguments import number
-from snakesim_hal.drivers.mounting import Mounting
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.mounting import Mounting
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import aligned, say
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.record.black_box import read_black_box
-from snakesim_hal.record.host_record import BLACK_BOX
-from snakesim_hal.terminal import aligned, say
+from snakesim_hal.programs.arguments import number
+from snakesim_hal.run_log.black_box import read_black_box
+from snakesim_hal.run_log.host_record import BLACK_BOX
 
 OK, FAILED = 0, 1
 MODULES = "can"  # the backend of joint modules

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from snakesim_can_backend.protocol.definitions import LAST_NODE
-from snakesim_hal.drivers.mounted import Mounted
+from snakesim_drivers.emulation.mounted import Mounted
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.quantities import from_zero
 

@@ -13,7 +13,7 @@ import msgspec
 from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Message, Mode, Pace
 
 if TYPE_CHECKING:
-    from snakesim_hal.injection import Injection
+    from snakesim_hal.model.fault_kinds import Injection
     from snakesim_hal.model.scenario import RunConfig
 
 

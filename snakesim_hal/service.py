@@ -7,8 +7,8 @@ from typing import Protocol
 
 import msgspec
 
-from snakesim_hal.allowed_faults import faults_of_service
-from snakesim_hal.errors import NotConnectedError, ServiceError, SnakesimError, WireError, raised
+from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimError, WireError, raised
+from snakesim_hal.faults.allowed import faults_of_service
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client

@@ -22,9 +22,9 @@ _leave_out_working_folder()
 import resource  # noqa: E402
 import signal  # noqa: E402
 
-from snakesim_hal.arithmetic import pin  # noqa: E402
-from snakesim_hal.process import protect_children  # noqa: E402
-from snakesim_hal.terminal import print_stderr  # noqa: E402
+from snakesim_hal.base.arithmetic import pin  # noqa: E402
+from snakesim_hal.base.process import protect_children  # noqa: E402
+from snakesim_hal.base.terminal import print_stderr  # noqa: E402
 
 
 def main() -> int:

@@ -12,11 +12,13 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from snakesim_hal.errors import ConfigError, did_you_mean, short
-from snakesim_hal.terminal import discard, exit_code, print_stderr, report_error, say
+from snakesim_hal.base.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.terminal import discard, exit_code, print_stderr, report_error, say
+from snakesim_operator.monitoring import watching
 from snakesim_operator.playback import arguments as playback
+from snakesim_operator.robot_commands import commanding
 from snakesim_operator.run import arguments as run
-from snakesim_operator.tools import commanding, setup, watching
+from snakesim_operator.this_computer import setup
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 ADDS = "add_commands"  # the name of an entry point's function that adds to the parser
@@ -28,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return exit_code("snakesim", lambda: _act(given, owns_process=argv is None))
     except ModuleNotFoundError as error:
-        from snakesim_operator.extras import explained
+        from snakesim_operator.base.extras import explained
 
         if (why := explained(error)) is None:
             raise
@@ -182,7 +184,7 @@ def _add_completion(commands: Any) -> None:
 
 
 def _completion(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.tools.completion import completion
+    from snakesim_operator.this_computer.completion import completion
 
     for line in completion(parser(), arguments.shell):
         say(line)

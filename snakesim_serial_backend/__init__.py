@@ -3,5 +3,5 @@
 `serial_command`  `snakesim serial scan`: who answers on a port
 `dynamixel/`      the backend `dynamixel`: Dynamixel X, by protocol 2.0      `wire`  a port, and a pseudo terminal
 
-All else that a driver needs is in `snakesim_hal.drivers`. Imports `snakesim_hal` alone, and pyserial.
+All else that a driver needs is in `snakesim_drivers.kit`. Imports `snakesim_hal` alone, and pyserial.
 """

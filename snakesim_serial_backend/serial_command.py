@@ -4,8 +4,8 @@ import argparse
 import struct
 from collections.abc import Iterator, Sequence
 
-from snakesim_hal.errors import BackendError
-from snakesim_hal.terminal import aligned, say
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.base.terminal import aligned, say
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port

@@ -16,7 +16,7 @@ from typing import TextIO
 
 import serial
 
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 
 BITS_A_BYTE = 10  # with start and stop
 USB_LATENCY_S = 0.001  # of an adapter whose driver does not say it: a frame of USB

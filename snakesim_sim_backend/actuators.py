@@ -16,9 +16,9 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import Module, RobotFile
 from snakesim_hal.physics.motor import roll_off

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.errors import BackendError
-from snakesim_hal.fault_plan import check_backend_can
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_plan import check_backend_can
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.physics.motor import check_gains

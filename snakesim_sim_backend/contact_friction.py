@@ -18,7 +18,7 @@ from collections.abc import Collection
 import mujoco
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.chain import Chain
 

@@ -5,7 +5,7 @@ import logging
 import mujoco
 import numpy as np
 
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 from snakesim_sim_backend.model import FREE_DOFS
 from snakesim_sim_backend.physics import Physics
 

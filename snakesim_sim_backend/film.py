@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP

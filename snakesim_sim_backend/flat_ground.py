@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.chain import Chain
 
 SINK_M = 2e-4  # of a foot under its share of the weight

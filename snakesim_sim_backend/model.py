@@ -12,8 +12,8 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile

@@ -8,8 +8,8 @@ import msgspec
 import mujoco
 import numpy as np
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.plant import LinkLoad

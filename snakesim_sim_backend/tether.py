@@ -7,7 +7,7 @@ A tendon with a limited length keeps the point on a circle of `ROPE_M` around th
 import mujoco
 import numpy as np
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.robot import RobotFile
 from snakesim_sim_backend.settings import Tether
 

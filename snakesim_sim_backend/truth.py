@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.contacts import Touch
 
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_sim_backend.flat_ground import DAMPING, MAX_PHASE

@@ -4,7 +4,7 @@ import shutil
 import signal
 import tempfile
 
-from snakesim_hal.arithmetic import pin
+from snakesim_hal.base.arithmetic import pin
 
 if "SNAKESIM_UNPINNED" not in os.environ:  # set by tests/e2e/test_computers.py
     pin(one_thread=True)  # so that what is computed in this process is what `snakesim` computes

@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from snakesim_hal import arithmetic
+from snakesim_hal.base import arithmetic
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.run.in_process import simulate
 
@@ -24,7 +24,9 @@ def main() -> int:
         return 1
     measured = arithmetic.measured()
     if differing := arithmetic.foreign(measured):
-        print(f"{' and '.join(differing)} of this computer round otherwise than COMMON in snakesim_hal/arithmetic.py.")
+        print(
+            f"{' and '.join(differing)} of this computer round otherwise than COMMON in snakesim_hal/base/arithmetic.py."
+        )
         print("If the lock has another NumPy now, change it there, and try again:", json.dumps(measured, indent=4))
         return 1
     found: dict[str, str] = {}

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from snakesim_hal.injection import DOERS, KINDS, Amount
+from snakesim_hal.model.fault_kinds import DOERS, KINDS, Amount
 
 PAGE = Path(__file__).parents[1] / "docs" / "injector.md"
 BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"

@@ -12,8 +12,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_hal.arithmetic import ONE_THREAD
-from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent, python_command
+from snakesim_hal.base.arithmetic import ONE_THREAD
+from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, python_command
 
 NET = "10.78.0"
 HURRIED = ("chrt", "--fifo", str(SERVICE_PRIORITY))

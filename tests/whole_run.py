@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_operator.results.record import RunRecord

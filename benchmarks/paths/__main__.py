@@ -26,7 +26,7 @@ import numpy as np
 from benchmarks.paths.ways import Lab, Way
 from benchmarks.physics import config_of, wire_bytes
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.messages import request_to_arm
 
 LOOP = Path(__file__).parents[1] / "peers" / "loop.toml"
@@ -57,13 +57,15 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
         routers(way, stack, folder)
         log = folder / "ours.log"
         flags = [*scenario, "--duration", str(seconds)]
-        service = way.workstation.module("snakesim_hal.serve", "control", *flags, *way.service, log=log)
+        service = way.workstation.module(
+            "snakesim_hal.programs.service_program", "control", *flags, *way.service, log=log
+        )
         stack.callback(_end, service)
         mine, its = socket_pair()
         with its:
             out = ["--once", "--end-after-fault", "1", "--out", str(folder), "--channel", str(its.fileno())]
             host = way.robot.module(
-                "snakesim_hal.host_process", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
+                "snakesim_hal.programs.host_program", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
             )
         stack.callback(_end, host)
         arm(StarterEnd(mine), host, seconds)

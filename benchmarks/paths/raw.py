@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 import zenoh
 
 from benchmarks.echo import REPLY, REQUEST, answer, publisher_of
-from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
+from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
 
 DROP = zenoh.CongestionControl.DROP
 PERIOD_S, WARM_UP = 0.01, 100

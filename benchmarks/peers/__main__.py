@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks.echo import echo_times_us
 from benchmarks.physics import config_of, wire_bytes
 from benchmarks.whole import run
-from snakesim_hal.in_process import InProcessRun
-from snakesim_hal.process import child_environment, python_command
+from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.safety.authority import Authority
 
 HERE = Path(__file__).parent

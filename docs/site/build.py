@@ -15,7 +15,7 @@ from pathlib import Path
 import pdoc
 
 import snakesim  # before NumPy
-from snakesim_hal.process import child_environment, python_command
+from snakesim_hal.base.process import child_environment, python_command
 from snakesim_operator.cli import parser
 
 ROOT = Path(__file__).resolve().parent.parent.parent

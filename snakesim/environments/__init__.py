@@ -10,7 +10,7 @@ Importing this package registers the names; it needs the extra `gym`, and nothin
 `rewards` what is paid; what is seen is in `snakesim_gnc.control.observations`. `docs/environments.md` is the reference.
 """
 
-from snakesim_operator import extras
+from snakesim_operator.base import extras
 
 extras.check("gym", "`snakesim.environments`")
 

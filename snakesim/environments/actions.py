@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError, did_you_mean
+from snakesim_hal.base.errors import ConfigError, did_you_mean
 from snakesim_hal.wire.messages import Description, Mode
 
 RESIDUAL = "residual:"

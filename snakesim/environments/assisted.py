@@ -10,10 +10,10 @@ import msgspec
 from snakesim_gnc.control.controller import Action, Controller, View
 from snakesim_gnc.control.service import SENSED
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import BackendError, ControllerError, SnakesimError
-from snakesim_hal.in_process import InProcessRun
+from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
 from snakesim_hal.model.scenario import CONTROL, RunConfig
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     AppliedCommand,

@@ -18,7 +18,7 @@ from snakesim.environments.rewards import weights_of
 from snakesim.environments.stepped import SteppedRobot
 from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.observations import Observer, chosen
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.drawn import draws_of
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.scenario import Override, RunConfig, description_of

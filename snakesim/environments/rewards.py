@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,17 @@ Lifecycle, lease, limits and the latency of commands are those of a run in locks
 
 import msgspec
 
-from snakesim_hal.allowed_faults import Faults, faults_of_host
 from snakesim_hal.backend import Backend, Samples, SetPoints
-from snakesim_hal.errors import BackendError, ConfigError, RefusedError
-from snakesim_hal.fault_plan import planned
+from snakesim_hal.base.errors import BackendError, ConfigError, RefusedError
+from snakesim_hal.faults.allowed import Faults, faults_of_host
 from snakesim_hal.host.guarded_backend import GuardedBackend
-from snakesim_hal.injection import CONTROL
+from snakesim_hal.model.fault_kinds import CONTROL
+from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, Service
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.plugin_check import backend_settings
-from snakesim_hal.record.black_box import BlackBox
+from snakesim_hal.programs.preflight import backend_settings
+from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.safety.authority import Authority, Decision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (

@@ -20,7 +20,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from snakesim.environments.environment import SnakeEnv
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 
 CLOSE_TIMEOUT_S = 5.0
 CLOSE = "close"  # a request without an answer

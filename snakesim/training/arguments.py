@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import number
+from snakesim_hal.programs.arguments import number
 
 TASK = "run"  # under which `snakesim --help` lists it
 
@@ -52,7 +52,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from snakesim_operator import extras
+    from snakesim_operator.base import extras
 
     for extra in ("train", "gym", "plot", "policy", *(["evaluate"] if arguments.cluster else [])):
         extras.check(extra, "`snakesim train`")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from snakesim.training.search import Generation
 from snakesim_hal.model.textfiles import exported
-from snakesim_operator.figures.inherited import PLAIN_TEXT, import_matplotlib
+from snakesim_operator.features.figures.inherited import PLAIN_TEXT, import_matplotlib
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:

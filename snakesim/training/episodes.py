@@ -9,8 +9,8 @@ import numpy as np
 
 from snakesim.environments import SnakeEnv
 from snakesim.training.form import OBSERVE, Policy
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.worker_pool import WorkerPool
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.base.worker_pool import WorkerPool
 
 RETRIES = 2  # of an episode whose worker died
 Values = Mapping[str, float]
@@ -64,7 +64,7 @@ class Episodes:
         return self._opened.enter_context(WorkerPool(self._workers)).map
 
     def _map_there(self, address: str) -> Map:
-        from snakesim_operator.dask_cluster import connected  # of another extra
+        from snakesim_operator.base.dask_cluster import connected  # of another extra
 
         client = self._opened.enter_context(connected(address))
         executor = client.get_executor(pure=False, retries=RETRIES)

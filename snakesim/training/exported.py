@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from snakesim.training.form import FELT_RAD, OBSERVE, RAMP_PER_S, Policy
 from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, opened
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import exported
 
 LEARNED = "snakesim.learned"

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.errors import ConfigError
 
 FILE = "search.jsonl"
 

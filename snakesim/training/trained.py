@@ -12,8 +12,8 @@ from snakesim.training.episodes import Episodes
 from snakesim.training.exported import export, learned_by
 from snakesim.training.form import Policy
 from snakesim.training.search import Effort, Generation, Step, search
-from snakesim_hal.process import stop_signals_raise
-from snakesim_hal.terminal import say
+from snakesim_hal.base.process import stop_signals_raise
+from snakesim_hal.base.terminal import say
 from snakesim_operator.run.conclusion import INTERRUPTED
 
 FRAME_SKIP = 5  # ticks: at 100 Hz, 20 decisions a second

@@ -21,7 +21,7 @@ from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, 
 from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
-from snakesim_hal.errors import BackendError, ConfigError, did_you_mean
+from snakesim_hal.base.errors import BackendError, ConfigError, did_you_mean
 
 LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
 FD = ("socketcan", "kvaser", *LOCAL)

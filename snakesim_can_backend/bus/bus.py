@@ -25,8 +25,8 @@ from can.interfaces.virtual import VirtualBus
 from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
 from snakesim_can_backend.bus.bus_faults import VirtualFaults, inject_into_interface
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
-from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.model.fault_kinds import Injection
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
@@ -67,7 +67,7 @@ class Wire(Protocol):
         ...
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end an injected bus fault: see `snakesim_hal.injection`. Raises ConfigError."""
+        """Begin or end an injected bus fault: see `snakesim_hal.model.fault_kinds`. Raises ConfigError."""
         ...
 
     def close(self) -> None:

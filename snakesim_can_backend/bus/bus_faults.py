@@ -10,7 +10,7 @@ import subprocess
 
 from snakesim_can_backend.bus.bus_errors import BusError, Kind
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 
 VIRTUAL = "vcan"
 ERROR_FRAME, CONTROLLER, BUS_OFF, RESTARTED = 0x20000000, 0x04, 0x40, 0x100  # linux/can.h, linux/can/error.h

@@ -12,7 +12,7 @@ from math import ceil
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, HEARTBEAT_PERIOD_S, LAST_NODE, Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 
 BIT_RATE = 1_000_000

@@ -11,7 +11,7 @@ from typing import TextIO
 
 from snakesim_can_backend.bus.bus import LAST_STANDARD_ID, Wire
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 
 FLUSH_BYTES = 1 << 16
 FD_MARK = "##1"  # a second bit rate

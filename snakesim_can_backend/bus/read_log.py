@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 import can
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 
 KINDS = ".log, .asc, .blf"
 NAMED = 3  # dropped lines that are named; the others are counted

@@ -19,7 +19,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 
 CANOPEN_HEARTBEAT, CANOPEN_STATES = 0x700, {0: "boot", 4: "stopped", 5: "operational", 127: "pre-operational"}
 ODRIVE_HEARTBEAT, ODRIVE_LENGTH, ODRIVE_STATES, ODRIVE_NODE_BITS = 0x01, 8, 14, 5

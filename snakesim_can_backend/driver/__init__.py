@@ -1,6 +1,6 @@
 """The backend `can`.
 
-`backend`     CanBackend, on the kit of `snakesim_hal.drivers`      `modules`  what a tick says to modules
+`backend`     CanBackend, on the kit of `snakesim_drivers.kit`      `modules`  what a tick says to modules
 `bring_up`    finds and checks every module, enabling none; `parameters` checks their parameters
 `reports`     the modules' reports as arrays; `module_monitor` detects module and bus faults
 `sensors`     IMU, contacts, power

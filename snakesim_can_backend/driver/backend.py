@@ -7,12 +7,12 @@ from snakesim_can_backend.driver.own_twins import check_faults, check_twins
 from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog
 from snakesim_can_backend.driver.sensors import Sensors, described
 from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.mounted import check_mounted
+from snakesim_drivers.kit.drive_backend import Clock, DriveBackend
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.motion_capture.mocap import check_pose, receiver
 from snakesim_hal.backend import Samples
-from snakesim_hal.drivers.drive_backend import Clock, DriveBackend
-from snakesim_hal.drivers.findings import Finding
-from snakesim_hal.drivers.mocap import check_pose, receiver
-from snakesim_hal.drivers.mounted import check_mounted
-from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import LifecycleState, Pace, SensorDescription

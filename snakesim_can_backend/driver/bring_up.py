@@ -23,7 +23,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 
 ASK_EVERY_S = 0.1
 LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id may answer later

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence, Set
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS, BusError
 from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
-from snakesim_hal.drivers.findings import Finding, Told
+from snakesim_drivers.kit.findings import Finding, Told
 from snakesim_hal.wire.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer

@@ -1,4 +1,4 @@
-"""Joint modules on their buses: a `snakesim_hal.drivers.drive_backend.Drives`. Thin: every task has its own file.
+"""Joint modules on their buses: a `snakesim_drivers.kit.drive_backend.Drives`. Thin: every task has its own file.
 
 A tick: Sync is sent, every module answers with its samples of that instant, and enacts the set-point that it received
 in the period before. So a command acts exactly one period after the state that it answers, whatever the load.
@@ -22,13 +22,13 @@ from snakesim_can_backend.driver.sensors import contacts_due
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.arrays import Floats
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.readings import Readings
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.findings import Finding
-from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import LifecycleState, Mode
 

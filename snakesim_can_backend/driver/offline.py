@@ -18,9 +18,9 @@ from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import contacts_due, joint_values
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, opcode_of
-from snakesim_hal.arrays import Floats
-from snakesim_hal.drivers.mounting import Mounting
-from snakesim_hal.record.black_box import Layout
+from snakesim_drivers.mounting import Mounting
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.run_log.black_box import Layout
 
 SYNC_BYTES = codec()[Opcode.SYNC].length
 BRING_UP_SYNCS = 64  # before the first tick, at most

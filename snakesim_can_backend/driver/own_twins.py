@@ -12,13 +12,13 @@ import msgspec
 
 from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.fault_plan import check_backend_can
-from snakesim_hal.injection import KINDS, Injection
+from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.terminal import print_stderr
+from snakesim_hal.model.fault_kinds import KINDS, Injection
+from snakesim_hal.model.fault_plan import check_backend_can
 from snakesim_hal.model.scenario import RunConfig, write
-from snakesim_hal.process import child_environment, python_command
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import print_stderr
 
 READY = "modules ready"
 STOP_LIMIT_S = 5.0

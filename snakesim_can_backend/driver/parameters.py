@@ -6,7 +6,7 @@ from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Opcode, Parameter, SafeMotion
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig

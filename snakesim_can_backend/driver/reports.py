@@ -27,7 +27,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
 ONE_CLOCK_MS = 350  # two heartbeats whose uptimes differ by no more are of the same module

@@ -12,10 +12,10 @@ from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, Opcode
-from snakesim_hal.arrays import Floats
+from snakesim_drivers.motion_capture.mocap import MocapReceiver
+from snakesim_drivers.mounting import Mounting
 from snakesim_hal.backend import Samples
-from snakesim_hal.drivers.mocap import MocapReceiver
-from snakesim_hal.drivers.mounting import Mounting
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.felt_force import FeltForce
 from snakesim_hal.model.kinematics import tangents
 from snakesim_hal.model.scenario import RunConfig

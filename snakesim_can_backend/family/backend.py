@@ -13,14 +13,14 @@ from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.family.drives import CanDrives
 from snakesim_can_backend.family.traffic import Load, Traffic, load_of
 from snakesim_can_backend.family.twin import CanTwin
-from snakesim_hal.drivers.buses import Bus
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.drive_settings import DriveSettings, answer_limit_s, body_of, port_of, who
-from snakesim_hal.drivers.family import FamilyBackend, buses_of
-from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.drivers.twin_body import TwinBody
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import KINDS
+from snakesim_drivers.emulation.twin_body import TwinBody
+from snakesim_drivers.kit.buses import Bus
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, body_of, port_of, who
+from snakesim_drivers.kit.drive_type import FamilyBackend, buses_of
+from snakesim_drivers.kit.readings import Readings
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import KINDS
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 

@@ -11,13 +11,13 @@ from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_w
 from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.family.backend import CanDriveBackend
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.twin_body import serve_until_stopped
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.emulation.twin_body import serve_until_stopped
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import die_with_parent
+from snakesim_hal.base.terminal import exit_code, say
 from snakesim_hal.model.scenario import Override, load, parse_set
-from snakesim_hal.plugin_check import backend_settings
-from snakesim_hal.process import die_with_parent
-from snakesim_hal.terminal import exit_code, say
+from snakesim_hal.programs.preflight import backend_settings
 
 
 def run(backend: type[CanDriveBackend], command: str, argv: Sequence[str] | None) -> int:

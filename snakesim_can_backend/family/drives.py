@@ -1,4 +1,4 @@
-"""Drives on one CAN bus: a `snakesim_hal.drivers.drive_backend.Drives` without its protocol, which a family adds.
+"""Drives on one CAN bus: a `snakesim_drivers.kit.drive_backend.Drives` without its protocol, which a family adds.
 
 Each tick every drive is asked for motion and torque, and one of them for its health.
 """
@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterator, Sequence
 from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_into, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.arrays import Floats
-from snakesim_hal.drivers.findings import Finding
-from snakesim_hal.drivers.following import Following, Word
-from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.drivers.twin_body import FAULTS
-from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import Injection
+from snakesim_drivers.emulation.twin_body import FAULTS
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.following import Following, Word
+from snakesim_drivers.kit.readings import Readings
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from snakesim_can_backend.bus.load import MAX_LOAD
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 
 
 @dataclass(frozen=True)

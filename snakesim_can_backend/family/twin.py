@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.drivers.drive_settings import DriveSettings
-from snakesim_hal.drivers.twin_body import DriveTwin, TwinBody
+from snakesim_drivers.emulation.twin_body import DriveTwin, TwinBody
+from snakesim_drivers.kit.drive_settings import DriveSettings
 
 
 class CanTwin(DriveTwin):

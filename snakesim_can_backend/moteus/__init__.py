@@ -3,6 +3,6 @@
 `backend`   MoteusBackend: settings and checks      `controllers`  what a tick says to a controller, and hears
 `protocol`  registers and frames as bytes           `twin`         emulated controllers
 
-All else is in `snakesim_can_backend.family` and `snakesim_hal.drivers`.
+All else is in `snakesim_can_backend.family` and `snakesim_drivers.kit`.
 Numbers are those of the controller's output shaft: turns, turns/s, N·m.
 """

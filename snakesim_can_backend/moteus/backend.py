@@ -11,7 +11,7 @@ from snakesim_can_backend.family.traffic import Traffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_can_backend.moteus.twin import MoteusTwin
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 

@@ -29,7 +29,7 @@ from snakesim_can_backend.moteus.protocol import (
     parts,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.drivers.following import Word
+from snakesim_drivers.kit.following import Word
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode as JointMode
 

@@ -3,6 +3,6 @@
 `backend`   OdriveBackend: settings and checks      `axes`     what a tick says to an axis, and hears
 `protocol`  messages as bytes                       `twin`     emulated axes
 
-All else is in `snakesim_can_backend.family` and `snakesim_hal.drivers`.
+All else is in `snakesim_can_backend.family` and `snakesim_drivers.kit`.
 Numbers are those of the motor's shaft: turns, A, N·m.
 """

@@ -13,9 +13,9 @@ from snakesim_can_backend.odrive.axes import READING, TWIN_CONSTANT, UNKNOWN_MAX
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.twin import HEARTBEAT_US, OdriveTwin
-from snakesim_hal.drivers.drive_settings import who
-from snakesim_hal.drivers.mounted import Mounted
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.kit.drive_settings import who
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 

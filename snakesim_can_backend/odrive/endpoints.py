@@ -11,7 +11,7 @@ from struct import Struct
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_text
 
 

@@ -26,7 +26,7 @@ from snakesim_can_backend.odrive.protocol import (
     write,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.drivers.twin_body import TwinBody
+from snakesim_drivers.emulation.twin_body import TwinBody
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 

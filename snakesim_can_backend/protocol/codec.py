@@ -16,7 +16,7 @@ import cantools
 from cantools.database.can import Database
 
 from snakesim_can_backend.protocol.definitions import NODE_BITS, WITH_CHECKSUM, Frame, Opcode, checksum, frame_id
-from snakesim_hal.errors import SnakesimError
+from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.model.files import SCHEMAS
 
 DBC = "snakesim.dbc"

@@ -24,10 +24,10 @@ from snakesim_can_backend.twin.module_sensors import ModuleSensors
 from snakesim_can_backend.twin.module_slot import ModuleSlot
 from snakesim_can_backend.twin.node_ids import node_ids
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_hal.drivers.mocap_twin import PoseCamera
-from snakesim_hal.drivers.mounted import as_built, built
-from snakesim_hal.drivers.mounting import Mounting, joint_target
-from snakesim_hal.injection import Change, Injection, Plan
+from snakesim_drivers.emulation.mounted import as_built, built
+from snakesim_drivers.motion_capture.mocap_twin import PoseCamera
+from snakesim_drivers.mounting import Mounting, joint_target
+from snakesim_hal.model.fault_kinds import Change, Injection, Plan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.plant import Plant

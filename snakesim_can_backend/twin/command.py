@@ -18,13 +18,13 @@ from snakesim_can_backend.twin.bus_time import Traffic, by_opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.faults import explain, parse, parse_typed
 from snakesim_can_backend.twin.server import TwinServer
-from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.twin_body import make_plant
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.emulation.twin_body import make_plant
+from snakesim_drivers.motion_capture.mocap_twin import PoseSender
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.base.terminal import exit_code, say
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
-from snakesim_hal.process import die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.terminal import exit_code, say
 
 DEFAULT_CHANNEL = "vcan0"
 DEFAULT_POSE, NO_POSE = "127.0.0.1:7450", "none"

@@ -1,15 +1,15 @@
 """Injected faults of a module twin: those faults of a joint that a module can have.
 
-The vocabulary is that of `snakesim_hal.injection`, with times since the twins were started: `mute:joint_3@2.0-3.5` is a
+The vocabulary is that of `snakesim_hal.model.fault_kinds`, with times since the twins were started: `mute:joint_3@2.0-3.5` is a
 module that sends nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
 """
 
 import re
 from collections.abc import Mapping
 
-from snakesim_hal import injection
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import KINDS, Injection
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model import fault_kinds as injection
+from snakesim_hal.model.fault_kinds import KINDS, Injection
 
 ABOUT: Mapping[str, str] = {
     name: kind.in_module or kind.about for name, kind in KINDS["joint"].items() if "module" in kind.by

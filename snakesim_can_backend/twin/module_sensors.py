@@ -20,8 +20,8 @@ from snakesim_can_backend.twin.reports import (
     Readings,
     touch,
 )
-from snakesim_hal.arrays import Floats
-from snakesim_hal.drivers.mounting import Mounting
+from snakesim_drivers.mounting import Mounting
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.physics.plant import LinkLoad, Plant
 

@@ -1,7 +1,7 @@
 """The node id of every emulated module: its joint's number, but for what the settings say is otherwise."""
 
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.robot import RobotFile
 
 

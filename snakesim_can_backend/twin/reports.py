@@ -8,7 +8,7 @@ import numpy as np
 
 from snakesim_can_backend.protocol.codec import Signal, codec
 from snakesim_can_backend.protocol.definitions import Opcode
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.physics.plant import LinkLoad
 
 UNTOUCHED = (0, 0, 0, 0, 0, 0)

@@ -13,10 +13,10 @@ from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.twin_body import make_plant
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_drivers.emulation.twin_body import make_plant
+from snakesim_drivers.motion_capture.mocap_twin import PoseSender
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
 
 IN_STEP_US = 2000.0  # the plant lags now by at most this, so that a Sync needs little computing

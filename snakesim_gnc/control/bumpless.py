@@ -10,8 +10,8 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, JointState
 from snakesim_hal.wire.quantities import about, above
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Rise
 
 STEEPEST = 0.35  # of a ramp: height over length

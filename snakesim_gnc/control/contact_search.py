@@ -21,7 +21,7 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.felt_wave import FeltWave, spacings
 from snakesim_gnc.control.standstill import Standstill
 from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
 STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.undulation import LateralUndulation, aside_rad
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.wire.messages import Description
 
 AMPLITUDE_RAD, GROWTH_RAD, PERIOD_S, LAG_RAD = 0.637896, -0.616543, math.tau / 5.391202, 0.391127

@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, above, bounded, from_zero

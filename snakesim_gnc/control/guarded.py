@@ -12,7 +12,7 @@ from typing import Any
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import ControllerError, raised
+from snakesim_hal.base.errors import ControllerError, raised
 from snakesim_hal.wire.messages import Description, JointDescription, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
 

@@ -10,13 +10,13 @@ import msgspec
 
 from snakesim_gnc.control.controller import Controller
 from snakesim_gnc.control.guarded import Guarded
-from snakesim_hal.errors import ConfigError, ControllerError, WireError
+from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
+from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Question
-from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE, Decoder
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, Description, SettingsRequest

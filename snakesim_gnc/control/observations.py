@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.goal_progress import Progress
-from snakesim_hal.errors import ConfigError, did_you_mean
+from snakesim_hal.base.errors import ConfigError, did_you_mean
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Message, Pose
 

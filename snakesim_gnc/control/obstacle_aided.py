@@ -25,12 +25,12 @@ from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress, SpeedFilter
 from snakesim_gnc.control.push import Push, PushFilter, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_gnc.control.undulation import LateralUndulation
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, Mode, World

@@ -9,8 +9,8 @@ from typing import Annotated
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.controller import Action, Report, View
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Progress, SpeedFilter
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, from_zero

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.observations import Observer, Part, chosen, parts_of
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import SHIPPED, FileStruct, expanded
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import BodyOnPath
 from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_instant_ns
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.body_on_path import BodyOnPath
+from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Trajectory, World
 from snakesim_hal.wire.quantities import about, from_zero

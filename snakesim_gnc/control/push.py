@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.planar import cross
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.planar import cross
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import SHARES, Outlines, nearest_on_chain
 
 BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head

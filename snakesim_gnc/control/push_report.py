@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_gnc.control.carried import Carried, what_holds
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.push import Push, Touches
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.wire.messages import World, WorldContact
 
 MAX_REPORTED = 64  # push-points in a message

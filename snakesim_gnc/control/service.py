@@ -13,12 +13,12 @@ from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.live_settings import LiveSettings
 from snakesim_gnc.control.state_reports import StateReports
 from snakesim_gnc.control.update_times import UpdateTimes
-from snakesim_hal.errors import ControllerError
+from snakesim_hal.base.errors import ControllerError
+from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
-from snakesim_hal.plugin_check import what_it_lacks
+from snakesim_hal.programs.preflight import what_it_lacks
 from snakesim_hal.service import SILENCE_S, Service
-from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Clock,

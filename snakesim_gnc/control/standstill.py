@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.standstill import Standstill
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, above, bounded, from_zero

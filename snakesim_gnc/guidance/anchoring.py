@@ -18,7 +18,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.body_history import Body
 from snakesim_gnc.guidance.localisation import Localiser
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Contact, Description, Obstacle
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.circle_fit import OUTLIER_SD, softened
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 DEPTH_M, DEPTH_SD_M = 0.10, 0.04  # of a box of which one face was seen
 WALL_M = 0.45  # a longer face is a wall,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 RADIUS_M, RADIUS_SD_M = 0.05, 0.03  # prior: what stands around, before it was looked at
 SMALLEST_M, LARGEST_M = 0.01, 0.5

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Contact, WorldContact
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.ground import NEAR_M, refined, tolerance_m
 from snakesim_gnc.guidance.scan import BAND_M, MAX_RANGE_M, Noise, Scan
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage
 
 Singles = NDArray[np.float32]

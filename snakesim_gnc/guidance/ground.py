@@ -5,7 +5,7 @@ On hills the plane is that of the ground near the head; what is off it by less t
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 FLAT_M, PER_M = 0.015, 0.02  # deviation of ground from its plane: near the robot, and more for each metre of distance
 NEAR_M = 1.5  # the plane is fitted to what is nearer

@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.body_history import Base, BodyHistory, about_z, wrapped
 from snakesim_gnc.guidance.odometry import Odometry, Step
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, Pose
 

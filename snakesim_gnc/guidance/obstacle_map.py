@@ -17,7 +17,7 @@ from snakesim_gnc.guidance.clusters import clusters_of
 from snakesim_gnc.guidance.scan import MAX_RANGE_M, Scan
 from snakesim_gnc.guidance.surfaces import MAX_DOUBTS
 from snakesim_gnc.guidance.tracks import BELIEVED, GONE, HIT, MISS, TOUCH, Track, fit, outlines_of, position_sd_m
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 

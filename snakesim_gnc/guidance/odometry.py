@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState
 

@@ -17,7 +17,7 @@ from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.scan import Look, Noise, Scan, scan_of_ranges
 from snakesim_gnc.guidance.scan_match import matched
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire.messages import (
     Contacts,

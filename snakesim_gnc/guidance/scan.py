@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Ranges
 
 BAND_M = (0.02, 0.12)  # height above the ground of what a snake's body can touch

@@ -11,7 +11,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.scan import Scan
 from snakesim_gnc.guidance.tracks import Track, outlines_of, position_sd_m
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 GATE_M = 0.05
 MIN_POINTS = 8

@@ -12,11 +12,11 @@ from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.reckoned_pose import ReckonedPose
 from snakesim_gnc.guidance.scan import Look, Noise
+from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig, start_of, surveyed
 from snakesim_hal.model.sensors import DepthCamera, Looking
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
-from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Clock,

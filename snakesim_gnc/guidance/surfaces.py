@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 CELL_M = 0.01
 MAX_CELLS = 48

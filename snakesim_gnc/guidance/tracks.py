@@ -14,7 +14,7 @@ import numpy as np
 from snakesim_gnc.guidance.box_fit import fit_boxes
 from snakesim_gnc.guidance.circle_fit import RADIUS_M, fit_circles
 from snakesim_gnc.guidance.surfaces import Surface, batched
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.planar import wrenches
+from snakesim_gnc.geometry.planar import wrenches
 from snakesim_gnc.navigation.line import back_from_end
 from snakesim_gnc.navigation.margin import margins_n
 from snakesim_gnc.navigation.obstacle_map import NONE, ROUGH_M, ObstacleMap
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 Ints = NDArray[np.intp]
 

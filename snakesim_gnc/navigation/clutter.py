@@ -38,7 +38,7 @@ from snakesim_gnc.navigation.plan import (
     straight_on,
     within_reach,
 )
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal

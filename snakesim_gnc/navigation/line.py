@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 SPACING_M = 0.01
 

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 LARGEST_N = 80.0  # lambda_max: force on one contact
 SINGULAR = 1e-4  # of a determinant of three unit wrenches, with moments over half a metre

@@ -14,7 +14,7 @@ from snakesim_gnc.navigation.beam import MIN_TOWARDS, STEP_M, Beam, PathSearch, 
 from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 from snakesim_gnc.navigation.snap import Fit, snap
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_instant_ns
+from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
 from snakesim_gnc.navigation.beam import Search
 from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.core import KnownPath

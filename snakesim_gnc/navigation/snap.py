@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 
 @dataclass(frozen=True)

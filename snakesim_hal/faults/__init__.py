@@ -1,4 +1,4 @@
-"""Carries out injected faults; their vocabulary is in `snakesim_hal.injection`.
+"""Carries out injected faults; their vocabulary is in `snakesim_hal.model.fault_kinds`.
 
 `injector`        one per process: planned and requested faults, at their times
 `message_faults`  lost, late, duplicated and corrupted messages; `disturbance` is the pure part

@@ -9,7 +9,7 @@ import struct
 from collections import deque
 from math import inf
 
-from snakesim_hal.injection import Injection
+from snakesim_hal.model.fault_kinds import Injection
 
 MAX_AT_ONCE = 256  # repeats of a flood at once: after a delay of this process the others are skipped
 LONGEST_BURST = 64  # bytes that are inserted, or copied from elsewhere in the message

@@ -10,8 +10,8 @@ from dataclasses import replace
 import msgspec
 
 from snakesim_hal.backend import Backend, Injectable, Samples
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Description, JointState
 
 NO_NUMBER = float("nan")

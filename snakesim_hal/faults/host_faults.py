@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.faults.injector import Injector
-from snakesim_hal.injection import HAL
+from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import LifecycleState

@@ -11,13 +11,13 @@ from queue import Empty, SimpleQueue
 
 import msgspec
 
-from snakesim_hal.errors import BackendError, ConfigError, WireError
-from snakesim_hal.fault_plan import planned
+from snakesim_hal.base.errors import BackendError, ConfigError, WireError
+from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.faults.message_faults import MessageFaults
-from snakesim_hal.injection import Change, Injection, Plan, checked
+from snakesim_hal.model.fault_kinds import Change, Injection, Plan, checked
+from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
-from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from functools import partial
 from math import inf
 
+from snakesim_hal.base.workers import start_worker
 from snakesim_hal.faults.disturbance import Disturbance
-from snakesim_hal.injection import Injection
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.network.session import Session
-from snakesim_hal.workers import start_worker
 
 SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter
 

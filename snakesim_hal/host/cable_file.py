@@ -12,9 +12,9 @@ from pathlib import Path
 
 import msgspec
 
+from snakesim_hal.base.atomic_write import write_whole
 from snakesim_hal.host.outbox import Sender
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.safety.cables import TURN_RAD, CableJoint, Cables
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description, JointState

@@ -13,9 +13,9 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
-from snakesim_hal.errors import BackendError, SnakesimError, WireError
-from snakesim_hal.injection import Injection
-from snakesim_hal.step_limit import StepTooLongError, place_of
+from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
+from snakesim_hal.base.step_limit import StepTooLongError, place_of
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState
 from snakesim_hal.wire.outgoing import checked, packed

@@ -17,10 +17,10 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.allowed_faults import Faults, NoFaults
-from snakesim_hal.arithmetic import measured
 from snakesim_hal.backend import Backend, Samples
-from snakesim_hal.errors import BackendError, WireError
+from snakesim_hal.base.arithmetic import measured
+from snakesim_hal.base.errors import BackendError, WireError
+from snakesim_hal.faults.allowed import Faults, NoFaults
 from snakesim_hal.host.cable_file import CableFile
 from snakesim_hal.host.inbox import Inbox, Request
 from snakesim_hal.host.latch import EstopLatch, replying
@@ -30,14 +30,14 @@ from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.host.status_messages import applied_message, waiting_for
 from snakesim_hal.host.timing import BackendTime, Deadlines, PublishTimes
-from snakesim_hal.injection import HAL
+from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.network.private_channel import HostEnd, HostMessage
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
 from snakesim_hal.network.run_key import own_run_key, proven
 from snakesim_hal.network.session import Session
-from snakesim_hal.record.black_box import BlackBox
-from snakesim_hal.record.host_record import Ending
+from snakesim_hal.run_log.black_box import BlackBox
+from snakesim_hal.run_log.host_record import Ending
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (

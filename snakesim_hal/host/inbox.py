@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from queue import Empty
 from typing import Any, Protocol
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Question, Session
 from snakesim_hal.wire import keys

@@ -13,12 +13,12 @@ from queue import SimpleQueue
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.whole_file import sync_folder, write_whole
+from snakesim_hal.base.atomic_write import sync_folder, write_whole
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.workers import start_worker
 from snakesim_hal.network.local_registry import state_folder
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Answer
-from snakesim_hal.workers import start_worker
 
 ESTOP = "estop.json"
 ANSWER_LIMIT_S = 1.0  # for a disk that hangs; requesters wait longer

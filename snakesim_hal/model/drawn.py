@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, short
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import Override
 

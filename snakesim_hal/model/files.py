@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, did_you_mean, nearest, short
+from snakesim_hal.base.errors import ConfigError, did_you_mean, nearest, short
 from snakesim_hal.model.field_types import Violation, first_violation, in_words, unit_of
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 

@@ -12,7 +12,7 @@ from typing import Annotated, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import above, bounded, from_zero

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import Table, decode, expanded
 from snakesim_hal.model.sibling_modules import find_siblings_of
 from snakesim_hal.model.textfiles import read_bytes

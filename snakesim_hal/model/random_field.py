@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.random import Generator
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright, block, made_of, peg

@@ -12,7 +12,7 @@ from typing import Annotated, get_args
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.errors import short
+from snakesim_hal.base.errors import short
 from snakesim_hal.model.checked import Checked
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, table

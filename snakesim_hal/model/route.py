@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 
 def is_line(points_w: Floats) -> bool:

@@ -16,8 +16,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError, short
-from snakesim_hal.injection import CONTROL
+from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
 from snakesim_hal.model.fitting import fitted
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
@@ -26,7 +27,6 @@ from snakesim_hal.model.robot import RobotFile, describe
 from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
 from snakesim_hal.model.textfiles import parse_toml
-from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Obstacle, Pace
 from snakesim_hal.wire.quantities import above
@@ -136,7 +136,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
     duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.injection
+    faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.model.fault_kinds
     faults_allowed: bool = False  # also where something real moves
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
     start_limit_s: Annotated[float, Meta(gt=0, le=3600, extra_json_schema={"unit": "s"})] = 60.0

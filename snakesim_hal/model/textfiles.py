@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.errors import ConfigError, nearest
-from snakesim_hal.model.whole_file import replaced, write_whole
+from snakesim_hal.base.atomic_write import replaced, write_whole
+from snakesim_hal.base.errors import ConfigError, nearest
 
 MB = 1024 * 1024
 MAX_BYTES, MAX_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML

@@ -11,7 +11,7 @@ from queue import Empty
 from typing import Any, Generic
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import NotConnectedError, StalledError, WireError, short
+from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.run_key import is_proven, own_run_key

@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import RefusedError, StalledError
-from snakesim_hal.injection import CONTROL
+from snakesim_hal.base.errors import RefusedError, StalledError
+from snakesim_hal.base.process import tune_garbage_collector
+from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.session import Session
-from snakesim_hal.process import tune_garbage_collector
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, Message, Pace, Pose
 

@@ -4,7 +4,7 @@ import re
 import socket
 from ipaddress import ip_address
 
-from snakesim_hal.errors import ConfigError, RefusedError, short
+from snakesim_hal.base.errors import ConfigError, RefusedError, short
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"

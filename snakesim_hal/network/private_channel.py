@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import msgspec
 
+from snakesim_hal.base.workers import start_worker
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
-from snakesim_hal.workers import start_worker
 
 MAX_BYTES = 1 << 18
 

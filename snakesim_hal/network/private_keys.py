@@ -7,7 +7,7 @@ from pathlib import Path
 
 import zenoh
 
-from snakesim_hal.terminal import print_stderr
+from snakesim_hal.base.terminal import print_stderr
 
 _NAMED = ("connect_private_key", "listen_private_key")  # below transport/link/tls
 

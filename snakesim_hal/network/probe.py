@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 
 import zenoh
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 
 UNUSED_KEY = "nobody/is/here"
 TRIES = 9

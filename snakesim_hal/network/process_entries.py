@@ -7,11 +7,11 @@ import time
 from collections.abc import Collection
 from importlib.metadata import version
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
+from snakesim_hal.base.process import user_name
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import shared_settings
 from snakesim_hal.network.session import Arrival, Publisher, Session
-from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import VERSIONS, Process

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import zenoh
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.router_log import ZENOH_LEVELS, short_log
 from snakesim_hal.network.session_file import of_mode, read_zenoh_file, refused_by_zenoh

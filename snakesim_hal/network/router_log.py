@@ -17,8 +17,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from io import RawIOBase
 
-from snakesim_hal.terminal import print_stderr
-from snakesim_hal.workers import start_worker
+from snakesim_hal.base.terminal import print_stderr
+from snakesim_hal.base.workers import start_worker
 
 ZENOH_LEVELS = (
     "info,zenoh::net::routing::interceptor::access_control=trace,"

@@ -21,11 +21,11 @@ import msgspec
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, WireError
+from snakesim_hal.base.process import raise_open_files
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded, check_loopback
 from snakesim_hal.network.image_connection import configure_for_images, set_unless_given
 from snakesim_hal.network.session_file import SessionFile
-from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
 from snakesim_hal.wire.messages import Answer, Message, Preview

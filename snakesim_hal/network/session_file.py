@@ -11,7 +11,7 @@ from typing import Any
 
 import zenoh
 
-from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, short
 from snakesim_hal.model.textfiles import check_brackets, read_text
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.private_keys import warn_of_readable_keys

@@ -22,8 +22,8 @@ from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import dataclass
 
-from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.workers import start_worker
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.base.workers import start_worker
 
 REQUEST, ANSWER = b"SNAKSTOP", b"SNAKDONE"
 TEST = b"SNAKTEST"  # does nothing, and is never answered

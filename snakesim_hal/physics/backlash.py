@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.plant import LinkLoad, Plant

@@ -5,7 +5,7 @@ A joint's torque follows its demand as a first-order lag, is clipped to a limit,
 
 import numpy as np
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import Module, RobotFile
 

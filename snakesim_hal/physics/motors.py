@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.physics.motor import roll_off
 from snakesim_hal.wire.messages import Mode

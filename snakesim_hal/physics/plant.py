@@ -7,7 +7,7 @@ can use the physics of another without importing it.
 from dataclasses import dataclass
 from typing import Protocol
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import Vector
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 
 MIN_SHARE = 0.2  # of its torque, left to the hottest winding

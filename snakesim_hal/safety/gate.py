@@ -21,8 +21,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import oldest_state_ns
 from snakesim_hal.wire.messages import Description, JointCommand, JointDescription, Mode

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire.messages import VERSIONS, ColourImage, DepthImage, Message, OwnSample
 
 MessageT = TypeVar("MessageT", bound=Message)

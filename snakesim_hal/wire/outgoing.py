@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import WireError, did_you_mean, short
+from snakesim_hal.base.errors import WireError, did_you_mean, short
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import VERSIONS, Message, OwnSample

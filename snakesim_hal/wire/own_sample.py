@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.errors import ConfigError, WireError, short
+from snakesim_hal.base.errors import ConfigError, WireError, short
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Message, OwnSample
 from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_OWN_SCHEMA

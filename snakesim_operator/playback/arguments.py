@@ -6,10 +6,10 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import add_json, number
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import say
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.terminal import say
+from snakesim_hal.programs.arguments import add_json, number
 
 
 def add_commands(commands: Any) -> None:
@@ -133,7 +133,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _video(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.tools.video import video
+    from snakesim_operator.playback.video import video
 
     size = (arguments.width, arguments.height)
     if any(pixels % 2 for pixels in size):
@@ -143,7 +143,7 @@ def _video(arguments: argparse.Namespace) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from snakesim_operator import extras
+    from snakesim_operator.base import extras
 
     if arguments.format in ("parquet", "lerobot"):
         extras.check("export", f"--format {arguments.format}")

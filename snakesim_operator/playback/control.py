@@ -16,14 +16,14 @@ from typing import Any
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from snakesim_hal.errors import ConfigError, SnakesimError, short
+from snakesim_hal.base.errors import ConfigError, SnakesimError, short
+from snakesim_hal.base.terminal import Say
 from snakesim_hal.model.plugins import in_file
 from snakesim_hal.model.scenario import CHOSEN, Override, RunConfig, load, write, written
 from snakesim_hal.network.local_network import LocalNetwork, LocalQuery
 from snakesim_hal.network.session import Arrival, Publisher, Question
-from snakesim_hal.plugin_check import find_service
+from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import ServiceLoop
-from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import (

@@ -16,13 +16,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.playback.demonstrations import EPISODES, EpisodeLabel
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.pictures import Pictures, read_pictures
 from snakesim_operator.results.advance import Advance
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.tools.demonstrations import EPISODES, EpisodeLabel
 
 
 @dataclass(frozen=True)

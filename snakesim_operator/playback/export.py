@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import Say, printable
 from snakesim_hal.model.textfiles import exported
-from snakesim_hal.terminal import Say, printable
 from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
 from snakesim_operator.playback.info import recording_of

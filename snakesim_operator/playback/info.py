@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from snakesim_hal.arithmetic import digest_text, foreign
-from snakesim_hal.errors import ConfigError, WireError
-from snakesim_hal.terminal import Say
+from snakesim_hal.base.arithmetic import digest_text, foreign
+from snakesim_hal.base.errors import ConfigError, WireError
+from snakesim_hal.base.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import ControlSettings, Status
@@ -26,7 +26,7 @@ from snakesim_operator.results.gaps import unread
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import GIVE
 from snakesim_operator.results.recorded import ALL, Contents
-from snakesim_operator.tools.parameters import PREFIX, differing
+from snakesim_operator.robot_commands.parameters import PREFIX, differing
 
 # Published on a change too, so that nothing is missing there.
 IRREGULAR = (keys.CONTROL_STATE, keys.STATUS, keys.INTENT)

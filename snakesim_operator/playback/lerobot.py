@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.episodes import Episode
 from snakesim_operator.playback.lerobot_statistics import (

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_operator.playback.pictures import Pictures
 
 QUANTILES = (1, 10, 50, 90, 99)  # percent

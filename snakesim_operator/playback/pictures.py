@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import ColourImage, DepthImage
-from snakesim_operator.png import png
+from snakesim_operator.base.png import png
 from snakesim_operator.recording.reader import RecordingReader
 
 _KINDS = {"depth": Decoder(DepthImage), "colour": Decoder(ColourImage)}

@@ -9,8 +9,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from snakesim_hal.base.terminal import Say
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Publisher, Session, open_session
-from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
 from snakesim_operator.playback.order import in_robot_order

@@ -8,7 +8,7 @@ import msgspec
 from mcap.decoder import DecoderFactory as McapDecoderFactory
 from mcap.records import Schema
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire.messages import VERSIONS
 from snakesim_hal.wire.own_sample import own_kind
 

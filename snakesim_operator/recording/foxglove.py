@@ -23,7 +23,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Protobuf
 
-from snakesim_hal.errors import SnakesimError
+from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.model.scenario import RunConfig, capsules_at_start
 from snakesim_hal.model.scene import place
 from snakesim_hal.network.robot_mismatch import mismatch

@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import TYPE_CHECKING, Self
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of, topic
 from snakesim_operator.recording.origin_relay import HOST, OriginRelay, hidden_host
 

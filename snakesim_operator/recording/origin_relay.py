@@ -6,8 +6,8 @@ import secrets
 import threading
 from collections.abc import Callable, Collection
 
-from snakesim_hal.errors import NotConnectedError
-from snakesim_operator.page_origin import why_head_refused
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_operator.base.page_origin import why_head_refused
 
 HOST = "127.0.0.1"
 LONGEST_HEAD = 16 * 1024

@@ -16,16 +16,16 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.arguments import add_network, add_parent, add_scenario
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import HAL
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import on_stop_signal
+from snakesim_hal.base.terminal import exit_code, print_stderr
+from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, open_session
-from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import ProcessOptions, process_options
+from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
+from snakesim_hal.programs.service_program import ProcessOptions, process_options
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import exit_code, print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description

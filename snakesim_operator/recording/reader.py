@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Header, McapRecord, Message, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.keys import row_key
 from snakesim_operator.recording.chunks import (
     HEAD,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mcap.records import Channel, Message, Metadata, Schema
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.reader import RecordingReader

@@ -6,11 +6,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
-from snakesim_hal.record.black_box import BlackBox
+from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.results.record import RunRecord
 

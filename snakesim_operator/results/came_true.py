@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, WorldContact
 
 DELAY_S = 0.06  # from the set-point to the mean that shows it

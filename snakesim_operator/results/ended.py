@@ -1,7 +1,7 @@
 """How a run ended, of its record: `complete`, or a sentence."""
 
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_operator.results.record import RunRecord
 
 COMPLETE = "complete"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.wire.messages import World
 from snakesim_operator.results.record import RunRecord

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines, nearest_on_chain
 
 REACH_M = 0.02  # an obstacle so near to the body counts

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.messages import Description
 
 LARGEST = 1e9  # no signal is larger, in its SI unit; beyond it a number counts as infinite

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from snakesim_hal.terminal import print_stderr
+from snakesim_hal.base.terminal import print_stderr
 
 INCOMPLETE = 3
 """Exit code: done, but the record lacks something."""

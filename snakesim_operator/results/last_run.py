@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.base.atomic_write import write_whole
 from snakesim_hal.network.local_registry import state_folder
 from snakesim_hal.wire.codec import UNDECODABLE
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_operator.results.advance import Advance
 from snakesim_operator.results.record import RunRecord

@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import RunConfig, place_all, read
 from snakesim_hal.model.scene import Placed, route_of
-from snakesim_hal.record.black_box import Layout, digest_of, read_black_box
-from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
+from snakesim_hal.run_log.black_box import Layout, digest_of, read_black_box
+from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World

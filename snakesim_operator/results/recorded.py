@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError, WireError
-from snakesim_hal.record.black_box import digest_of, touching
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.base.errors import ConfigError, WireError
+from snakesim_hal.run_log.black_box import digest_of, touching
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from snakesim_hal.arithmetic import foreign
+from snakesim_hal.base.arithmetic import foreign
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, Fault, Mode, Pace, Timing
 from snakesim_operator.results.advance import Advance, body_centre_w, energy_j, energy_j_per_m, work_j

@@ -4,7 +4,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.arguments import (
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import output_may_fail
+from snakesim_hal.programs.arguments import (
     add_host,
     add_insecure,
     add_network,
@@ -15,13 +17,11 @@ from snakesim_hal.arguments import (
     load_scenario,
     session_given,
 )
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.terminal import output_may_fail
 from snakesim_operator.recording.message import RAW_ONLY
 
 if TYPE_CHECKING:
+    from snakesim_hal.base.step_limit import Pulse
     from snakesim_hal.model.scenario import RunConfig
-    from snakesim_hal.step_limit import Pulse
 
 
 def add_commands(commands: Any) -> None:
@@ -125,7 +125,7 @@ def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int
 
 
 def _config_of(arguments: argparse.Namespace) -> "RunConfig":
-    from snakesim_hal.plugin_check import check_plugins
+    from snakesim_hal.programs.preflight import check_plugins
 
     loaded = load_scenario(arguments)
     return check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
@@ -139,6 +139,6 @@ def _host(arguments: argparse.Namespace) -> int:
 
 
 def _service(arguments: argparse.Namespace) -> int:
-    from snakesim_hal import serve
+    from snakesim_hal.programs import service_program as serve
 
     return serve.run(arguments)

@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from snakesim_hal import arithmetic
-from snakesim_hal.process import child_environment, python_command
-from snakesim_hal.workers import start_worker
+from snakesim_hal.base import arithmetic
+from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.workers import start_worker
 
 STOP_LIMIT_S = 5.0
 LINES_SHOWN, LAST_BYTES = 15, 16384

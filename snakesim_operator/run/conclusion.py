@@ -6,17 +6,17 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.arithmetic import digest_text
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.arithmetic import digest_text
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import say
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import EMULATED, REAL, UNKNOWN
 from snakesim_hal.network.local_registry import robot_folder
-from snakesim_hal.record.host_record import HostRecord
-from snakesim_hal.terminal import say
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.messages import Description
-from snakesim_operator import extras
+from snakesim_operator.base import extras
 from snakesim_operator.results import last_run
 from snakesim_operator.results.ended import COMPLETE, ended_early
 from snakesim_operator.results.gaps import unwritten

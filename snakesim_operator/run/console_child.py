@@ -5,13 +5,13 @@ import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
-from snakesim_hal.errors import ConfigError
-from snakesim_operator import extras
-from snakesim_operator.console_port import address_of, open_port
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.base import extras
+from snakesim_operator.base.console_port import address_of, open_port
 from snakesim_operator.run import children
 from snakesim_operator.run.run_files import RunFiles
 
-CONSOLE = "snakesim_operator.console"
+CONSOLE = "snakesim_operator.features.console"
 LOG = "console.log"
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from types import FrameType
 
-from snakesim_hal.process import stop_signals
+from snakesim_hal.base.process import stop_signals
 
 
 @dataclass

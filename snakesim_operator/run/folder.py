@@ -8,9 +8,9 @@ from datetime import datetime
 from itertools import count
 from pathlib import Path
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.whole_file import PARTIAL
-from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD
+from snakesim_hal.base.atomic_write import PARTIAL
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY
 

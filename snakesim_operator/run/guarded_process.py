@@ -13,9 +13,9 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from snakesim_hal.process import die_with_parent, limit_memory, stop_signals
-from snakesim_hal.step_limit import Pulse
-from snakesim_hal.terminal import print_stderr
+from snakesim_hal.base.process import die_with_parent, limit_memory, stop_signals
+from snakesim_hal.base.step_limit import Pulse
+from snakesim_hal.base.terminal import print_stderr
 
 LOOK_S = 0.25
 INTERRUPT_LIMIT_S = 3.0  # after Ctrl-C, for the present step; Python code is interrupted long before

@@ -3,11 +3,11 @@
 import argparse
 import contextlib
 
-from snakesim_hal.host_process import host
+from snakesim_hal.base.terminal import say
 from snakesim_hal.model.scenario import write
-from snakesim_hal.plugin_check import check_backend
-from snakesim_hal.serve import process_options
-from snakesim_hal.terminal import say
+from snakesim_hal.programs.host_program import host
+from snakesim_hal.programs.preflight import check_backend
+from snakesim_hal.programs.service_program import process_options
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.folder import claimed
 

@@ -20,21 +20,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.arithmetic import is_pinned
-from snakesim_hal.errors import ConfigError, ControllerError, SnakesimError
-from snakesim_hal.host_process import record_of
-from snakesim_hal.in_process import InProcessRun, check
+from snakesim_hal.base.arithmetic import is_pinned
+from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError
+from snakesim_hal.base.step_limit import Pulse
+from snakesim_hal.base.terminal import print_stderr, say
 from snakesim_hal.model.plugins import anything_offered
 from snakesim_hal.model.scenario import CONTROL, RunConfig, write
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
-from snakesim_hal.plugin_check import check_plugins
-from snakesim_hal.record.recorder import HostRecordWriter
-from snakesim_hal.step_limit import Pulse
-from snakesim_hal.terminal import print_stderr, say
+from snakesim_hal.programs.host_program import record_of
+from snakesim_hal.programs.preflight import check_plugins
+from snakesim_hal.programs.single_process import InProcessRun, check
+from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
-from snakesim_operator import extras
+from snakesim_operator.base import extras
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
@@ -109,7 +109,7 @@ def simulate(
     Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
-    the run is computed in a child process, so that its digest is the same. `snakesim_hal.arithmetic.pin()` before the
+    the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before the
     first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest may
     be its computer's own (`summary.own_arithmetic`).
     """

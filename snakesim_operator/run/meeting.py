@@ -3,12 +3,12 @@
 import contextlib
 import socket
 
-from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.endpoint import DEFAULT_PORT, check_loopback
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.stop_port import open_stop_port, stop_address
 from snakesim_hal.wire import keys
-from snakesim_operator.tools.targets import CONNECT_S, robots_on
+from snakesim_operator.base.targets import CONNECT_S, robots_on
 
 LOOPBACK = "127.0.0.1"
 TRIES = 10

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session

@@ -1,4 +1,4 @@
-"""A function in a child process, which computes in the common arithmetic (`snakesim_hal/arithmetic.py`).
+"""A function in a child process, which computes in the common arithmetic (`snakesim_hal/base/arithmetic.py`).
 
 For programs that imported NumPy before it could be told which processor code to choose.
 """
@@ -14,9 +14,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from snakesim_hal import errors
-from snakesim_hal.arithmetic import environment
-from snakesim_hal.process import child_environment, die_with_parent, python_command
+from snakesim_hal.base import errors
+from snakesim_hal.base.arithmetic import environment
+from snakesim_hal.base.process import child_environment, die_with_parent, python_command
 
 ResultT = TypeVar("ResultT")
 ASKED, ANSWER = "asked", "answer"

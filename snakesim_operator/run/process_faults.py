@@ -10,12 +10,12 @@ from collections.abc import Callable
 from math import inf
 from queue import SimpleQueue
 
-from snakesim_hal.errors import ConfigError, RefusedError, WireError
-from snakesim_hal.fault_plan import planned
-from snakesim_hal.injection import RUN, Injection, Plan, checked
+from snakesim_hal.base.errors import ConfigError, RefusedError, WireError
+from snakesim_hal.base.process import step_wall_clock
+from snakesim_hal.model.fault_kinds import RUN, Injection, Plan, checked
+from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
-from snakesim_hal.process import step_wall_clock
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, Description, FaultRequest, LifecycleState

@@ -4,8 +4,8 @@ import sys
 import time
 from typing import Self
 
+from snakesim_hal.base.terminal import overwrite_line, say
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.terminal import overwrite_line, say
 from snakesim_hal.wire.messages import ControlState, Status
 
 TERMINAL_PERIOD_S = 0.1

@@ -11,20 +11,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
-from snakesim_hal.fault_plan import planned
-from snakesim_hal.injection import ROUTER
+from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, SnakesimError
+from snakesim_hal.base.terminal import say
+from snakesim_hal.model.fault_kinds import ROUTER
+from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.scenario import RunConfig, written
-from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.local_registry import LocalRobot, registered
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
-from snakesim_hal.plugin_check import check_plugins
+from snakesim_hal.programs.preflight import check_plugins
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import say
 from snakesim_hal.wire.roles import RECORDER
-from snakesim_operator import extras
+from snakesim_operator.base import extras
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
@@ -156,19 +156,21 @@ def _conduct(
     listening = ["--insecure"] if request.insecure else []
     joins = request.router is not None or request.with_router
     host_arguments = [
-        *("snakesim_hal.host_process", *common, *listening, "--once", "--memory", supervisor.memory),
+        *("snakesim_hal.programs.host_program", *common, *listening, "--once", "--memory", supervisor.memory),
         *(["--router", link.endpoint] if joins else meeting),
         *(["--out", str(files.folder)] if files.folder else []),
         *([] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
     ]
     try:
         if request.with_router:
-            supervisor.start(ROUTER, ["snakesim_hal.router_process", *common, *meeting, *listening])
+            supervisor.start(ROUTER, ["snakesim_hal.programs.router_program", *common, *meeting, *listening])
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
             if name in config.beside:
                 continue
-            supervisor.start(name, ["snakesim_hal.serve", name, *common, *meeting], may_restart=service.restart)
+            supervisor.start(
+                name, ["snakesim_hal.programs.service_program", name, *common, *meeting], may_restart=service.restart
+            )
         if request.record and files.folder is not None:
             recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
             recorder += ["--raw-only"] if request.raw_only else []

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from snakesim_hal.model.whole_file import write_whole
-from snakesim_hal.workers import start_worker
+from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.workers import start_worker
 
 MEMORY_BYTES = 8 * 2**20
 FILE_BYTES = 64 * 2**20  # of a log: a part that floods does not fill the disk

@@ -16,7 +16,7 @@ import msgspec
 
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.network.run_key import RUN_KEY, new_run_key
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.results.summary import Restart

@@ -4,13 +4,13 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from snakesim_hal.drivers.buses import Bus
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.drive_settings import answer_limit_s, body_of, port_of, who
-from snakesim_hal.drivers.family import FamilyBackend, buses_of
-from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.drivers.twin_body import TwinBody
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_drivers.emulation.twin_body import TwinBody
+from snakesim_drivers.kit.buses import Bus
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_settings import answer_limit_s, body_of, port_of, who
+from snakesim_drivers.kit.drive_type import FamilyBackend, buses_of
+from snakesim_drivers.kit.readings import Readings
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz

@@ -5,7 +5,7 @@ import struct
 import time
 from collections.abc import Iterator, Sequence
 
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
 from snakesim_serial_backend.dynamixel.port import Port

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.twin_body import serve_until_stopped
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.emulation.twin_body import serve_until_stopped
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import die_with_parent
+from snakesim_hal.base.terminal import exit_code, say
 from snakesim_hal.model.scenario import Override, load, parse_set
-from snakesim_hal.plugin_check import backend_settings
-from snakesim_hal.process import die_with_parent
-from snakesim_hal.terminal import exit_code, say
+from snakesim_hal.programs.preflight import backend_settings
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, twin_on
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.registers import RATE

@@ -1,4 +1,4 @@
-"""Dynamixel X servos as a family of drives: a `snakesim_hal.drivers.drive_backend.Drives`.
+"""Dynamixel X servos as a family of drives: a `snakesim_drivers.kit.drive_backend.Drives`.
 
 Every tick all servos say current, velocity and position in one fast sync read, one of them says its health,
 and all get goal current and goal position in one sync write. They stay in current-based position mode: a torque is that
@@ -11,11 +11,11 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.drivers.findings import Finding
-from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.drivers.twin_body import FAULTS
-from snakesim_hal.injection import Injection
+from snakesim_drivers.emulation.twin_body import FAULTS
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.readings import Readings
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.bring_up import ANSWERS_TWICE, GARBLED, bring_up

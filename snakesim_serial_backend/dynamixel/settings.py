@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from snakesim_hal.drivers.drive_settings import DriveSettings
+from snakesim_drivers.kit.drive_settings import DriveSettings
 
 NAME = "dynamixel"
 Baud = Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000]

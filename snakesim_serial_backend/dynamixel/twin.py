@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.drivers.twin_body import DriveTwin, TwinBody
+from snakesim_drivers.emulation.twin_body import DriveTwin, TwinBody
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import (

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, expanded
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage

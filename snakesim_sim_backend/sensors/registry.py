@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import AnyMounted

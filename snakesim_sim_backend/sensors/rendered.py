@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import ColourImage, DepthImage
 from snakesim_sim_backend.ground import PLANE_GROUP

@@ -7,7 +7,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.thermal import Thermal

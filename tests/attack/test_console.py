@@ -181,7 +181,7 @@ def test_c5_a_flood_costs_nobody_the_stop(robot: Robot, at: str, kind: str, reco
 
 def console_mb(robot: Robot) -> float:
     """Resident memory of the console."""
-    pid = next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.console" in line)
+    pid = next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.features.console" in line)
     return psutil.Process(pid).memory_info().rss / 1e6
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.protocol.definitions import Frame, node_of
-from snakesim_hal.conformance.bench import Bench
-from snakesim_hal.drivers.mixed import MixedBackend
+from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Pace
+from snakesim_testing.contract.bench import Bench
 from tests.contract.drives import DrivesOfAnyFamily, DrivesOfModules
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up

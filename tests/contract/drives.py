@@ -16,7 +16,7 @@ POLL_S = 0.02
 
 
 class DrivesOfAnyFamily:
-    """Drives of the driver kit, on one bus or on several: a `snakesim_hal.conformance.bench.EmulatedDrives`."""
+    """Drives of the driver kit, on one bus or on several: a `snakesim_testing.contract.bench.EmulatedDrives`."""
 
     def __init__(self, backend: Any) -> None:
         self._backend, self._lines = backend, backend._drives.lines

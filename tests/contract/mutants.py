@@ -16,10 +16,10 @@ import pytest
 from msgspec.structs import replace
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.conformance.bench import Bench
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
+from snakesim_testing.contract.bench import Bench
 from tests.contract.workbench import DrivesWorkbench, Workbench, WorkbenchDrives, mute
 from tests.unit.hal.rig import pose
 

@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from snakesim_drivers.kit.braking import AT_REST_RAD_S
+from snakesim_drivers.kit.drive_backend import LATCHED
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.drivers.braking import AT_REST_RAD_S
-from snakesim_hal.drivers.drive_backend import LATCHED
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
 DOCS = Path(__file__).parents[2] / "docs" / "backends.md"

@@ -26,7 +26,7 @@ HELD = '''
 import json
 from pathlib import Path
 
-from snakesim_hal.drivers.mounting import Mounting
+from snakesim_drivers.mounting import Mounting
 
 
 class Held(Workbench):

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import snakesim
+from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, Status
 from snakesim_operator.playback.info import inspect_recording

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal import arithmetic
+from snakesim_hal.base import arithmetic
 from tests.e2e.command import SNAKESIM, Ended, call, environment
 from tests.golden import GOLDEN, SECONDS
 from tests.harness.endpoint import free_endpoint

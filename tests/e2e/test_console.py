@@ -12,11 +12,11 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, JointState, Status
-from snakesim_operator.console.operations import Log, Operations
-from snakesim_operator.console.page import Page
-from snakesim_operator.console.server import page_server
-from snakesim_operator.console.snapshot import expected_of
-from snakesim_operator.console_port import open_port
+from snakesim_operator.base.console_port import open_port
+from snakesim_operator.features.console.operations import Log, Operations
+from snakesim_operator.features.console.page import Page
+from snakesim_operator.features.console.server import page_server
+from snakesim_operator.features.console.snapshot import expected_of
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, running
 from tests.harness.endpoint import free_endpoint
@@ -120,7 +120,7 @@ def test_a_page_says_when_its_second_stop_does_not_answer_and_stops_by_it(tmp_pa
         page.wait_for("armed by snakesim run")
         page.wait_for("SECOND STOP")
         assert SILENT not in page.text()
-        console = next(pid for pid, line in processes_of(run.out) if "snakesim_operator.console" in line)
+        console = next(pid for pid, line in processes_of(run.out) if "snakesim_operator.features.console" in line)
         os.kill(console, signal.SIGSTOP)
         try:
             page.wait_for(SILENT)

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from snakesim_hal.record.host_record import HOST_RECORD
+from snakesim_hal.run_log.host_record import HOST_RECORD
 from snakesim_operator.results.record import REPORT
 from tests.e2e.command import SNAKESIM, Ended, background, environment, run_to_summary, snakesim
 from tests.harness.endpoint import free_endpoint

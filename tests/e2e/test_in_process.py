@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.scenario import load, parse_set, read
 from snakesim_hal.network.client import Client
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, DepthImage, World
 from snakesim_operator.results.record import CONFIG

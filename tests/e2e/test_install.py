@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from snakesim_operator.extras import BRINGS
+from snakesim_operator.base.extras import BRINGS
 from tests.contract.workbench import text_of_the_example
 from tests.distributions import required
 from tests.e2e.command import Ended, call, environment

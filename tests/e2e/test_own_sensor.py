@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 import snakesim
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
-from snakesim_operator.console.own_sensors import sensor_table
-from snakesim_operator.console.watch import Watch
+from snakesim_operator.features.console.own_sensors import sensor_table
+from snakesim_operator.features.console.watch import Watch
 from snakesim_operator.recording.decoder import DecoderFactory
 from tests.e2e.command import Ended, call, environment, running
 from tests.e2e.command import snakesim as command
@@ -23,7 +23,7 @@ from tests.whole import command as in_process
 pytestmark = pytest.mark.e2e
 
 ROBOT = REPOSITORY / "docs" / "planar13_whiskers.toml"
-PYTEST = ("-p", "no:cacheprovider", "--pyargs", "snakesim_hal.conformance", "--snakesim-backend", "sim")
+PYTEST = ("-p", "no:cacheprovider", "--pyargs", "snakesim_testing.contract", "--snakesim-backend", "sim")
 LEFT = keys.own("left")
 
 

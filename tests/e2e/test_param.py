@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.process import user_name
+from snakesim_hal.base.process import user_name
 from tests.e2e.command import Ended, Running, armed_run
 from tests.whole.command import snakesim
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys

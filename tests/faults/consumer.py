@@ -8,8 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+from snakesim_hal.base.process import die_with_parent
 from snakesim_hal.network.session import Arrival, Link, open_session
-from snakesim_hal.process import die_with_parent
 from snakesim_hal.wire import keys
 
 SLEEP_S = 0.5

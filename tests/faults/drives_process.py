@@ -21,16 +21,16 @@ from snakesim_can_backend.family.backend import CanDriveBackend
 from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import TwinServer
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.drive_settings import body_of
-from snakesim_hal.drivers.family import FamilyBackend, Part
-from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.twin_body import TwinBody, make_plant
+from snakesim_drivers.emulation.twin_body import TwinBody, make_plant
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_settings import body_of
+from snakesim_drivers.kit.drive_type import FamilyBackend, Part
+from snakesim_drivers.motion_capture.mocap_twin import PoseSender
+from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.base.terminal import say
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, load
-from snakesim_hal.plugin_check import backend_settings
-from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.terminal import say
+from snakesim_hal.programs.preflight import backend_settings
 from snakesim_serial_backend.dynamixel.backend import twin_of
 from snakesim_serial_backend.dynamixel.command import named
 from snakesim_serial_backend.wire import Pty

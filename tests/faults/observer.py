@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from snakesim_hal.errors import NotConnectedError, WireError
+from snakesim_hal.base.errors import NotConnectedError, WireError
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import Override, RunConfig, load, write
 from snakesim_hal.network.session import Link, open_session
 from snakesim_operator.run import children
@@ -62,14 +62,20 @@ class Robot:
         common = [str(self.folder / "config.json"), "--endpoint", self.endpoint]
         inherits: list[int] = []
         if name == "host":
-            module = ["snakesim_hal.host_process", *common, "--out", str(self.folder), "--insecure"]  # network_cut
+            module = [
+                "snakesim_hal.programs.host_program",
+                *common,
+                "--out",
+                str(self.folder),
+                "--insecure",
+            ]  # network_cut
             module += ["--router", self.endpoint] if self.router else []
             inherits = [self.host.inherited.fileno()]
             module += ["--channel", str(inherits[0])]
         elif name == "router":
-            module = ["snakesim_hal.router_process", *common]
+            module = ["snakesim_hal.programs.router_program", *common]
         else:
-            module = ["snakesim_hal.serve", name, *common]
+            module = ["snakesim_hal.programs.service_program", name, *common]
         log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
         state = {"XDG_STATE_HOME": str(self.folder)}  # what outlives a run must not outlive this one
         self.running[name] = children.start(name, module, log.write, inherits=inherits, more=state)

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from snakesim_hal.injection import KINDS
+from snakesim_hal.model.fault_kinds import KINDS
 from snakesim_hal.wire import keys
 from tests.faults.row import DRIVE_TYPES, Backend, Measure, Place, Row
 from tests.faults.rows import (

@@ -25,7 +25,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from tests.fuzz.texts import flipped
 from tests.unit.can_backend.loop import JOINTS, Loop, config, loop

@@ -18,10 +18,10 @@ import msgspec
 import pytest
 
 from snakesim_can_backend.twin import faults as twin_faults
-from snakesim_hal import injection
-from snakesim_hal.drivers.mocap import MAX_BYTES, MocapReceiver
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.motion_capture.mocap import MAX_BYTES, MocapReceiver
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
+from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.model import files, scenario
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scene import SceneFile

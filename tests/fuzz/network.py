@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.record.black_box import read_black_box
-from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD, HostRecord
+from snakesim_hal.run_log.black_box import read_black_box
+from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
 from tests.e2e.command import LIMIT_S, Running, running

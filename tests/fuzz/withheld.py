@@ -7,9 +7,9 @@ byte, under the right encoding, and would have an effect: everything else is sen
 from dataclasses import dataclass
 from typing import Any
 
-from snakesim_hal import injection
-from snakesim_hal.errors import ConfigError, WireError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import ConfigError, WireError
+from snakesim_hal.model import fault_kinds as injection
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.codec import Decoder, encoding_of
 from snakesim_hal.wire.messages import (
     VERSIONS,

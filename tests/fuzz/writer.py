@@ -15,8 +15,8 @@ import msgspec
 import zenoh
 from msgspec import inspect
 
-from snakesim_hal import injection
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
+from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.wire import keys

@@ -17,21 +17,21 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.twin_body import Motion, TwinBody, make_plant
+from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.identify import Identify
-from snakesim_hal.arrays import Floats
-from snakesim_hal.drivers.drive_settings import BodySettings
-from snakesim_hal.drivers.mounted import Mounted
-from snakesim_hal.drivers.twin_body import Motion, TwinBody, make_plant
-from snakesim_hal.in_process import InProcessRun
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Imu, JointState, Mode
-from snakesim_operator.commissioning.identification import Identified, identified
-from snakesim_operator.commissioning.judge import Judged, judged
-from snakesim_operator.commissioning.measured import measured
+from snakesim_operator.features.commissioning.identification import Identified, identified
+from snakesim_operator.features.commissioning.judge import Judged, judged
+from snakesim_operator.features.commissioning.measured import measured
 
 LAID_RAD = 0.03  # how straight a person lays a robot, at each joint
 OFFSET_RAD = 0.15

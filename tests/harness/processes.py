@@ -8,8 +8,8 @@ from tests.harness.wait import wait_until
 
 SERVICE = re.compile(r"snakesim_hal\.serve\0(\w+)\0")
 PROGRAMS = {
-    "snakesim_hal.host_process": "host",
-    "snakesim_hal.router_process": "router",
+    "snakesim_hal.programs.host_program": "host",
+    "snakesim_hal.programs.router_program": "router",
     "snakesim_operator.recording.process": "recorder",
     "snakesim_can_backend.twin": "twins",
 }

@@ -13,13 +13,13 @@ from typing import Any
 
 import zenoh
 
-from snakesim_hal.process import die_with_parent
+from snakesim_hal.base.process import die_with_parent
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.lab.certificates import write_certificates
-from snakesim_operator.lab.identities import Identity, identities
-from snakesim_operator.lab.lab_file import Lab, load_lab
-from snakesim_operator.lab.render import render
-from snakesim_operator.lab.zenoh_files import session_settings
+from snakesim_operator.features.lab.certificates import write_certificates
+from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_operator.features.lab.lab_file import Lab, load_lab
+from snakesim_operator.features.lab.render import render
+from snakesim_operator.features.lab.zenoh_files import session_settings
 from tests.e2e.command import SNAKESIM, environment
 from tests.harness.endpoint import free_port
 from tests.harness.wait import wait_until

@@ -11,7 +11,7 @@ import yaml
 import zenoh
 
 from snakesim_operator.cli import main
-from snakesim_operator.lab.lab_file import EXAMPLE
+from snakesim_operator.features.lab.lab_file import EXAMPLE
 from tests.harness.command import call
 
 ROBOTS = {

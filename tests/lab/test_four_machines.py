@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.record.host_record import HostRecord
-from snakesim_operator.lab.lab_file import EXAMPLE
+from snakesim_hal.run_log.host_record import HostRecord
+from snakesim_operator.features.lab.lab_file import EXAMPLE
 from tests.e2e.command import SNAKESIM, summary_of
 from tests.machines import NET, connected
 

@@ -17,8 +17,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.lab.certificates import Issuer, issue, make_authority
-from snakesim_operator.lab.identities import Identity
+from snakesim_operator.features.lab.certificates import Issuer, issue, make_authority
+from snakesim_operator.features.lab.identities import Identity
 from tests.harness.endpoint import free_port
 from tests.lab.small_lab import OTHER, OWN, SmallLab, opened
 from tests.lab.test_matrix import eventually, settle

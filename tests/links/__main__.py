@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD, HostRecord
+from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_operator.results.record import RunRecord
 from tests.links.lab import Lab, lab
 

@@ -36,12 +36,24 @@ class Lab:
         self.start_router()
         self.host = self._start_host()
         for name in self.config.services:
-            arguments = ("snakesim_hal.serve", name, str(self._saved), "--router", "tcp/10.77.2.1:7447")
+            arguments = (
+                "snakesim_hal.programs.service_program",
+                name,
+                str(self._saved),
+                "--router",
+                "tcp/10.77.2.1:7447",
+            )
             self.workstation.module(*arguments, log=folder / f"{name}.log")
 
     def start_router(self) -> None:
         """A new router."""
-        arguments = ("snakesim_hal.router_process", str(self._saved), "--endpoint", "tcp/0.0.0.0:7447", "--insecure")
+        arguments = (
+            "snakesim_hal.programs.router_program",
+            str(self._saved),
+            "--endpoint",
+            "tcp/0.0.0.0:7447",
+            "--insecure",
+        )
         self._router = self.router_machine.module(*arguments, log=self.folder / "router.log", hurried=True)
 
     def record(self) -> Path:
@@ -59,7 +71,7 @@ class Lab:
     def _start_host(self) -> StarterEnd:
         ours, its = socket_pair()
         with its:
-            arguments = ("snakesim_hal.host_process", str(self._saved), "--router", "tcp/10.77.1.1:7447")
+            arguments = ("snakesim_hal.programs.host_program", str(self._saved), "--router", "tcp/10.77.1.1:7447")
             out = ("--out", str(self.folder), "--channel", str(its.fileno()))
             self.robot.module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
         return StarterEnd(ours)

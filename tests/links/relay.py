@@ -18,7 +18,7 @@ import sys
 import time
 from collections import deque
 
-from snakesim_hal.process import HOST_PRIORITY, set_realtime_priority
+from snakesim_hal.base.process import HOST_PRIORITY, set_realtime_priority
 
 TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 CLONE_NEWNET = 0x40000000

@@ -13,7 +13,7 @@ from unittest import mock
 import numpy as np
 
 import snakesim
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.felt_force import FELT_OVER_S
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.results.came_true import ASKED_N, EMPTY_N

@@ -12,10 +12,10 @@ import pytest
 
 from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
 from snakesim_hal.backend import Samples
-from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.plugins import BACKENDS, offered
 from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Imu, Pose
 from snakesim_sim_backend.backend import SimBackend

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Intent, World
 

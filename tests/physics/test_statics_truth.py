@@ -15,8 +15,8 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import TripletSolution, bending_torque_nm, solve_triplet
 from snakesim_gnc.control.obstacle_triplet.statics import loads
-from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.route import Route, lay_chain, sine_points
 from snakesim_hal.model.scenario import RunConfig, Start

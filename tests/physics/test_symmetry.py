@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, build
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings

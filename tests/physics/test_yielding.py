@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
 from snakesim_sim_backend.model import build
 from snakesim_sim_backend.plant import MujocoPlant
 from snakesim_sim_backend.settings import PlantSettings, SimSettings

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, LifecycleRequest, Message
 from tests.faults.observer import TrialError

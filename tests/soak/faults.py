@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.injection import KINDS, Injection, TargetType, checked
+from snakesim_hal.model.fault_kinds import KINDS, Injection, TargetType, checked
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 

@@ -13,10 +13,10 @@ from typing import Literal, get_args
 
 import msgspec
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import ask_to_stop
-from snakesim_hal.record.host_record import HOST_RECORD, HostRecord
+from snakesim_hal.run_log.host_record import HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import SUMMARY

@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from typing import Any
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Clock, Description, Mode, Status

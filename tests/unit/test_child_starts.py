@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.process import child_environment, python_command
+from snakesim_hal.base.process import child_environment, python_command
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("snakesim", *sorted(path.name for path in ROOT.glob("snakesim_*")), "benchmarks", "deploy", "docs")
@@ -41,7 +41,7 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "deploy/vm/with_vcan.py": "the command that the user types",
     "docs/site/build.py": "git",
     "snakesim_can_backend/bus/bus_faults.py": "ip",
-    "snakesim_hal/process.py": "the same program again, with its own options",
+    "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
 FORKS = {
     "benchmarks/environments.py",
@@ -93,7 +93,7 @@ def test_every_python_child_is_started_with_the_command_line_and_environment_mad
 
 
 def test_nothing_else_makes_a_command_line_of_this_interpreter() -> None:
-    allowed = {"snakesim_hal/process.py", "deploy/bootstrap.py"}
+    allowed = {"snakesim_hal/base/process.py", "deploy/bootstrap.py"}
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         if "sys.executable" not in text or path.relative_to(ROOT).as_posix() in allowed:

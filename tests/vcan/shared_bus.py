@@ -18,8 +18,8 @@ from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleSt
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import TwinServer
+from snakesim_drivers.emulation.twin_body import make_plant
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.physics.plant import Plant
 from tests.unit.can_backend.loop import Loop, armed, config
 

@@ -144,7 +144,9 @@ class Bench:
         self.until(lambda: "modules ready" in self.said("modules"), "modules ready")
 
     def control(self) -> subprocess.Popen[bytes]:
-        return self.start("control", "snakesim_hal.serve", "control", self._saved, "--endpoint", self.endpoint)
+        return self.start(
+            "control", "snakesim_hal.programs.service_program", "control", self._saved, "--endpoint", self.endpoint
+        )
 
     @property
     def host_arguments(self) -> Sequence[str]:
@@ -178,7 +180,7 @@ class Bench:
     def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         """Start modules, host and control, and wait until every module is armed. Returns the latter two processes."""
         self.modules()
-        host = self.start("host", "snakesim_hal.host_process", *self.host_arguments)
+        host = self.start("host", "snakesim_hal.programs.host_program", *self.host_arguments)
         self.until(lambda: len(self.listener.of(Opcode.SYNC)) > 20, "the driver's Syncs")
         control = self.control()
         self.until(self._is_armed, "ready to arm")

@@ -5,7 +5,7 @@ import pytest
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.hold import Hold
-from snakesim_hal.errors import ControllerError
+from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire.messages import Mode

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.compare.command import compare
 from snakesim_operator.results.incomplete import INCOMPLETE

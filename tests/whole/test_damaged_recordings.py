@@ -14,6 +14,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.wire import keys
+from snakesim_operator.playback import video
 from snakesim_operator.playback.episodes import read_episodes
 from snakesim_operator.playback.export import write_parquet
 from snakesim_operator.playback.lerobot import write_lerobot
@@ -22,7 +23,6 @@ from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.summary import summarise
-from snakesim_operator.tools import video
 from tests.whole.command import snakesim
 from tests.whole.damaged import chunks, flipped, packed, recorded, spans, written
 

@@ -21,7 +21,7 @@ from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
 from snakesim.environments.rewards import TERMS
 from snakesim_hal.model.drawn import Draw
 from snakesim_hal.model.scenario import write
-from snakesim_operator.extras import BRINGS
+from snakesim_operator.base.extras import BRINGS
 from tests.e2e.documents import REPOSITORY, sections
 
 IDS = [f"SnakeSIM/{name}-v0" for name in SCENARIOS]

@@ -9,8 +9,8 @@ import pytest
 
 from snakesim.training.curve import write_curve
 from snakesim.training.search import Generation
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.evaluate.store import write_tables
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.evaluate.store import write_tables
 from tests.whole.command import run_to_summary, snakesim
 
 FITS_BYTES = 2000  # less than any of these exports takes

@@ -82,7 +82,7 @@ def test_a_controller_that_does_not_return_ends_the_run_in_a_safe_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("snakesim_hal.in_process.TURN_LIMIT_S", 2.0)
+    monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_LIMIT_S", 2.0)
     (tmp_path / "endless.py").write_text(ENDLESS)
     changes = [Override("controller", "./endless.py:Endless", "the test"), parse_set("start_limit_s=1")]
     result = simulate(load("triplet", changes).config)

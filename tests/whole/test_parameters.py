@@ -5,14 +5,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, installed
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, SettingsRequest
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.tools.parameters import Parameter, parameters_of
+from snakesim_operator.robot_commands.parameters import Parameter, parameters_of
 from tests.whole.command import snakesim
 
 CHANGED_AT = 30  # turns

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snakesim_operator.console.drawing import Surroundings, draw
-from snakesim_operator.console.recorded import RecordedRun
+from snakesim_operator.features.console.drawing import Surroundings, draw
+from snakesim_operator.features.console.recorded import RecordedRun
 from tests.whole.command import run_to_summary, snakesim
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.family import backend as can_family
-from snakesim_hal.drivers.buses import Bus, Buses
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.drivers.readings import Readings
+from snakesim_drivers.kit.buses import Bus, Buses
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.readings import Readings
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
-from snakesim_hal.plugin_check import backend_settings
+from snakesim_hal.programs.preflight import backend_settings
 from snakesim_serial_backend.dynamixel import backend as dynamixel
 from tests.unit.hal.rig import run_config
 from tests.whole.command import run_to_summary

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import BodyPose
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.body_on_path import BodyPose
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle

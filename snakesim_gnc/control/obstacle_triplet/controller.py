@@ -23,7 +23,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.climb import Climb
@@ -33,10 +32,11 @@ from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Tripl
 from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
 from snakesim_gnc.control.obstacle_triplet.telemetry import bending_nm, planned_contacts
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.body_on_path import BodyPose
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
 
 PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstacle that is near the body

@@ -20,8 +20,8 @@ from snakesim_gnc.control.obstacle_triplet.statics import (
     torque_per_newton,
     unit_forces,
 )
-from snakesim_gnc.control.planar import wrenches
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.planar import wrenches
+from snakesim_hal.base.arrays import Floats
 
 Names = tuple[str, str, str]
 Three = tuple[PlannedContact, PlannedContact, PlannedContact]

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from snakesim_gnc.control.planar import cross, wrenches
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.planar import cross, wrenches
+from snakesim_hal.base.arrays import Floats
 
 Planar = tuple[float, float] | Floats
 

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.obstacle_triplet.selection import Choice
 from snakesim_gnc.control.obstacle_triplet.statics import torque_under
-from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_hal.arrays import Floats
+from snakesim_gnc.geometry.body_on_path import BodyPose
+from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import World, WorldContact
 
 

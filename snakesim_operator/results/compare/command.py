@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import say, say_json
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.terminal import say, say_json
 from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table

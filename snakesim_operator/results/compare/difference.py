@@ -7,9 +7,9 @@ from itertools import takewhile
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.record.host_record import BLACK_BOX
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.run_log.host_record import BLACK_BOX
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following

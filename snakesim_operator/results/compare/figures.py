@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.compare.difference import Advance, Difference, Gap
 from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
 from snakesim_operator.results.propulsion import propulsion_intervals

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 MOST_S = 0.25  # of a lag that is looked for
 LEAST_MOTION = 1e-6  # standard deviation in A, of which less is none

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 Figure = dict[str, Any]
 LIBRARY = Path(__file__).parent / "vendor" / "plotly-cartesian.min.js"

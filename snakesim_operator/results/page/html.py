@@ -10,7 +10,7 @@ import jinja2
 import msgspec
 from markupsafe import Markup
 
-from snakesim_hal.terminal import printable
+from snakesim_hal.base.terminal import printable
 from snakesim_operator.results.page.charts import LIBRARY, Figure
 from snakesim_operator.results.page.palette import themes
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.came_true import is_felt
 from snakesim_operator.results.record import RunRecord

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.map_score import MapScore, score

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.came_true import EMPTY_N, Pair, pairs
 from snakesim_operator.results.record import RunRecord

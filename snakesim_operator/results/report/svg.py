@@ -6,7 +6,7 @@ What it looks like stands in figure.css and palette.py; a figure only names clas
 import math
 from html import escape
 
-from snakesim_hal.terminal import printable
+from snakesim_hal.base.terminal import printable
 
 Point = tuple[float, float]
 Attribute = str | float | int | None

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.motion import Motion

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord

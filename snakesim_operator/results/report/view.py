@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant

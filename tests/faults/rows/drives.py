@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.injection import Injection
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig, write
-from snakesim_hal.plugin_check import check_plugins
+from snakesim_hal.programs.preflight import check_plugins
 from snakesim_operator.run import children
 from tests.faults.drives_process import READY
 from tests.faults.observer import Observer, TrialError

@@ -16,9 +16,9 @@ from functools import partial
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, node_of
-from snakesim_hal import host_process
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.programs import host_program as host_process
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, robot
 from tests.faults.row import Request, Trial

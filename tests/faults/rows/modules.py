@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from snakesim_can_backend.protocol.definitions import Action
-from snakesim_hal.injection import Injection, checked
+from snakesim_hal.model.fault_kinds import Injection, checked
 from snakesim_hal.wire.messages import Answer, Status
 from tests.faults import bus_log
 from tests.faults.observer import Observer, TrialError

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 
-from snakesim_hal.record.black_box import read_black_box
-from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD, HostRecord
+from snakesim_hal.run_log.black_box import read_black_box
+from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from tests.faults.observer import TrialError
 from tests.faults.robot import START_LIMIT_S, recovered, robot
 from tests.faults.row import Request, Trial

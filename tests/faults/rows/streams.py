@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 
-from snakesim_hal.injection import writer_of
+from snakesim_hal.model.fault_kinds import writer_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Mode
 from tests.faults.observer import Observer, TrialError

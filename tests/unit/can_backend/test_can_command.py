@@ -14,10 +14,10 @@ from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.commands import command
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import aligned
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
-from snakesim_hal.terminal import aligned
 from tests.unit.can_backend.frames import health, heartbeat
 
 TRIPLET = load_scenario("triplet").config

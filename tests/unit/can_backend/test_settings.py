@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Parameter
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 
 

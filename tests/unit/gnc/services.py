@@ -8,11 +8,11 @@ from typing import Any
 
 from snakesim_gnc.control.controller import Action, View
 from snakesim_gnc.control.hold import Hold
-from snakesim_hal.errors import SnakesimError
+from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.model.plugins import CONTROLLERS, offered
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link, Reader, open_session
-from snakesim_hal.plugin_check import find_service
+from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState

@@ -5,8 +5,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import chain_nodes
 from snakesim_gnc.control.controller import View
+from snakesim_gnc.geometry.body_on_path import chain_nodes
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
 from snakesim_hal.wire.messages import Axis, Description, Obstacle, Trajectory, World, WorldContact

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.body_on_path import BodyOnPath, chain_nodes, heading_of
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
+from snakesim_gnc.geometry.body_on_path import BodyOnPath, chain_nodes, heading_of
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.route import lay_chain
 from tests.unit.gnc.stage import PERIOD_S, make_robot, make_route, make_stage, nodes_of

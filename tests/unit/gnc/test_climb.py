@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.body_on_path import BodyOnPath
 from snakesim_gnc.control.climb import ABOVE_M, Climb, line_height_m
+from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_gnc.navigation.rises import Rises
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.model.route import Route

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.body_on_path import chain_nodes
+from snakesim_gnc.geometry.body_on_path import chain_nodes
 from snakesim_gnc.navigation.beam import Beam, PathSearch, PlannedPath, Search
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion

@@ -12,8 +12,8 @@ from snakesim.training.form import Policy
 from snakesim_gnc.control.controller import Action
 from snakesim_gnc.control.felt_wave import FeltWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.policy import POLICIES
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import Stage, make_contact, make_stage

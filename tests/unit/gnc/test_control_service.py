@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.errors import ControllerError
+from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
 from tests.harness.wait import wait_until

@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.guarded import Guarded
-from snakesim_hal.errors import ControllerError
+from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.gnc.stage import make_stage
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.planar import wrenches
 from snakesim_gnc.control.push import Touches, find_touches, push_forward
+from snakesim_gnc.geometry.planar import wrenches
 from snakesim_gnc.navigation.margin import LARGEST_N, margins_n
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.carried import Carried
-from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.push import find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
+from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import make_robot, make_world

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.body_on_path import BodyOnPath
 from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import (
     Choice,
@@ -18,6 +17,7 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
     propulsion_joint,
     solve,
 )
+from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import BODY_RADIUS_M, CLEARANCE_M, make_pegs, make_route, make_stage, nodes_of

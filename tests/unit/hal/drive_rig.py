@@ -2,9 +2,9 @@
 
 from typing import Any
 
+from snakesim_drivers.kit.drive_backend import DriveBackend
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.drivers.drive_backend import DriveBackend
-from snakesim_hal.injection import parse
+from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.faults.allowed import faults_of_host
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig, description_of

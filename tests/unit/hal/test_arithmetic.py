@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal import arithmetic
+from snakesim_hal.base import arithmetic
 
 INTEL = "processor : 0\nflags\t\t: fpu sse2 fma avx2 avx512f\n"
 

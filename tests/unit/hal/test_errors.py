@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import raised
+from snakesim_hal.base.errors import raised
 
 PLUGIN = "import numpy as np\n\n\ndef solve():\n    return np.linalg.solve(np.zeros((2, 2)), np.ones(2))\n"
 

@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.fault_plan import check_backend_can, check_planned, check_without_run, planned
-from snakesim_hal.injection import (
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import (
     KINDS,
     Injection,
     Plan,
@@ -18,6 +17,7 @@ from snakesim_hal.injection import (
     kinds_in_short,
     parse,
 )
+from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, planned
 from snakesim_hal.wire import keys
 from tests.kinds_table import PAGE, with_table
 from tests.unit.hal.rig import run_config

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 LOCK = "import resource; resource.setrlimit(resource.RLIMIT_MEMLOCK, ({0}, {0})); "
-PRINT = "from snakesim_hal.process import {0}; print({0}({1}))"
+PRINT = "from snakesim_hal.base.process import {0}; print({0}({1}))"
 
 
 def said(code: str, *, drop: str = "") -> str:
@@ -33,7 +33,7 @@ def test_memory_is_locked_where_that_is_allowed() -> None:
 
 
 def test_what_is_refused_is_returned_and_printed() -> None:
-    code = "from snakesim_hal.process import enter_realtime; r = enter_realtime(20); print(len(r), r)"
+    code = "from snakesim_hal.base.process import enter_realtime; r = enter_realtime(20); print(len(r), r)"
     words = said(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
     assert words.startswith("2 [") and words.count("no real-time priority") == 2, words
 
@@ -46,7 +46,7 @@ def test_the_clock_is_not_stepped_without_permission() -> None:
 def test_a_thread_that_never_pauses_gives_up_its_priority() -> None:
     code = """
 import os, time
-from snakesim_hal.process import drop_priority_after, set_realtime_priority
+from snakesim_hal.base.process import drop_priority_after, set_realtime_priority
 if set_realtime_priority(5) is not None:
     raise SystemExit("refused")
 drop_priority_after(0.05)

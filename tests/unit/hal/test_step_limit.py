@@ -5,7 +5,7 @@ from contextlib import closing
 
 import pytest
 
-from snakesim_hal.step_limit import Pulse, StepLimit, StepTooLongError, place_of
+from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, place_of
 
 
 def endless() -> None:

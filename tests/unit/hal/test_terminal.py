@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.terminal import overwrite_line, printable, report_error, say
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import overwrite_line, printable, report_error, say
 
 REPOSITORY = Path(__file__).parents[3]
 STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidirectional overrides too), surrogates, separators

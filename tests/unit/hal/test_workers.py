@@ -9,11 +9,11 @@ from queue import SimpleQueue
 import msgspec
 import pytest
 
+from snakesim_hal.base.workers import Worker, start_worker
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.network.private_channel import HostEnd, socket_pair
 from snakesim_hal.network.stop_port import Reply, ask_to_stop, open_stop_port, serve_stops
 from snakesim_hal.wire.messages import Answer, LifecycleRequest
-from snakesim_hal.workers import Worker, start_worker
 from tests.harness.wait import wait_until
 
 LOOPBACK = "127.0.0.1"

@@ -8,8 +8,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from snakesim_operator import worker_pool
-from snakesim_operator.worker_pool import (
+from snakesim_operator.base import worker_pool
+from snakesim_operator.base.worker_pool import (
     FOLDER_PREFIX,
     CallTookTooLongError,
     Raised,

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_serial_backend.wire import USB_LATENCY_S, Pty, SerialWire, latency_s
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.model import build
 from snakesim_sim_backend.settings import SimSettings

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import Mode
 from tests.unit.sim_backend.rig import Run, make_config

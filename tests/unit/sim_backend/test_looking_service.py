@@ -7,11 +7,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.in_process import InProcessRun
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import SERVICES, offered
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.client import Client
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensor_service import SensorService

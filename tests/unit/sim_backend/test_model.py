@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from tests.unit.sim_backend.rig import Run, make_config, open_sim
 
 

@@ -5,7 +5,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 
 BODIES, ARM_LINKS = 4, 4  # 4 * (6 + 2 * 4) = 56 degrees of freedom
 ARM_LINK = """

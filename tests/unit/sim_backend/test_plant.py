@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, start_of
 from snakesim_hal.physics.plant import Plant

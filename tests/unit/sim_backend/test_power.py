@@ -4,8 +4,8 @@ from math import inf
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.sim_backend.rig import Run, make_config, open_sim
 

@@ -25,7 +25,7 @@ from snakesim_can_backend.bus.load import (
 )
 from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import load as load_scenario
 

@@ -9,7 +9,7 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 
 LINE = re.compile(r"\((\d+\.\d{6})\) (\S+) ([0-9A-F]{3})#([0-9A-F]*) ([RT])\n")
 

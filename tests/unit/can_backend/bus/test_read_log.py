@@ -7,7 +7,7 @@ import can
 import pytest
 
 from snakesim_can_backend.bus.read_log import BusLog
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 
 COMPACT = """\
 (1700000000.000000) can0 105#0011223344556677 R

@@ -10,8 +10,8 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.fault_kinds import Injection
 
 
 class End:

@@ -16,7 +16,7 @@ from snakesim_can_backend.bus import bus as wire_module
 from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, check_interface, drain, is_up
 from snakesim_can_backend.bus.bus_errors import BusError, Kind, bus_errors_of
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 
 CAN_ERR_FLAG = 0x20000000  # linux/can.h, linux/can/error.h
 CAN_ERR_TX_TIMEOUT, CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x001, 0x002, 0x004, 0x008

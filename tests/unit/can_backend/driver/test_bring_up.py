@@ -35,8 +35,8 @@ from snakesim_can_backend.protocol.definitions import (
     opcode_of,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.fault_kinds import Injection
 from tests.unit.can_backend.frames import heartbeat, read
 from tests.unit.can_backend.loop import config
 from tests.unit.can_backend.twin.rig import chain

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.protocol.definitions import ModuleState
-from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import parse
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.fault_kinds import parse
 from tests.unit.can_backend.loop import cleared_and_armed_again, loop
 
 START_TICK = 60

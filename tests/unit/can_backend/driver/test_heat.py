@@ -11,12 +11,12 @@ import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.contract.rig import Rig
 from tests.unit.can_backend.loop import chain_of
 from tests.unit.hal.rig import run_config
 

@@ -14,9 +14,9 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.faults import ABOUT
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.injection import parse
+from snakesim_hal.model.fault_kinds import parse
 from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
 
 

@@ -16,9 +16,9 @@ from snakesim_can_backend.protocol.commands import command, emergency
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.firmware import PASSIVE
-from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.injection import parse
+from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
+from snakesim_testing.contract.rig import Rig
 from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
 from tests.unit.can_backend.loop import JOINTS, chain_of, config
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.drivers.mocap import MAX_AT_ONCE, MocapReceiver
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_drivers.motion_capture.mocap import MAX_AT_ONCE, MocapReceiver
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Pose
 
 MS = 1_000_000

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from snakesim_hal.drivers.mocap_times import MAX_LATE_NS, READINGS_TO_BELIEVE, CaptureTimes
+from snakesim_drivers.motion_capture.mocap_times import MAX_LATE_NS, READINGS_TO_BELIEVE, CaptureTimes
 
 MS = 1_000_000
 AHEAD_NS = 5_000_000_000_000  # what the other clock shows when ours shows 0

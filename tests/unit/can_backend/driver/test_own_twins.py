@@ -12,8 +12,8 @@ import pytest
 from snakesim_can_backend.driver import own_twins
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.model.fault_kinds import Injection
 from tests.harness.wait import wait_until
 from tests.unit.can_backend.loop import config
 

@@ -10,8 +10,8 @@ from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, che
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.drivers.mounted import Mounted, check_mounted
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_drivers.emulation.mounted import Mounted, check_mounted
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.joints import JointExceptions
 from snakesim_hal.model.robot import RobotFile

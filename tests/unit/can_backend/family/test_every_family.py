@@ -15,8 +15,8 @@ from snakesim_can_backend.moteus.backend import MoteusBackend
 from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import State
-from snakesim_hal.drivers.family import FamilyBackend
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_drivers.kit.drive_type import FamilyBackend
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from tests.contract.drives import DrivesOfAnyFamily
@@ -160,7 +160,7 @@ def test_a_drive_that_restarts_in_motion_stays_off_until_the_clear_and_then_has_
 def test_a_drive_that_restarts_between_two_ticks_does_not_go_on_as_if_nothing_had_been(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("snakesim_hal.drivers.twin_body.BOOT_US", 10_000.0)
+    monkeypatch.setattr("snakesim_drivers.emulation.twin_body.BOOT_US", 10_000.0)
     robot.run(30, "armed")
     robot.go_wrong("reboot:joint_3@0")
     assert [(fault.what, fault.joint) for fault in robot.run(SHOWN, "armed")] == [("drive_not_armed", "joint_3")]

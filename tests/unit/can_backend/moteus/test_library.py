@@ -13,9 +13,9 @@ from snakesim_can_backend.moteus import protocol
 from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
 from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION
 from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.loop import config
 from tests.unit.hal.drive_rig import drives_of

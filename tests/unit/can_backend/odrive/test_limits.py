@@ -13,7 +13,7 @@ from snakesim_can_backend.odrive.backend import MountedAxis, OdriveBackend, Odri
 from snakesim_can_backend.odrive.endpoints import EMULATED, Setting, read_endpoints
 from snakesim_can_backend.odrive.protocol import Message, parted, read_setting, setting_of
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config

@@ -21,8 +21,8 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.reports import Readings
+from snakesim_drivers.emulation.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.frames import read

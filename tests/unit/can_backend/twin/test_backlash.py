@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from snakesim_drivers.emulation.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.physics.backlash import BacklashPlant, without_rotors
-from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from tests.unit.can_backend.loop import config
 
 BACKLASH_RAD = 0.03

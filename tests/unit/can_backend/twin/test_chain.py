@@ -10,7 +10,7 @@ from snakesim_can_backend.protocol.commands import command, sync
 from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
 from snakesim_can_backend.twin.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
-from snakesim_hal.drivers.mocap_sample import MocapSample
+from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
 from tests.unit.can_backend.loop import config

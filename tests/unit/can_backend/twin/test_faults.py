@@ -3,8 +3,8 @@
 import pytest
 
 from snakesim_can_backend.twin.faults import parse, parse_typed, typed
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import Injection
 
 
 def test_what_is_typed_is_a_fault_that_begins_or_ends_now():

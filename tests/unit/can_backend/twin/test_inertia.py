@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
+from snakesim_drivers.emulation.inertia import InertiaPlant, InertiaSettings
 from tests.unit.can_backend.loop import config
 
 INERTIA = 0.005 + 0.2 * 0.1**2 / 12  # of the middle joints of the test robot

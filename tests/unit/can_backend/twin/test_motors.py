@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from snakesim_drivers.emulation.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.model.scenario import load
-from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend

@@ -12,8 +12,8 @@ from snakesim_can_backend.protocol.commands import command, sync
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import InProcessTwins, TwinServer
-from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.errors import ConfigError
+from snakesim_drivers.motion_capture.mocap_twin import PoseSender
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.twin.rig import chain, only, set_point
 

@@ -10,7 +10,7 @@ from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.scan import Noise
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, lay_chain, sine_points, yaw_segments_m

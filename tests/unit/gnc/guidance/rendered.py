@@ -8,9 +8,9 @@ import numpy as np
 
 from snakesim_gnc.guidance.depth_scan import Intrinsics
 from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
-from snakesim_operator.robots.urdf_tree import rotation
+from snakesim_operator.features.robots.urdf_tree import rotation
 
 Ground = Callable[[Floats, Floats], Floats]
 INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.odrive.protocol import State
-from snakesim_hal.drivers.mixed import MixedBackend, MixedSettings
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Mode, Pace
 from tests.contract.drives import DrivesOfAnyFamily
 from tests.harness.wait import wait_until

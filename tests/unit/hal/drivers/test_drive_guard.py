@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.drivers.braking import Braking
-from snakesim_hal.drivers.drive_guard import DriveGuard
-from snakesim_hal.drivers.findings import Finding
+from snakesim_drivers.kit.braking import Braking
+from snakesim_drivers.kit.drive_guard import DriveGuard
+from snakesim_drivers.kit.findings import Finding
 from snakesim_hal.wire.messages import Mode
 
 MS = 1_000_000

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.drivers.mounting import Mounting
+from snakesim_drivers.mounting import Mounting
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import robot_file
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, corrupted
-from snakesim_hal.injection import Injection, checked
+from snakesim_hal.model.fault_kinds import Injection, checked
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import JointCommand
 from tests.unit.hal.rig import command, description

@@ -8,9 +8,9 @@ import msgspec
 import pytest
 
 from snakesim_hal.backend import Backend, SetPoints
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.injection import Injection, parse
+from snakesim_hal.model.fault_kinds import Injection, parse
 from snakesim_hal.wire.messages import Description, JointState, Mode
 from tests.unit.hal.local_network import LagBackend
 from tests.unit.hal.rig import PERIOD_NS, run_config

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.injector import Injector
 from snakesim_hal.faults.message_faults import MessageFaults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
-from snakesim_hal.injection import parse
+from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
 from tests.harness.wait import wait_until

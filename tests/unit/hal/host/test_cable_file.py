@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.cable_file import CABLES, FRESH_S, CableFile, kept_at
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.joints import Joint

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.backend import Samples
-from snakesim_hal.errors import BackendError
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Pace
 from tests.harness.wait import wait_until

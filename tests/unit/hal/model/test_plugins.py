@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.plugins import (
     BACKENDS,
@@ -162,9 +162,9 @@ WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_hal/safety", "snakesim_hal.network.session", HAL),
     ("snakesim_hal/network", "snakesim_hal.faults.injector", HAL),
     ("snakesim_hal/faults", "snakesim_hal.host.host", HAL),
-    ("snakesim_hal/host", "snakesim_hal.serve", HAL),
+    ("snakesim_hal/host", "snakesim_hal.programs.service_program", HAL),
     ("snakesim_hal/faults", "snakesim_hal.service", HAL),
-    ("snakesim_operator/results", "snakesim_operator.tools.targets", OPERATOR),
+    ("snakesim_operator/results", "snakesim_operator.base.targets", OPERATOR),
     ("snakesim_operator/tools", "snakesim_operator.run.supervisor", OPERATOR),
     ("snakesim_operator/run", "snakesim_operator.cli", OPERATOR),
     ("snakesim_can_backend/protocol", "snakesim_can_backend.settings", CAN),

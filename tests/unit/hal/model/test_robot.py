@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Motor, Supply
 from snakesim_hal.model.robot import RobotFile, describe, layout_hash

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.fault_plan import check_planned
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.participants import Participants
+from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Outlines

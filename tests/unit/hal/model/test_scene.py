@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.outlines import Outlines, outline_distance_m
 from snakesim_hal.model.scene import (

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.process import child_environment, python_command
+from snakesim_hal.base.process import child_environment, python_command
 
 FILE = """
 import random

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table, find, read_table
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML, parse_toml, read_text, write_text

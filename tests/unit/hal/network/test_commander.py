@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from snakesim_hal.errors import StalledError
+from snakesim_hal.base.errors import StalledError
 from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import open_session

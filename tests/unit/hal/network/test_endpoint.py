@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import child_environment, python_command
 from snakesim_hal.network.endpoint import check_endpoint, check_guarded, check_loopback, check_namespace
-from snakesim_hal.process import child_environment, python_command
 
 GOOD = [
     *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_registry import LocalRobot, local_robots, registered, robot_folder
 from snakesim_hal.network.private_channel import HostEnd, HostMessage, StarterEnd, socket_pair

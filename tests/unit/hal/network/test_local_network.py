@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import Question
 from snakesim_hal.wire import keys

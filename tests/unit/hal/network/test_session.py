@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
 from snakesim_hal.network.session import Arrival, Link, Publisher, Question, open_session
 from snakesim_hal.wire import keys

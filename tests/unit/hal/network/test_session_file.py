@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.session_file import read_session

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.stop_port import (
     ANSWER,
     REQUEST,

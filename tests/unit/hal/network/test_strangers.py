@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import zenoh
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.route import Route

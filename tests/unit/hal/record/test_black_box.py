@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.record.black_box import BlackBox, digest_of, read_black_box
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Mode

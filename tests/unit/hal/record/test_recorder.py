@@ -13,11 +13,11 @@ import msgspec
 import pytest
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.host_process import record_of
-from snakesim_hal.record import recorder as under_test
-from snakesim_hal.record.black_box import BlackBox, digest_of, read_black_box
-from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
-from snakesim_hal.record.recorder import HostRecordWriter
+from snakesim_hal.programs.host_program import record_of
+from snakesim_hal.run_log import writer as under_test
+from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
+from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
+from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire.messages import Description, Mode
 from tests.harness.wait import wait_until

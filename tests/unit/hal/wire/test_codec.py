@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import (
     VERSIONS,

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from snakesim_hal.errors import ConfigError, WireError
+from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import OwnSample

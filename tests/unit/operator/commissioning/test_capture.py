@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from snakesim_hal.arrays import Floats
-from snakesim_operator.commissioning.capture import RESTS_RAD, Turn, TurnWatch
+from snakesim_hal.base.arrays import Floats
+from snakesim_operator.features.commissioning.capture import RESTS_RAD, Turn, TurnWatch
 
 JOINTS, RATE_HZ = 4, 50.0
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_operator.commissioning.estimate import Friction, Moved, curvature, friction, slope, windowed
+from snakesim_operator.features.commissioning.estimate import Friction, Moved, curvature, friction, slope, windowed
 
 TRUTH = {"dry_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005}
 INERTIA_KG_M2, WEIGHT_NM_PER_RAD, SCALE = 0.02, 1.5, 1.2

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.commissioning.jog import AHEAD_RAD, HELD_S, Jog, JogRequest
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.commissioning.jog import AHEAD_RAD, HELD_S, Jog, JogRequest
 from tests.unit.hal.rig import description
 
 PERIOD_S = 0.01

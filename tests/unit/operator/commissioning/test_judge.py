@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from snakesim_hal.arrays import Floats
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import Drive
-from snakesim_operator.commissioning.check import report_lines
-from snakesim_operator.commissioning.judge import AS_TOLD, Judged, judged
-from snakesim_operator.commissioning.measured import Measured, unclamped
+from snakesim_operator.features.commissioning.check import report_lines
+from snakesim_operator.features.commissioning.judge import AS_TOLD, Judged, judged
+from snakesim_operator.features.commissioning.measured import Measured, unclamped
 
 PERIOD_S = 0.01
 WAY_RAD = 0.06

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.checked import PROPERTIES, Checked
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.robot import RobotFile, with_modes
-from snakesim_operator.commissioning.robot_edit import change_joints, joints_on_drives, write_checked
+from snakesim_operator.features.commissioning.robot_edit import change_joints, joints_on_drives, write_checked
 
 
 @pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])

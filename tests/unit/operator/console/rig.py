@@ -2,7 +2,7 @@
 
 from concurrent.futures import Future
 
-from snakesim_operator.tools.prepared_stop import StopReadiness
+from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 
 
 class ReadyStop:

@@ -12,11 +12,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from snakesim_operator.console.connections import ConnectionLimits, Waiting, limits_for, why_no_page
-from snakesim_operator.console.front import Front, HandedOn
-from snakesim_operator.console.peer_user import PeerUsers
-from snakesim_operator.console_port import open_port
-from snakesim_operator.tools.prepared_stop import StopReadiness
+from snakesim_operator.base.console_port import open_port
+from snakesim_operator.features.console.connections import ConnectionLimits, Waiting, limits_for, why_no_page
+from snakesim_operator.features.console.front import Front, HandedOn
+from snakesim_operator.features.console.peer_user import PeerUsers
+from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 from tests.harness.wait import wait_until
 from tests.unit.operator.console.rig import ReadyStop
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import viser
 
-from snakesim_operator.console.server import page_server
-from snakesim_operator.console_port import open_port
+from snakesim_operator.base.console_port import open_port
+from snakesim_operator.features.console.server import page_server
 from tests.viewer import ASKED, Viewer, viewing
 
 CHANGES = 200

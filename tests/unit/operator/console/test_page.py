@@ -8,16 +8,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import capsules_at_start, load
-from snakesim_operator.console import texts
-from snakesim_operator.console.drawing import draw
-from snakesim_operator.console.page import LEGEND
-from snakesim_operator.console.server import page_server
-from snakesim_operator.console.snapshot import RobotSnapshot, expected_of
-from snakesim_operator.console.token import ControlToken
-from snakesim_operator.console_port import address_of, open_port
-from snakesim_operator.page_origin import why_refused
+from snakesim_operator.base.console_port import address_of, open_port
+from snakesim_operator.base.page_origin import why_refused
+from snakesim_operator.features.console import texts
+from snakesim_operator.features.console.drawing import draw
+from snakesim_operator.features.console.page import LEGEND
+from snakesim_operator.features.console.server import page_server
+from snakesim_operator.features.console.snapshot import RobotSnapshot, expected_of
+from snakesim_operator.features.console.token import ControlToken
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description, status
 from tests.viewer import watch

@@ -5,9 +5,9 @@ from pathlib import Path
 from pytest import approx
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.console import texts
-from snakesim_operator.console.pictures import picture
-from snakesim_operator.console.recorded import RecordedRun
+from snakesim_operator.features.console import texts
+from snakesim_operator.features.console.pictures import picture
+from snakesim_operator.features.console.recorded import RecordedRun
 from snakesim_operator.run.in_process import simulate
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_hal.wire.messages import ControlSettings
-from snakesim_operator.console.settings_form import Field, fields_of
+from snakesim_operator.features.console.settings_form import Field, fields_of
 
 SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
     "push_n": {"type": "number", "unit": "N", "description": "a bound", "exclusiveMinimum": 0, "maximum": 10000},

@@ -3,11 +3,11 @@
 import pytest
 
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.console.drawing import M_PER_N, draw
-from snakesim_operator.console.server import page_server
-from snakesim_operator.console.snapshot import RobotSnapshot
-from snakesim_operator.console.stage import Stage
-from snakesim_operator.console_port import open_port
+from snakesim_operator.base.console_port import open_port
+from snakesim_operator.features.console.drawing import M_PER_N, draw
+from snakesim_operator.features.console.server import page_server
+from snakesim_operator.features.console.snapshot import RobotSnapshot
+from snakesim_operator.features.console.stage import Stage
 from tests.unit.hal.rig import description
 from tests.unit.operator.console.test_drawing import contact, joints, pushing, world
 

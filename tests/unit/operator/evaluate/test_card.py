@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.evaluate.card import CARD, card_of, compare, holm, mcnemar, read_card, text
-from snakesim_operator.evaluate.case import Outcome
-from snakesim_operator.evaluate.suite import Suite, cases_of
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.evaluate.card import CARD, card_of, compare, holm, mcnemar, read_card, text
+from snakesim_operator.features.evaluate.case import Outcome
+from snakesim_operator.features.evaluate.suite import Suite, cases_of
 
 
 def test_p_as_tabulated() -> None:

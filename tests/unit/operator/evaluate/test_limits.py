@@ -3,8 +3,8 @@
 import time
 from pathlib import Path
 
-from snakesim_operator.evaluate.case import GAVE_UP, Outcome, code_digest, run_case
-from snakesim_operator.evaluate.suite import Suite, cases_of
+from snakesim_operator.features.evaluate.case import GAVE_UP, Outcome, code_digest, run_case
+from snakesim_operator.features.evaluate.suite import Suite, cases_of
 
 ENDLESS = """
 from snakesim_gnc.control.hold import Hold

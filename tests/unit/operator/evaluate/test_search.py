@@ -10,12 +10,12 @@ import msgspec
 import optuna
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import find
 from snakesim_hal.model.textfiles import read_text
-from snakesim_operator.evaluate import optimise as search
-from snakesim_operator.evaluate.case import Case, Outcome
-from snakesim_operator.evaluate.optimise import Request, optimise
+from snakesim_operator.features.evaluate import optimise as search
+from snakesim_operator.features.evaluate.case import Case, Outcome
+from snakesim_operator.features.evaluate.optimise import Request, optimise
 
 PROPULSION = "control.propulsion_n"
 FIRST = {

@@ -5,12 +5,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
-from snakesim_operator.evaluate.case import Case
-from snakesim_operator.evaluate.suite import Suite, cases_of, read_suite, settings_of
+from snakesim_operator.features.evaluate.case import Case
+from snakesim_operator.features.evaluate.suite import Suite, cases_of, read_suite, settings_of
 
 ROWS = """
 scenario = "surveyed_clutter"

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_operator.evaluate.case import Case, Outcome
-from snakesim_operator.evaluate.table import UNKNOWN, lines_of, mean_interval, table, wilson, worst
+from snakesim_operator.features.evaluate.case import Case, Outcome
+from snakesim_operator.features.evaluate.table import UNKNOWN, lines_of, mean_interval, table, wilson, worst
 
 
 def case(field: int, controller: str = "poal", row: int = 1) -> Case:

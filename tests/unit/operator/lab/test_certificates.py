@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.cli import main
-from snakesim_operator.lab.certificates import issue, make_authority, read_certificate, write_certificates
-from snakesim_operator.lab.identities import identities
-from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
+from snakesim_operator.features.lab.certificates import issue, make_authority, read_certificate, write_certificates
+from snakesim_operator.features.lab.identities import identities
+from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
 
 LAB = load_lab(EXAMPLE)
 

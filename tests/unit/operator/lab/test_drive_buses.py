@@ -9,11 +9,11 @@ import msgspec
 import pytest
 import yaml
 
-from snakesim_hal.arguments import add_host, add_service, load_scenario
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.lab.check import Findings, check_what_moves
-from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
-from snakesim_operator.lab.render import rendered
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.programs.arguments import add_host, add_service, load_scenario
+from snakesim_operator.features.lab.check import Findings, check_what_moves
+from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
+from snakesim_operator.features.lab.render import rendered
 from tests.unit.hal.rig import description
 
 BY_ID = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT4-if00-port0"

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.roles import ABOUT, TABLE, Role, permissions
-from snakesim_operator.lab.identities import identities
-from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
+from snakesim_operator.features.lab.identities import identities
+from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
 
 TEXT = EXAMPLE.read_text()
 

@@ -8,9 +8,9 @@ import pytest
 from snakesim_hal.network.private_keys import _warn
 from snakesim_hal.network.session_file import read_session
 from snakesim_operator.cli import main
-from snakesim_operator.lab.check import Findings, _check_certificate
-from snakesim_operator.lab.identities import identities
-from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
+from snakesim_operator.features.lab.check import Findings, _check_certificate
+from snakesim_operator.features.lab.identities import identities
+from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
 from tests.harness.command import SNAKESIM, call, environment
 
 

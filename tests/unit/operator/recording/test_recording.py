@@ -15,8 +15,8 @@ import msgspec
 import pytest
 from mcap.reader import make_reader
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import HAL
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.wire import keys

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.model.scenario import load
-from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page

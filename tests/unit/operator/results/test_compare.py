@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.robot import describe, identified
 from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
 from snakesim_hal.wire import keys

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from snakesim_hal.model.scenario import write
 from snakesim_hal.network.session import Arrival
-from snakesim_hal.record.black_box import Layout
-from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
+from snakesim_hal.run_log.black_box import Layout
+from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encoding_of
 from snakesim_operator.playback.export import arrays

@@ -8,17 +8,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
 from snakesim_operator.cli import main
-from snakesim_operator.robots.command import export_robot, import_robot
-from snakesim_operator.robots.exporting import urdf_of
-from snakesim_operator.robots.imported import Imported, Order
-from snakesim_operator.robots.importing import robot_of
-from snakesim_operator.robots.meshes import vertices
-from snakesim_operator.robots.toml_text import toml_of
+from snakesim_operator.features.robots.command import export_robot, import_robot
+from snakesim_operator.features.robots.exporting import urdf_of
+from snakesim_operator.features.robots.imported import Imported, Order
+from snakesim_operator.features.robots.importing import robot_of
+from snakesim_operator.features.robots.meshes import vertices
+from snakesim_operator.features.robots.toml_text import toml_of
 from snakesim_operator.run.in_process import simulate
 from snakesim_sim_backend.model import build
 from snakesim_sim_backend.settings import SimSettings

@@ -17,15 +17,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.robot import RobotFile
-from snakesim_operator.robots.command import import_robot
-from snakesim_operator.robots.exporting import urdf_of
-from snakesim_operator.robots.imported import Imported, Order
-from snakesim_operator.robots.importing import robot_of
-from snakesim_operator.robots.joint_limits import NUMBERS
+from snakesim_operator.features.robots.command import import_robot
+from snakesim_operator.features.robots.exporting import urdf_of
+from snakesim_operator.features.robots.imported import Imported, Order
+from snakesim_operator.features.robots.importing import robot_of
+from snakesim_operator.features.robots.joint_limits import NUMBERS
 
 SNAKE = (Path(__file__).parent / "urdf" / "every_attribute.urdf").read_text()
 

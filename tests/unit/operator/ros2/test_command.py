@@ -2,7 +2,7 @@
 
 import time
 
-from snakesim_operator.ros2.relay import RosTime
+from snakesim_operator.features.ros2.relay import RosTime
 
 
 def test_robot_time_is_taken_as_it_is() -> None:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_of
-from snakesim_operator.ros2.frames import OPTICAL_IN_CAMERA, Frames, ros_name
-from snakesim_operator.ros2.messages import Transform
-from snakesim_operator.ros2.urdf import urdf_of
+from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, ros_name
+from snakesim_operator.features.ros2.messages import Transform
+from snakesim_operator.features.ros2.urdf import urdf_of
 from tests.unit.hal.rig import pose, state
 from tests.unit.operator.ros2.rig import of_robot
 

@@ -3,8 +3,8 @@
 import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_operator.ros2 import graph, messages
-from snakesim_operator.ros2.graph import NodeName, Topic, token_key, topic_key
+from snakesim_operator.features.ros2 import graph, messages
+from snakesim_operator.features.ros2.graph import NodeName, Topic, token_key, topic_key
 
 # From docs/design.md of ros2/rmw_zenoh.
 LISTENER = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"

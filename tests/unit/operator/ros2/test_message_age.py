@@ -3,8 +3,8 @@
 import pytest
 
 from snakesim_hal.network.foreign_network import RawSample
-from snakesim_operator.ros2.graph import attachment
-from snakesim_operator.ros2.message_age import MAX_AGE_NS, SenderClocks, why_request_too_old, why_too_old
+from snakesim_operator.features.ros2.graph import attachment
+from snakesim_operator.features.ros2.message_age import MAX_AGE_NS, SenderClocks, why_request_too_old, why_too_old
 
 SECOND = 10**9
 GID, OTHER = bytes(range(16)), bytes(16)

@@ -12,11 +12,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from snakesim_hal.wire import messages as m
 from snakesim_hal.wire.own_sample import own_kind, schema_of
-from snakesim_operator.ros2 import messages as ros
-from snakesim_operator.ros2 import robot_in_ros
-from snakesim_operator.ros2.graph import RosType
-from snakesim_operator.ros2.messages import Marker, Transform
-from snakesim_operator.ros2.steering import Steering
+from snakesim_operator.features.ros2 import messages as ros
+from snakesim_operator.features.ros2 import robot_in_ros
+from snakesim_operator.features.ros2.graph import RosType
+from snakesim_operator.features.ros2.messages import Marker, Transform
+from snakesim_operator.features.ros2.steering import Steering
 from tests.unit.hal.strategies import messages_of
 from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
 

@@ -8,12 +8,12 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from snakesim_hal.wire.messages import Clock, JointState, LifecycleState, Mode
-from snakesim_operator.ros2 import graph
-from snakesim_operator.ros2 import service_types as types
-from snakesim_operator.ros2.graph import NodeName, Topic, token_key
-from snakesim_operator.ros2.joint_commands import VALID_NS, JointTargets
-from snakesim_operator.ros2.parameters import NOT_SET, _descriptor, _value
-from snakesim_operator.tools.parameters import Parameter
+from snakesim_operator.features.ros2 import graph
+from snakesim_operator.features.ros2 import service_types as types
+from snakesim_operator.features.ros2.graph import NodeName, Topic, token_key
+from snakesim_operator.features.ros2.joint_commands import VALID_NS, JointTargets
+from snakesim_operator.features.ros2.parameters import NOT_SET, _descriptor, _value
+from snakesim_operator.robot_commands.parameters import Parameter
 from tests.unit.hal import rig
 from tests.unit.operator.ros2.rig import SERVICE_HASHES, of_robot
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.run.folder import LOCK, claimed, named_after
 from tests.harness.wait import wait_until
 

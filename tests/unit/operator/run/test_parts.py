@@ -4,7 +4,9 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from snakesim_hal import host_process, router_process, serve
+from snakesim_hal.programs import host_program as host_process
+from snakesim_hal.programs import router_program as router_process
+from snakesim_hal.programs import service_program as serve
 from snakesim_operator.recording import process as recorder
 
 

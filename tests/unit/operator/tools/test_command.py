@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import RefusedError
+from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
-from snakesim_operator.tools import command, stop
-from snakesim_operator.tools.targets import RobotSelection
+from snakesim_operator.base.targets import RobotSelection
+from snakesim_operator.robot_commands import command, stop
 from tests.e2e.command import snakesim
 from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.network.test_client_host import run_config

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.cli import main
-from snakesim_operator.tools.kernel import kernel
-from snakesim_operator.tools.network_findings import ports, routers
-from snakesim_operator.tools.targets import RobotSelection
+from snakesim_operator.this_computer.kernel import kernel
+from snakesim_operator.this_computer.network_findings import ports, routers
 from tests.harness.endpoint import free_endpoint
 
 

@@ -3,13 +3,13 @@
 import pytest
 
 from snakesim_gnc.control.live_settings import LiveSettings
-from snakesim_hal.errors import ControllerError, RefusedError
+from snakesim_hal.base.errors import ControllerError, RefusedError
 from snakesim_hal.model.scenario import load
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState
-from snakesim_operator.tools import parameters
+from snakesim_operator.robot_commands import parameters
 from tests.unit.hal.rig import description
 
 CLOCK = Clock(tick=7, stamp_ns=70, period_ns=10, pace="lockstep", lifecycle="armed", arming=1, lease_epoch=1, newest={})

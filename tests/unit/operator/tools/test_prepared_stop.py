@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import Link
 from snakesim_hal.network.stop_port import Reply, StopRequester, open_stop_port, serve_stops
-from snakesim_operator.tools import prepared_stop
-from snakesim_operator.tools.prepared_stop import WAITING, PreparedStop
-from snakesim_operator.tools.robot_selection import RobotSelection
-from snakesim_operator.tools.stop_result import StopResult
+from snakesim_operator.base.robot_selection import RobotSelection
+from snakesim_operator.robot_commands import prepared_stop
+from snakesim_operator.robot_commands.prepared_stop import WAITING, PreparedStop
+from snakesim_operator.robot_commands.stop_result import StopResult
 from tests.harness.wait import wait_until
 
 LOOPBACK = "127.0.0.1"

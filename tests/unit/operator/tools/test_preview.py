@@ -10,7 +10,7 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Preview, SensorDescription
-from snakesim_operator.tools.preview import cameras_of, preview_of
+from snakesim_operator.monitoring.preview import cameras_of, preview_of
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description

@@ -16,7 +16,7 @@ from snakesim_hal.safety import gate, lifecycle
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Description, Done, JointCommand, JointState, Mode
-from snakesim_operator.tools.schemas import contract
+from snakesim_operator.this_computer.schemas import contract
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from msgspec import inspect
 
-from snakesim_hal.errors import WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.model.files import read_part, shipped
 from snakesim_hal.model.scenario import load
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import VERSIONS, Message
-from snakesim_operator.tools.schemas import contract, write_schemas
+from snakesim_operator.this_computer.schemas import contract, write_schemas
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 REPOSITORY = Path(__file__).parents[4]

@@ -10,9 +10,9 @@ from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, encoding_of
 from snakesim_hal.wire.messages import Clock, JointState, Message
-from snakesim_operator.tools.targets import RobotSelection
-from snakesim_operator.tools.top import table_of, top
-from snakesim_operator.tools.traffic import KEPT, MAX_KEYS, Traffic
+from snakesim_operator.base.targets import RobotSelection
+from snakesim_operator.monitoring.top import table_of, top
+from snakesim_operator.monitoring.traffic import KEPT, MAX_KEYS, Traffic
 from tests.harness.endpoint import free_endpoint
 from tests.unit.hal.rig import clock, command, description, state
 

@@ -12,8 +12,8 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
-from snakesim_hal.drivers.drive_backend import Clock
-from snakesim_hal.injection import parse
+from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_hal.model.fault_kinds import parse
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import twin_on
 from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.drivers.mounted import Mounted
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend

@@ -9,7 +9,7 @@ import pytest
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Action, Frame, LastStop, Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Pose
 from tests.unit.can_backend.driver.whole.recorded import DISARMED, WIRES, is_action, module_of, words

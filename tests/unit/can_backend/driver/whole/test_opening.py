@@ -26,7 +26,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.server import InProcessTwins, here
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.wire.messages import Mode

@@ -14,9 +14,9 @@ from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, nod
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import InProcessTwins, TwinServer
-from snakesim_hal.errors import BackendError
+from snakesim_drivers.emulation.inertia import InertiaPlant, InertiaSettings
+from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire, go, is_action, is_set_point, words
 from tests.unit.can_backend.loop import Loop, config
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.errors import ConfigError
-from snakesim_operator.tools.teleop.joystick import (
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.robot_commands.teleop.joystick import (
     ABS_X,
     ABS_Y,
     EV_ABS,

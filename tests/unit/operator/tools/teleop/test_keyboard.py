@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_operator.tools.teleop.keyboard import MAX_AT_ONCE, MAX_UNREAD_S, KeyTiming
+from snakesim_operator.robot_commands.teleop.keyboard import MAX_AT_ONCE, MAX_UNREAD_S, KeyTiming
 
 PERIOD_S = 0.05  # of teleop
 

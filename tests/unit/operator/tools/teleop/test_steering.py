@@ -5,8 +5,8 @@ import math
 import pytest
 
 from snakesim_operator.cli import main
-from snakesim_operator.tools.teleop.keyboard import _split  # pyright: ignore[reportPrivateUsage]
-from snakesim_operator.tools.teleop.steering import LEAD_RAD, VALID_NS, Steering
+from snakesim_operator.robot_commands.teleop.keyboard import _split  # pyright: ignore[reportPrivateUsage]
+from snakesim_operator.robot_commands.teleop.steering import LEAD_RAD, VALID_NS, Steering
 
 
 def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:

@@ -12,9 +12,9 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent
-from snakesim_operator.tools.teleop import command, joystick
-from snakesim_operator.tools.teleop.command import Teleop
-from snakesim_operator.tools.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
+from snakesim_operator.robot_commands.teleop import command, joystick
+from snakesim_operator.robot_commands.teleop.command import Teleop
+from snakesim_operator.robot_commands.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import clock

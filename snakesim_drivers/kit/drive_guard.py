@@ -1,0 +1,85 @@
+"""Which drives of a bus may be driven: none that has stopped by itself, until the operator resets the fault. Pure.
+
+A drive stops by itself when its watchdog expires, when it finds an error, or when it restarts. Two things must not
+happen to such a stop: a command clears it before the driver has read it, or a later set-point enables the drive again.
+"""
+
+from collections.abc import Callable, Iterable
+
+from snakesim_drivers.kit.findings import Finding
+
+NO_DRIVES: frozenset[int] = frozenset()
+
+
+class DriveGuard:
+    """The drives of one bus, by their numbers on it."""
+
+    def __init__(self, clock_ns: Callable[[], int], *, gap_ns: int, grace_ns: int) -> None:
+        """Start with drives that were just brought up, none of them driven.
+
+        Args:
+            clock_ns: The driver's time.
+            gap_ns: A pause of the driver after which watchdogs of drives may have expired.
+            grace_ns: Time after a reset in which drives may still report an error from before it.
+        """
+        self._clock_ns, self._gap_ns, self._grace_ns = clock_ns, gap_ns, grace_ns
+        self._active_ns: int | None = None  # when the driver last used the bus
+        self._reset_ns: int | None = None
+        self._away = False
+        # Drives, until they are let go or reset.
+        self._driven = NO_DRIVES
+        self._stopped = NO_DRIVES
+        self._starved = False  # whether the bus has let its drives go while the robot was armed
+
+    # --- pauses of the driver --------------------------------------------------------------------------------
+
+    def mark_active(self) -> None:
+        """Note that the driver runs now. A pause before it is remembered until `states_were_read`."""
+        now_ns = self._clock_ns()
+        if self._active_ns is not None and now_ns - self._active_ns > self._gap_ns:
+            self._away = True
+        self._active_ns = now_ns
+
+    @property
+    def was_away(self) -> bool:
+        """Whether watchdogs of drives may have expired since their states were read last."""
+        return self._away
+
+    def states_were_read(self) -> None:
+        """Note that the driver has asked every drive for its state after the pause."""
+        self._away = False
+
+    # --- who is driven ---------------------------------------------------------------------------------------
+
+    def drives_to_command(self, wanted: frozenset[int], *, may_enable: bool) -> frozenset[int]:
+        """Return those of the wanted drives that get set-points now.
+
+        may_enable: whether the robot is armed. Otherwise only drives go on that are driven already.
+        """
+        if self._starved:
+            self._driven = NO_DRIVES
+        elif may_enable:
+            self._driven = wanted - self._stopped
+        else:
+            self._driven &= wanted - self._stopped
+        return self._driven
+
+    def let_go(self) -> bool:
+        """Note that the bus lets its drives go by itself; whether any was driven. None is driven before a reset."""
+        had_driven = bool(self._driven)
+        self._driven = NO_DRIVES
+        self._starved |= had_driven
+        return had_driven
+
+    def note_findings(self, findings: Iterable[Finding]) -> None:
+        """Note what the driver reports of its drives. A driven drive with a finding is not driven before a reset."""
+        if self._reset_ns is not None and self._clock_ns() - self._reset_ns <= self._grace_ns:
+            return
+        reported = frozenset(finding.joint for finding in findings if finding.joint is not None)
+        self._stopped |= reported & self._driven
+
+    def reset(self, drives: frozenset[int]) -> None:
+        """Note that the operator has reset the fault: these drives may be driven at the next arming."""
+        self._stopped -= drives
+        self._starved = False
+        self._reset_ns = self._clock_ns()

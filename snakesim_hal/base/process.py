@@ -1,0 +1,242 @@
+"""Processes that never outlive their parent, and that shut down in order on a signal."""
+
+import contextlib
+import ctypes
+import gc
+import getpass
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+from snakesim_hal.base.errors import RefusedError
+from snakesim_hal.base.terminal import print_stderr
+
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
+SEARCH_PATH = "PYTHONPATH"
+SAFE_PATH = "PYTHONSAFEPATH"  # the variable that stands for Python's option -P
+PR_SET_PDEATHSIG = 1
+CAP_IPC_LOCK = 14
+MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+MIN_MEMORY_LIMIT = 2**30  # bytes: four times what a run allocates
+SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
+# Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs does not delay the host.
+HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
+
+
+def user_name() -> str:
+    """The user's name."""
+    try:
+        return getpass.getuser()[:64]
+    except (KeyError, OSError):
+        return "operator"
+
+
+def python_command(*words: str) -> list[str]:
+    """Return the command line of a child that runs this interpreter: `python_command("-m", "package.module")`.
+
+    With `-P` the child does not search the folder that it runs in for modules. Without it, `python -m` searches that
+    folder first, so that a file `random.py` there would replace the module of that name, whoever wrote the file.
+    Every child that is started as Python gets its command line here and its variables from `child_environment`.
+    """
+    return [sys.executable, "-P", *words]
+
+
+def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment variables of a child: those of this process, then each of `more`.
+
+    `PYTHONSAFEPATH` does for the children of the child what `-P` does for itself. An empty entry of `PYTHONPATH`, as
+    in `/opt/mine:$PYTHONPATH`, would stand for the working folder, and is left out.
+    """
+    variables = dict(os.environ)
+    for mapping in more:
+        variables.update(mapping)
+    if SEARCH_PATH in variables:
+        folders = variables[SEARCH_PATH].split(os.pathsep)
+        variables[SEARCH_PATH] = os.pathsep.join(filter(None, folders))
+    variables[SAFE_PATH] = "1"
+    return variables
+
+
+def protect_children() -> None:
+    """Have every Python child that this process starts from now on ignore modules in the working folder."""
+    os.environ.update(child_environment())
+
+
+def die_with_parent(parent_pid: int | None = None) -> None:
+    """Have the kernel kill this process the moment its parent dies, however it dies.
+
+    parent_pid: the parent's process id, passed by the parent; if it is gone already, exit at once.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    if parent_pid is not None and os.getppid() != parent_pid:
+        sys.exit(1)
+
+
+def stop_signals() -> tuple[signal.Signals, ...]:
+    """The stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return tuple(number for number in STOPS if not (ignored and number == signal.SIGHUP))
+
+
+def accept_interrupts() -> None:
+    """From here on every stop counts: children start with Ctrl-C blocked, until they can handle it."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+
+
+def restart_process() -> NoReturn:
+    """Become the same program again, in the same process: with its parent, its arguments and what it has inherited.
+
+    A stop that comes meanwhile waits until the program can handle it. Close everything before.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, sys.orig_argv)
+
+
+def on_stop_signal(stop: Callable[[], None]) -> None:
+    """Call `stop` on SIGTERM, SIGINT, and when the terminal is closed, instead of ending at once."""
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        stop()
+
+    for number in stop_signals():
+        signal.signal(number, handle)
+    accept_interrupts()
+
+
+@contextlib.contextmanager
+def stop_signals_raise() -> Iterator[None]:
+    """Within, the first Ctrl-C, SIGTERM or closed terminal raises KeyboardInterrupt in the main thread.
+
+    So `with` blocks end their workers and remove their files. A second signal ends the process at once.
+    """
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        for number in replaced:  # SIGHUP comes twice of itself, from the kernel and from the shell
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    replaced = {number: signal.getsignal(number) for number in stop_signals()}
+    for number in replaced:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
+
+
+def tune_garbage_collector() -> None:
+    """Keep the garbage collector out of the loop: freeze all present objects, and make collections rare."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 50, 1000)
+
+
+def enter_realtime(priority: int) -> list[str]:
+    """Apply all real-time measures to a process in the control loop. Call it before a session is opened.
+
+    Best effort: measures that the system refuses are printed to stderr, and returned as short reasons.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    refused = [reason for reason in (set_realtime_priority(priority), lock_memory()) if reason is not None]
+    for reason in refused:
+        print_stderr(f"real time: {reason}")
+    return refused
+
+
+def set_realtime_priority(priority: int) -> str | None:
+    """Ask the kernel to run this process, and the threads that it will start, before ordinary ones.
+
+    Returns why it was refused, or None.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError as error:
+        return f"no real-time priority: {error.strerror}; see `ulimit -r`"
+    return None
+
+
+def drop_priority_after(longest_s: float) -> None:
+    """Have this process give up its priority once it has computed for this long without a pause: it hangs.
+
+    A busy thread with real-time priority starves ordinary processes, until the kernel throttles all real-time
+    processes for some 50 ms.
+    """
+
+    def drop_priority(_number: int, _frame: FrameType | None) -> None:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        print_stderr(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
+
+    signal.signal(signal.SIGXCPU, drop_priority)
+    _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (round(longest_s * 1e6), most))
+
+
+def lock_memory() -> str | None:
+    """Lock all present and future pages of this process into memory. Returns why it was refused, or None.
+
+    Pages are locked as they are first touched, so that the unused part of each thread's stack costs nothing. Under a
+    limit nothing is locked: the first allocation beyond it would fail in the middle of a run.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit != resource.RLIM_INFINITY and not _has_capability(CAP_IPC_LOCK):
+        return f"memory not locked: the limit is {limit // 1024} KiB, it must be unlimited; see `ulimit -l`"
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) != 0:
+        return f"memory not locked: {os.strerror(ctypes.get_errno())}"
+    return None
+
+
+def limit_memory() -> None:
+    """Let this process allocate no more than the computer has available now: beyond that, an allocation fails.
+
+    Otherwise code that allocates without end makes the whole computer swap, until the kernel ends some process. A
+    lower limit, as of `ulimit -d`, stays.
+    """
+    allowed = max(available_memory(), MIN_MEMORY_LIMIT)
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if soft == resource.RLIM_INFINITY or soft > allowed:
+        resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
+
+
+def available_memory() -> int:
+    """Return how many bytes the kernel could give to programs without swapping."""
+    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    raise OSError("/proc/meminfo has no MemAvailable")
+
+
+def raise_open_files(most: int) -> None:
+    """Raise this process's limit of open files and connections, as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+
+
+def step_wall_clock(by_s: float) -> None:
+    """Set the computer's clock forward or back. Raises RefusedError without CAP_SYS_TIME."""
+    try:
+        time.clock_settime(time.CLOCK_REALTIME, time.time() + by_s)
+    except PermissionError as error:
+        raise RefusedError(
+            "the wall clock cannot be stepped: that needs CAP_SYS_TIME; run as root, or omit step:clock"
+        ) from error
+
+
+def _has_capability(number: int) -> bool:
+    for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+        if line.startswith("CapEff:"):
+            return bool(int(line.split()[1], 16) >> number & 1)
+    return False

@@ -1,0 +1,203 @@
+"""Command-line arguments that several commands and processes share: a scenario, and how to reach the network.
+
+Every command reads this first, an emergency stop too: what takes long to import is imported where it is used.
+"""
+
+import argparse
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_endpoint, check_namespace
+
+if TYPE_CHECKING:
+    from snakesim_hal.model.scenario import Loaded, RunConfig
+    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session_file import SessionFile
+
+SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
+
+
+def number(least: float, most: float, unit: str = "") -> Callable[[str], float]:
+    """A type for argparse: a number within bounds; a whole one, if `least` is. NaN is within no bounds."""
+    whole = isinstance(least, int)
+
+    def parse(text: str) -> float:
+        try:
+            value = int(text) if whole else float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            kind, of = "a whole number" if whole else "a number", f" {unit}" if unit else ""
+            raise argparse.ArgumentTypeError(f"{short(text, 40)!r}: give {kind} from {least:.12g} to {most:.12g}{of}")
+        return value
+
+    return parse
+
+
+def add_scenario(parser: argparse.ArgumentParser) -> None:
+    """A scenario, and flags that change it."""
+    parser.add_argument(
+        "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
+    )
+    parser.add_argument("--backend", help="sim or can")
+    parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
+    parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
+    parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="change any value; may be repeated",
+    )
+    parser.add_argument(
+        "--unset",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY",
+        help="leave out what a file may leave out, such as robot.sensors.contacts; may be repeated",
+    )
+
+
+def load_scenario(arguments: argparse.Namespace) -> "Loaded":
+    """The configuration that `add_scenario`'s arguments ask for. Raises ConfigError."""
+    from snakesim_hal.model.scenario import Override, load, parse_set
+
+    flags = {
+        "backend": arguments.backend,
+        "controller": arguments.controller,
+        "pace": arguments.pace,
+        "duration_s": arguments.duration,
+        "seed": arguments.seed,
+    }
+    overrides = [parse_set(text) for text in arguments.set]
+    overrides += [Override(key, None, f"--unset {short(key)}") for key in arguments.unset]
+    if getattr(arguments, "until_goal", False):
+        overrides.append(Override("mission.until_goal", True, "--until-goal"))
+    for key, value in flags.items():
+        if value is not None:
+            flag = f"--{key.removesuffix('_s')} {short(str(value))}"
+            overrides.append(Override(key, value, flag))
+    if faults := getattr(arguments, "fault", None):
+        overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
+    return load(arguments.scenario, overrides)
+
+
+def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION})") -> None:
+    """How to reach the network. session: what is said of that option's default."""
+    parser.add_argument("--endpoint", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})")
+    parser.add_argument(
+        "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
+    )
+    parser.add_argument(
+        "--session",
+        type=Path,
+        metavar="FILE",
+        help=f"connect as a Zenoh session file says (JSON5: router, certificates) {session}".rstrip(),
+    )
+    parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Output for scripts."""
+    parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
+
+
+def add_insecure(parser: argparse.ArgumentParser) -> None:
+    """Consent to listen without access control."""
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
+    )
+
+
+def add_parent(parser: argparse.ArgumentParser) -> None:
+    """For processes of `snakesim run`."""
+    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
+
+
+def add_unchecked(parser: argparse.ArgumentParser) -> None:
+    """Of what arms."""
+    parser.add_argument(
+        "--unchecked",
+        action="store_true",
+        help="arm also a robot whose joints nobody has checked as they are now (simulated and emulated ones need none)",
+    )
+
+
+def add_host(parser: argparse.ArgumentParser) -> None:
+    """Of a HAL host. Hidden is what a run hands to its host.
+
+    --memory: path of an in-memory file for the host's statistics; --channel: inherited socket to the parent process;
+    --stop-port: inherited UDP socket for emergency stops.
+    """
+    add_scenario(parser)
+    add_network(parser, "")
+    add_insecure(parser)
+    parser.add_argument("--out", type=Path, help="folder for the record: black box, description, statistics")
+    parser.add_argument("--once", action="store_true", help="end when the robot was armed for the scenario's duration")
+    parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
+    add_parent(parser)
+    for flag, kind in (("--memory", str), ("--channel", int), ("--stop-port", int)):
+        parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
+
+
+def add_service(parser: argparse.ArgumentParser) -> None:
+    """Of a service."""
+    parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
+
+
+def check_network(arguments: argparse.Namespace) -> None:
+    """The arguments of `add_network` are valid, and do not contradict each other. Raises ConfigError."""
+    for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
+        if given is not None:
+            check_endpoint(given, flag)
+            if arguments.session is not None:
+                raise ConfigError(f"{flag} and --session: the session file names the endpoint; leave one out")
+    if arguments.namespace is not None:
+        check_namespace(arguments.namespace, "--namespace")
+
+
+def session_given(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
+    """The session file, if one is given. Raises ConfigError.
+
+    or_environment: for operator's tools, that of SNAKESIM_SESSION, unless an endpoint is given. What moves a robot, or
+    pretends to be one, is only where the command line puts it.
+    """
+    path = arguments.session
+    if path is None and or_environment and arguments.endpoint is None and arguments.router is None:
+        path = os.environ.get(SESSION) and Path(os.environ[SESSION])
+    if not path:
+        return None
+    from snakesim_hal.network.session_file import read_session
+
+    return read_session(path.expanduser())
+
+
+def link_of(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
+    """How a process of a robot joins its network. Raises ConfigError.
+
+    hosts: without a router the others connect to this process, so that it listens.
+    """
+    from snakesim_hal.network.session import Link
+    from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+
+    check_network(arguments)
+    session = session_given(arguments)
+    largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)
+    if session is not None:
+        namespace = session.namespace_for(arguments.namespace) or config.robot.name
+        return Link(session.endpoints[0], namespace, largest_bytes=largest_bytes, session=session)
+    return Link(
+        endpoint=arguments.router or arguments.endpoint or DEFAULT_ENDPOINT,
+        namespace=arguments.namespace or config.robot.name,
+        listen=hosts and arguments.router is None,
+        insecure=getattr(arguments, "insecure", False),
+        largest_bytes=largest_bytes,
+    )

@@ -1,0 +1,172 @@
+"""The HAL host as a program: `snakesim host SCENARIO`; `python -m snakesim_hal.programs.host_program` for a run's own.
+
+It opens the backend, and runs until it is told to stop, or until the run is over whose part it is.
+"""
+
+import argparse
+import contextlib
+import os
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+
+from snakesim_hal.backend import BackendFactory
+from snakesim_hal.base.errors import BackendError, RefusedError, SnakesimError
+from snakesim_hal.base.process import (
+    HOST_PRIORITY,
+    enter_realtime,
+    on_stop_signal,
+    restart_process,
+    tune_garbage_collector,
+)
+from snakesim_hal.base.terminal import exit_code, print_stderr
+from snakesim_hal.faults.allowed import faults_of_host
+from snakesim_hal.host.cable_file import kept_at
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.host.host import Host
+from snakesim_hal.host.latch import EstopLatch
+from snakesim_hal.model.checked import CHECK, why_unchecked
+from snakesim_hal.model.fault_plan import check_without_run
+from snakesim_hal.model.plugins import BACKENDS, find_plugin
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.what_moves import describe_what_moves
+from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
+from snakesim_hal.network.private_channel import HostEnd
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
+from snakesim_hal.programs.arguments import add_host
+from snakesim_hal.programs.preflight import backend_settings, check_backend
+from snakesim_hal.programs.service_program import ProcessOptions, joined, process_options
+from snakesim_hal.run_log.host_record import HostRecord
+from snakesim_hal.run_log.writer import HostRecordWriter
+from snakesim_hal.wire import keys
+
+GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
+    parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
+    add_host(parser)
+    arguments = parser.parse_args(argv)
+    return exit_code("snakesim host", lambda: host(process_options(arguments, hosts=True)))
+
+
+def host(given: ProcessOptions) -> int:
+    """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError.
+
+    A simulator that is reset becomes another host, in the same process.
+    """
+    if given.arguments.channel is None:
+        check_without_run(given.config, given.loaded.table)
+    host = _run(given, check_backend(given.config, given.loaded.table))
+    if host.ended == "reset":
+        restart_process()
+    stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
+    return 1 if stopped or host.ended != "complete" else 0
+
+
+def _run(given: ProcessOptions, config: RunConfig) -> Host:
+    """Open everything, run the host to its end, close everything."""
+    wanted = given.arguments
+    with contextlib.ExitStack() as opened:
+        if wanted.stop_port is not None:
+            stop_port = socket.socket(fileno=os.dup(wanted.stop_port))  # it stays open for another host
+        else:
+            stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
+            entry = LocalRobot.on(given.link, config.robot.name, config.backend, stop_port)
+            opened.enter_context(registered(entry))
+        opened.callback(stop_port.close)
+        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        opened.callback(backend.close)
+        realtime_warnings = enter_realtime(HOST_PRIORITY) if config.pace == "realtime" else []
+        session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
+        refuse_second_host(session, given.link)
+        described = backend.describe()
+        print_stderr(f"host: {describe_what_moves(described)}")  # a lab's journal has it, too
+        unchecked = ""
+        if config.controller != CHECK:
+            unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
+        folder = robot_folder(described.robot, described.backend, described.hardware)
+        backend, faults = faults_of_host(config, backend, session)
+        host = Host(
+            config,
+            backend,
+            session,
+            max_ticks=round(config.duration_s * config.rate_hz) if wanted.once else None,
+            end_after_fault_s=wanted.end_after_fault,
+            stay=wanted.end_after_fault is None,
+            latch=EstopLatch(folder),
+            starter=HostEnd.of(wanted.channel),
+            realtime_warnings=realtime_warnings,
+            faults=faults,
+            unchecked=unchecked,
+            cables=kept_at(folder, config.robot.joint_table, described),
+        )
+        serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
+        on_stop_signal(host.stop)
+        tune_garbage_collector()
+        memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
+        with HostRecordWriter(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
+            if config.beside:  # loaded for those who want it: it is not in the production host's way
+                from snakesim_hal.programs.in_host_service import Beside
+
+                opened.enter_context(Beside(config, session))
+            host.run()
+    return host
+
+
+def refuse_second_host(session: Session, link: Link) -> None:
+    """Raise RefusedError when another HAL host has the robot's name; a dead one may stay visible for a while."""
+    deadline = time.monotonic() + GONE_LIMIT_S
+    while others := session.present(keys.HOST_ALL):
+        if time.monotonic() > deadline:
+            raise RefusedError(
+                f"another HAL host is on {link.endpoint} as {link.namespace}: {keys.service_of(others[0])}. End it, or "
+                f"give this robot another --namespace"
+            )
+
+
+def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
+    """Open the run's backend. Raises BackendError for any error in it."""
+    settings = backend_settings(config, factory)
+    try:
+        return GuardedBackend(factory(config, settings))
+    except SnakesimError:
+        raise
+    except (Exception, SystemExit) as error:  # a backend may be third-party code
+        raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
+
+
+def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
+    """The host's present statistics. Called from another thread than its loop, which updates each value atomically."""
+    statistics, authority = host.statistics, host.authority
+    return HostRecord(
+        ticks=host.black_box.ticks,
+        wall_s=host.wall_s,
+        overruns=statistics.overruns,
+        answered_ticks=statistics.answered_ticks,
+        armed_ticks=statistics.ticks,
+        command_digest=host.black_box.command_digest,
+        state_to_command_us={f"p{p}": statistics.state_to_command.percentile_us(p) for p in (50, 99)},
+        tick_times=statistics.times.timings(),
+        rejected_commands=dict(authority.rejected),
+        limited_commands=dict(authority.limited),
+        faults=list(authority.since_start.kept),
+        faults_left_out=authority.since_start.left_out,
+        lifecycle=authority.state,
+        why=authority.why,
+        ended=host.ended,
+        ended_why=host.ended_why,
+        lost_ticks=lost_ticks,
+        failure=failure,
+        injected=list(host.faults.noted),
+        requests=list(host.requests),
+        isolated=authority.isolated,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""A service beside the driver: in a thread of the host's process, over the host's own connection to the network.
+
+It speaks as it would from a process of its own: the same client, messages, lease and gate, published for everybody. A
+command then comes back without a process, a socket or another scheduler in between.
+
+What it costs: service and host share one interpreter. A service that raises, hangs or computes without end in Python
+loses its lease, as anywhere. One that holds the interpreter (compiled code without end) stops the host too, and with it
+the stop port: modules then stop by their own watchdogs. One that ends its process ends the host.
+"""
+
+import threading
+import time
+import traceback
+from contextlib import closing
+from typing import Self
+
+from threadpoolctl import threadpool_limits
+
+from snakesim_hal.base.errors import SnakesimError
+from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
+from snakesim_hal.base.terminal import report_error
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.session import Session
+from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.service import ServiceLoop
+
+RESTART_S = 1.0  # until a service that ended is begun again
+END_S = 0.5
+
+
+class Beside:
+    """The services of a run whose place is the host, from `with` to its end. They wait for the host to speak."""
+
+    def __init__(self, config: RunConfig, session: Session) -> None:
+        self._config, self._session = config, session
+        self._closing = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._serve, args=(name,), name=name, daemon=True) for name in config.beside
+        ]
+
+    def __enter__(self) -> Self:
+        if self._threads:
+            threadpool_limits(1)  # as in a process of its own: sums of several threads are rounded otherwise
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._closing.set()
+        until = time.monotonic() + END_S
+        for thread in self._threads:  # one that hangs ends with the process
+            thread.join(max(until - time.monotonic(), 0.0))
+
+    def _serve(self, name: str) -> None:
+        if self._config.pace == "realtime":
+            set_realtime_priority(SERVICE_PRIORITY)
+        while not self._closing.is_set():
+            self._serve_once(name)
+            if not self._config.services[name].restart or self._closing.wait(RESTART_S):
+                return
+
+    def _serve_once(self, name: str) -> None:
+        """Until it fails, or the host ends. Its token vanishes then, so that the host knows."""
+        config, over = self._config, self._closing.is_set
+        try:
+            with (
+                closing(self._session.part()) as part,
+                closing(ServiceLoop(find_service(config, name), config, part, lambda: not over())) as loop,
+            ):
+                loop.join()
+                loop.run(over)
+        except SnakesimError as error:
+            if not self._closing.is_set():
+                report_error(error, f"snakesim {name}")
+        except Exception:  # noqa: BLE001 - this thread's outermost loop: the host goes on, and stops the robot
+            if not self._closing.is_set():
+                traceback.print_exc()

@@ -1,0 +1,36 @@
+"""`python -m snakesim_hal.programs.router_program`: a router for one run, for tests of router failures."""
+
+import argparse
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+
+from snakesim_hal.base.process import on_stop_signal
+from snakesim_hal.base.terminal import exit_code
+from snakesim_hal.network.session import open_session
+from snakesim_hal.programs.arguments import add_insecure, add_network, add_parent, add_scenario
+from snakesim_hal.programs.service_program import ProcessOptions, process_options
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Forward between all connected sessions, until a stop signal."""
+    parser = argparse.ArgumentParser(description="Run a Zenoh router on a run's endpoint.")
+    add_scenario(parser)
+    add_network(parser)
+    add_insecure(parser)
+    add_parent(parser)
+    arguments = parser.parse_args(argv)
+    return exit_code("snakesim router", lambda: _forward(process_options(arguments, hosts=True)))
+
+
+def _forward(given: ProcessOptions) -> int:
+    stopped = threading.Event()
+    on_stop_signal(stopped.set)
+    with open_session(replace(given.link, namespace=None)):
+        stopped.wait()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

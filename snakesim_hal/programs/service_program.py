@@ -1,0 +1,126 @@
+"""A service as a program: `snakesim service NAME SCENARIO`, and with the same arguments `python -m snakesim_hal.programs.service_program`.
+
+It needs only the scenario, and how to reach the network. It waits for the network and for the robot, says so, and meets
+whatever host comes next: so services and hosts start in any order, on any machine, and again at will.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
+
+from threadpoolctl import threadpool_limits
+
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.base.process import (
+    SERVICE_PRIORITY,
+    accept_interrupts,
+    die_with_parent,
+    drop_priority_after,
+    enter_realtime,
+    tune_garbage_collector,
+)
+from snakesim_hal.base.terminal import exit_code, print_stderr
+from snakesim_hal.model.scenario import Loaded, RunConfig
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.programs.arguments import add_service, link_of, load_scenario
+from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
+
+TRY_S = 2.0  # to connect
+TELL_S = 20.0  # between two signs of life
+
+
+@dataclass(frozen=True)
+class ProcessOptions:
+    """What one process of a robot was started with."""
+
+    loaded: Loaded
+    link: Link
+    arguments: argparse.Namespace
+
+    @property
+    def config(self) -> RunConfig:
+        """The whole configuration."""
+        return self.loaded.config
+
+
+def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> ProcessOptions:
+    """Read the files that the arguments name, and tie this process to its parent if it has one. Raises ConfigError."""
+    if arguments.parent is not None:
+        die_with_parent(arguments.parent)
+    loaded = load_scenario(arguments)
+    return ProcessOptions(loaded, link_of(arguments, loaded.config, hosts=hosts), arguments)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code: 0 told to stop, 1 could not go on, 2 wrong input."""
+    parser = argparse.ArgumentParser(prog="snakesim service", description="Run one service of a robot.")
+    add_service(parser)
+    return run(parser.parse_args(argv))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the service that the arguments name. Returns the exit code."""
+
+    def act() -> int:
+        with suppress(KeyboardInterrupt):
+            given = process_options(arguments)
+            serve(find_service(given.config, arguments.name), given)
+        return 0
+
+    return exit_code(f"snakesim {arguments.name}", act)
+
+
+def serve(service_type: type[Service], given: ProcessOptions) -> None:
+    """Run a service, as long as this process lives. Raises SnakesimError when it cannot go on."""
+    config, name = given.config, service_type.name
+    accept_interrupts()
+    threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
+    if service_type.urgent and config.pace == "realtime":
+        enter_realtime(SERVICE_PRIORITY)
+        drop_priority_after(config.lease_ns * 1e-9)
+    with joined(given.link, name) as session:
+        waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
+        with closing(ServiceLoop(service_type, config, session, waiting.goes_on)) as loop:
+            loop.join()
+            tune_garbage_collector()
+            loop.run()
+
+
+class StartupWait:
+    """Waits for something that others start, and says so."""
+
+    def __init__(self, name: str, what: str) -> None:
+        self._name, self._what = name, what
+        self._began = time.monotonic()
+        self._shown_at = self._began - TELL_S
+
+    def goes_on(self) -> bool:
+        """Whether to try again; call it after each try that failed."""
+        now = time.monotonic()
+        if now - self._shown_at >= TELL_S:
+            self._shown_at = now
+            print_stderr(f"{self._name}: waiting for {self._what}")
+        return now - self._began < START_LIMIT_S
+
+
+@contextmanager
+def joined(link: Link, name: str) -> Iterator[Session]:
+    """A session, as soon as there is a network. Raises NotConnectedError when there is none in time."""
+    waiting = StartupWait(name, f"the network: {link.endpoint}")
+    with ExitStack() as stack:
+        while True:
+            try:
+                session = stack.enter_context(open_session(link, connect_timeout_s=TRY_S))
+                break
+            except NotConnectedError:
+                if not waiting.goes_on():
+                    raise
+        yield session
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""Searching the robots that a command addresses."""
+
+import contextlib
+import shlex
+from dataclasses import replace
+
+from snakesim_hal.base.errors import NotConnectedError, RefusedError
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_operator.base.robot_selection import RobotSelection
+
+CONNECT_S = 1.0
+SEARCH_S = 3.0  # to connect, and to answer: a busy computer takes more than a second, and its robot is there
+HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
+
+
+def flags_of(link: Link, robot: str | None) -> str:
+    """What to type after a command to address a robot; nothing for a default. robot: its own name."""
+    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
+    if link.session is not None:
+        where = f" --session {shlex.quote(str(link.session.path))}"
+    return where + (f" --namespace {link.namespace}" if link.namespace != robot else "")
+
+
+def robots_on(session: Session) -> list[str]:
+    """The namespaces of all robots whose HAL is alive on a network."""
+    return [namespace_of(key) for key in session.present(HAL_EVERYWHERE, SEARCH_S)]
+
+
+def namespace_of(key: str) -> str:
+    """The namespace of a full key."""
+    split = keys.split_namespace(key)
+    return key if split is None else split[0]
+
+
+def find_robots(where: RobotSelection) -> list[Link]:
+    """Every addressed robot that can be reached."""
+    found: list[Link] = []
+    for link in where.networks():
+        try:
+            with open_session(link, SEARCH_S) as session:
+                if link.namespace is not None:
+                    found += [link] if session.present(keys.alive("hal"), SEARCH_S) else []
+                else:
+                    found += [replace(link, namespace=name) for name in robots_on(session)]
+        except NotConnectedError:
+            continue
+    return found
+
+
+def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tuple[Link, Session]]:
+    """One on every network that answers, for whatever is published there. Raises NotConnectedError."""
+    found: list[tuple[Link, Session]] = []
+    for link in where.networks():
+        with contextlib.suppress(NotConnectedError):
+            whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
+            found.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
+    if not found:
+        raise NotConnectedError(
+            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
+        )
+    return found
+
+
+def only_robot(where: RobotSelection, command: str) -> Link:
+    """The single addressed robot. Raises NotConnectedError when there is none, RefusedError when there are more."""
+    found = find_robots(where)
+    if not found:
+        named = "" if where.namespace is None else f" named {where.namespace}"
+        raise NotConnectedError(
+            f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or give --endpoint"
+        )
+    if len(found) > 1:
+        choices = [f"  snakesim {command}{flags_of(link, None)}" for link in found]
+        raise RefusedError("several robots found; choose one:", *choices)
+    return found[0]

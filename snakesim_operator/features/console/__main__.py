@@ -1,0 +1,9 @@
+"""`python -m snakesim_operator.features.console`: the console of a run."""
+
+import sys
+
+from snakesim_hal.base.terminal import exit_code
+from snakesim_operator.features.console.command import main
+
+if __name__ == "__main__":
+    sys.exit(exit_code("snakesim console", main))

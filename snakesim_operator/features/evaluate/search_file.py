@@ -1,0 +1,182 @@
+"""The file of a search: an Optuna study in SQLite, and the command that it belongs to.
+
+A search goes on only with a file that the same command began. Trials of another goal, direction, range, setting, seed,
+configuration or version of the code are not comparable, and the sampler and the printed result would mix them.
+"""
+
+import hashlib
+import shlex
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import optuna
+from optuna.exceptions import OptunaError
+from optuna.storages import BaseStorage, RDBStorage
+from optuna.study import Study
+from optuna.trial import TrialState
+from sqlalchemy import QueuePool
+from sqlalchemy.exc import SQLAlchemyError
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.evaluate.case import Case
+
+COMMAND = "snakesim_command"  # attribute of the study: the `SearchCommand` as JSON types
+NUMBER = "snakesim_number"  # attribute of a trial: as it was printed, from 1
+RESULTS = "snakesim_results"  # attribute of a trial: the goal of each of its runs
+STUCK = "snakesim_stuck"  # attribute of a trial: whether its first run was ended because it was stuck
+
+# What SQLite, SQLAlchemy and Optuna raise for a file of another kind, a folder, a full disk, another version.
+STORAGE_ERRORS = (OSError, sqlite3.Error, SQLAlchemyError, OptunaError, RuntimeError)
+
+
+class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that decides what a trial's number means."""
+
+    scenario: str
+    rows: list[int]
+    vary: dict[str, str]  # key -> LOW:HIGH
+    set: dict[str, Any]
+    set_words: list[str]  # as they were typed
+    goal: str
+    direction: Literal["minimize", "maximize"]
+    seeds: int
+    seed: int
+    configurations: str  # hash of what scenario, robot and scene files give at the ends of the ranges
+    code: str  # hash of the installed code
+
+    def in_words(self, storage: Path) -> str:
+        """Returns the command that goes on with the search, as a user types it."""
+        words = ["snakesim", "optimise", self.scenario]
+        if self.rows:
+            words += ["--rows", ",".join(map(str, self.rows))]
+        for key, limits in self.vary.items():
+            words += ["--vary", f"{key}={limits}"]
+        for setting in self.set_words:
+            words += ["--set", setting]
+        words += ["--goal", self.goal]
+        if self.direction == "minimize":
+            words.append("--minimise")
+        words += ["--seeds", str(self.seeds), "--seed", str(self.seed), "--storage", str(storage)]
+        return shlex.join(words)
+
+
+def hash_configurations(cases: Sequence[Case]) -> str:
+    """Returns a hash of the whole configurations of these cases."""
+    digest = hashlib.sha256()
+    for case in cases:
+        digest.update(case.config)
+    return digest.hexdigest()[:16]
+
+
+def open_study(path: Path, command: SearchCommand) -> Study:
+    """Opens the search in a file, or begins one. Raises ConfigError for the file of another search, and for no file."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        storage = _storage_in(path)
+        kept = optuna.get_all_study_summaries(storage)
+        used = [summary for summary in kept if summary.n_trials or COMMAND in summary.user_attrs]
+        if not used:
+            for summary in kept:  # of a process that was killed before its first trial
+                optuna.delete_study(study_name=summary.study_name, storage=storage)
+            return _begin_study(storage, command)
+        _check_same_search(path, used[0].user_attrs.get(COMMAND), command)
+        study = optuna.load_study(study_name=used[0].study_name, storage=storage)
+    except STORAGE_ERRORS as error:
+        reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0][:200]
+        raise ConfigError(f"--storage {path}: {reason}; choose another file") from None
+    _repeat_trials_without_result(study)
+    return study
+
+
+def free_numbers(study: Study) -> Iterator[int]:
+    """Yields numbers to print for further trials, from 1: those that no trial with a result has."""
+    taken = {trial.user_attrs.get(NUMBER) for trial in study.get_trials(states=(TrialState.COMPLETE,))}
+    number = 0
+    while True:
+        number += 1
+        if number not in taken:
+            yield number
+
+
+def _storage_in(path: Path) -> RDBStorage:
+    """Opens the file by its name. In a URL SQLAlchemy and Optuna give `?`, `%`, `#` and braces a meaning."""
+    engine_options = {
+        "creator": lambda: sqlite3.connect(path, check_same_thread=False),
+        "poolclass": QueuePool,  # as SQLAlchemy has it for a file; this URL has no file
+    }
+    return RDBStorage("sqlite://", engine_options)
+
+
+def _begin_study(storage: BaseStorage, command: SearchCommand) -> Study:
+    study = optuna.create_study(
+        storage=storage, study_name=f"{command.scenario} {command.goal}", direction=command.direction
+    )
+    study.set_user_attr(COMMAND, msgspec.to_builtins(command))
+    return study
+
+
+def _repeat_trials_without_result(study: Study) -> None:
+    """Ends the trials of a process that was killed, and asks for their values again."""
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL)
+        study.enqueue_trial(trial.params)
+
+
+def _check_same_search(path: Path, kept: Any, command: SearchCommand) -> None:
+    """Raises ConfigError that names each difference between the command in the file and this one."""
+    try:
+        there = msgspec.convert(kept, SearchCommand)
+    except msgspec.ValidationError:
+        raise ConfigError(
+            f"--storage {path}: the file holds trials and does not say with which command they were made: an older "
+            f"version or another program wrote it. Trials of two searches are not comparable; choose another file"
+        ) from None
+    here = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
+    differences = list(_differences(there, here))
+    if not differences:
+        return
+    raise ConfigError(
+        f"--storage {path}: the file holds another search, whose trials are not comparable with this one's. "
+        f"{'; '.join(differences)}. Go on with that search by `{there.in_words(path)}`, or choose another file"
+    )
+
+
+def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
+    """Yields what differs, in words of the command line."""
+    if there.scenario != here.scenario:
+        yield f"scenario: {there.scenario} there, {here.scenario} here"
+    if there.rows != here.rows:
+        yield f"--rows: {_rows_in_words(there)} there, {_rows_in_words(here)} here"
+    yield from _differing_keys("--vary", there.vary, here.vary)
+    yield from _differing_keys("--set", there.set, here.set)
+    if there.goal != here.goal:
+        yield f"--goal: {there.goal} there, {here.goal} here"
+    if there.direction != here.direction:
+        given = {"minimize": "given", "maximize": "not given"}
+        yield f"--minimise: {given[there.direction]} there, {given[here.direction]} here"
+    if there.seeds != here.seeds:
+        yield f"--seeds: {there.seeds} there, {here.seeds} here"
+    if there.seed != here.seed:
+        yield f"--seed: {there.seed} there, {here.seed} here"
+    if there.code != here.code:
+        yield "the installed SnakeSIM has changed since then"
+    same_command = msgspec.structs.replace(
+        there, configurations=here.configurations, code=here.code, set_words=here.set_words
+    )
+    if same_command == here and there.configurations != here.configurations:
+        yield "the same command gives another configuration: the files of scenario, robot, scene or suite have changed"
+
+
+def _differing_keys(option: str, there: dict[str, Any], here: dict[str, Any]) -> Iterator[str]:
+    for key in sorted(there.keys() | here.keys()):
+        before, now = there.get(key, "not given"), here.get(key, "not given")
+        if before != now:
+            yield f"{option} {key}: {before} there, {now} here"
+
+
+def _rows_in_words(command: SearchCommand) -> str:
+    return ",".join(map(str, command.rows)) or "all"

@@ -1,0 +1,30 @@
+"""What all figures share: their style, and time from the first tick on."""
+
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_operator.features.figures.inherited import PLAIN_TEXT
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.time_axis import zero_s
+
+STYLE: Any = {
+    **PLAIN_TEXT,
+    "font.size": 8.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "lines.linewidth": 1.0,
+    "legend.frameon": False,
+    "legend.fontsize": 7.0,
+    "pdf.fonttype": 42,  # text stays text: journals ask for it
+    "svg.fonttype": "none",
+    "savefig.dpi": 300.0,
+    "figure.constrained_layout.use": True,
+}
+
+
+def over_time(axes: Axes, record: RunRecord, values: Floats, name: str = "", **look: str | float) -> None:
+    """A line, (ticks,), from the first tick on."""
+    axes.plot(record.time_s - zero_s(record), values, label=name, **look)  # pyright: ignore[reportArgumentType]

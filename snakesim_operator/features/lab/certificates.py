@@ -1,0 +1,213 @@
+"""The lab's own authority, and a short-lived certificate for every identity.
+
+There is no revocation list: who loses a machine removes it from the lab file and restarts the routers with the rendered
+rules, which shuts that name out at once; its certificate ends a few days later by itself. Private keys are P-256, only
+their owner may read them, and nothing here prints them.
+"""
+
+import os
+import secrets
+import stat
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.textfiles import read_bytes
+from snakesim_hal.network.private_keys import readable_by_all
+from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_operator.features.lab.lab_file import Lab
+
+AUTHORITY = "authority"
+CLOCK_SLACK = timedelta(minutes=10)  # a robot's clock may be behind
+RENEW_AT = 1 / 3  # of its life left, and it is renewed
+
+
+@dataclass(frozen=True)
+class Issuer:
+    """Who signs."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+
+def make_authority(folder: Path, lab: Lab) -> Issuer:
+    """The authority in a folder; a new one when there is none. Its key stays there, and goes to no machine."""
+    at_certificate, at_key = folder / f"{AUTHORITY}.pem", folder / f"{AUTHORITY}.key"
+    if at_certificate.exists() or at_key.exists():
+        return _read_authority(at_certificate, at_key)
+    _make_private(folder)
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{lab.file.name} authority")])
+    usage = x509.KeyUsage(
+        digital_signature=False,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=True,
+        crl_sign=True,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    certificate = (
+        _builder(name, name, timedelta(days=lab.file.authority_days))
+        .public_key(key.public_key())
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    _write(at_key, _pem_of(key), 0o600)
+    _write(at_certificate, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    return Issuer(certificate, key)
+
+
+def _make_private(folder: Path) -> None:
+    """A new folder that is its owner's alone. One that is there stays as it is, and must be so already."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        if not folder.is_dir():
+            raise ConfigError(f"--authority {folder}: is a file; name a folder") from None
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & 0o077:
+            raise ConfigError(
+                f"--authority {folder}: others may look or write into this folder (mode {mode:o}), and who has the "
+                f"authority's key controls the lab. Name a new folder, or make it yours alone: chmod 700 {folder}"
+            ) from None
+
+
+def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
+    warned = readable_by_all(at_key)
+    if warned:
+        raise ConfigError(f"{warned}; as this is the lab's authority, anybody may have joined: better make a new one")
+    try:
+        certificate = x509.load_pem_x509_certificate(read_bytes(at_certificate))
+        key = serialization.load_pem_private_key(read_bytes(at_key), None)
+    except ValueError as error:
+        raise ConfigError(f"{at_certificate.parent}: not an authority of this command: {error}") from None
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise ConfigError(f"{at_key}: not the key of {at_certificate}; restore the one that belongs to it")
+    if certificate.not_valid_after_utc < datetime.now(UTC):
+        raise ConfigError(
+            f"{at_certificate}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; move the folder away, run "
+            "`snakesim deploy certs` again, and install the new files on every machine"
+        )
+    return Issuer(certificate, key)
+
+
+def issue(issuer: Issuer, identity: Identity, lab: Lab, life: timedelta | None = None) -> tuple[bytes, bytes]:
+    """A new certificate and its private key, as PEM. life: from now on; None: as the lab file says."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    router = identity.role is None
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *[ExtendedKeyUsageOID.SERVER_AUTH] * router]
+    builder = (
+        _builder(
+            x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity.common_name)]),
+            issuer.certificate.subject,
+            timedelta(days=lab.file.certificate_days) if life is None else life,
+        )
+        .public_key(key.public_key())
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(x509.SubjectAlternativeName(_names(identity, lab)), critical=False)
+    )
+    certificate = builder.sign(issuer.key, hashes.SHA256())
+    return certificate.public_bytes(serialization.Encoding.PEM), _pem_of(key)
+
+
+def _names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
+    """What a router is reached at, which who connects compares; a role is reached nowhere, and has only its name."""
+    address = lab.file.machines[identity.machine].address if identity.role is None else None
+    if address is None:
+        return [x509.DNSName(identity.common_name.replace("_", "-"))]
+    try:
+        return [x509.IPAddress(ip_address(address))]
+    except ValueError:
+        return [x509.DNSName(address)]
+
+
+def write_certificates(
+    lab: Lab, folder: Path, authority: Path, *, rotate: bool = False
+) -> list[tuple[Identity, str, datetime]]:
+    """Certificates of all identities, in `folder/MACHINE/tls`. Returns each with what was done, and its end.
+
+    What is done is `made`, `renewed` or `kept`. rotate: renew all of them; otherwise those of another authority, for
+    another address, or with less than a third of their life left.
+    """
+    issuer = make_authority(authority, lab)
+    root = issuer.certificate.public_bytes(serialization.Encoding.PEM)
+    done: list[tuple[Identity, str, datetime]] = []
+    for identity in identities(lab):
+        tls = folder / identity.machine / "tls"
+        tls.mkdir(parents=True, exist_ok=True)
+        at = tls / f"{identity.label}.pem"
+        kept = _still_valid(at, issuer, identity, lab)
+        state = "made" if kept is None and not at.exists() else "renewed" if kept is None or rotate else "kept"
+        if state != "kept":
+            certificate, key = issue(issuer, identity, lab)
+            _write(at.with_suffix(".key"), key, 0o600)
+            _write(at, certificate, 0o644)
+        _write(tls / f"{AUTHORITY}.pem", root, 0o644)
+        done.append((identity, state, read_certificate(at).not_valid_after_utc))
+    return done
+
+
+def read_certificate(at: Path) -> x509.Certificate:
+    """A certificate in a file. Raises ConfigError."""
+    try:
+        return x509.load_pem_x509_certificate(read_bytes(at))
+    except ValueError as error:
+        raise ConfigError(f"{at}: not a certificate: {error}; remove it and run `snakesim deploy certs`") from None
+
+
+def _still_valid(at: Path, issuer: Issuer, identity: Identity, lab: Lab) -> x509.Certificate | None:
+    """The certificate that is there, if it may stay."""
+    if not at.exists() or not at.with_suffix(".key").exists():
+        return None
+    found = read_certificate(at)
+    try:
+        found.verify_directly_issued_by(issuer.certificate)
+    except (ValueError, TypeError, InvalidSignature):
+        return None
+    names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    life = found.not_valid_after_utc - found.not_valid_before_utc
+    left = found.not_valid_after_utc - datetime.now(UTC)
+    return found if list(names) == _names(identity, lab) and left > life * RENEW_AT else None
+
+
+def _builder(subject: x509.Name, issuer: x509.Name, life: timedelta) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - CLOCK_SLACK)
+        .not_valid_after(now + life)
+    )
+
+
+def _pem_of(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _write(path: Path, content: bytes, mode: int) -> None:
+    """Replace a file atomically; a private key is readable for its owner only."""
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with os.fdopen(descriptor, "wb") as file:
+        os.fchmod(descriptor, mode)
+        file.write(content)
+        os.fsync(descriptor)
+    beside.replace(path)

@@ -1,0 +1,45 @@
+"""The identities in a lab: every router, and every pair of a machine and a role, with the name in its certificate."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from snakesim_hal.wire.roles import Role
+from snakesim_operator.features.lab.lab_file import ALL, Lab
+
+ROUTER = "router"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What one certificate stands for."""
+
+    machine: str
+    role: Role | None  # None: a router
+    of: str  # the robot, `all`, or the name of the router
+    services: tuple[str, ...] = ()  # of a gnc
+
+    @property
+    def label(self) -> str:
+        """Its name on its machine, and of its files: `gnc.planar13`, `router.main`."""
+        return f"{self.role or ROUTER}.{self.of}"
+
+    @property
+    def common_name(self) -> str:
+        """Its name in the certificate, in the access rules and in the routers' logs: `gnc.planar13.ws1`."""
+        return f"{self.label}.{self.machine}"
+
+    def robots(self, lab: Lab) -> list[str]:
+        """The robots that it has to do with."""
+        return list(lab.file.robots) if self.of == ALL else [self.of] * (self.role is not None)
+
+
+def identities(lab: Lab) -> Iterator[Identity]:
+    """All of a lab: routers, robots, then the roles in the file's order."""
+    for name, router in lab.file.routers.items():
+        yield Identity(router.machine, None, name)
+    for name, robot in lab.file.robots.items():
+        yield Identity(robot.machine, Role.ROBOT, name)
+    for grant in lab.file.roles:
+        role = Role(grant.role)
+        services = tuple(grant.services) if role is Role.GNC else ()
+        yield Identity(grant.machine, role, grant.robot, services)

@@ -1,0 +1,77 @@
+"""The programs of ours that run on a lab's machines all the time: routers, hosts, services, recorders."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from snakesim_hal.wire.roles import Role
+from snakesim_operator.features.lab.drive_buses import can_interfaces, devices, host_settings, uses_bus
+from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_operator.features.lab.lab_file import Lab
+from snakesim_operator.features.lab.lab_robot import Robot
+
+STATE = "/var/lib/snakesim"
+
+
+@dataclass(frozen=True)
+class Program:
+    """One of them. People start theirs themselves: operators, viewers and administrators have none."""
+
+    identity: Identity
+    about: str
+    arguments: tuple[str, ...]  # of the `snakesim` command
+    service: str = ""  # of a gnc
+    of_robot: str = ""  # of a recorder
+    interfaces: tuple[str, ...] = ()  # of the kernel's CAN, that must be up before it
+    devices: tuple[str, ...] = ()  # device files that it opens
+
+    @property
+    def name(self) -> str:
+        """Of its unit and its container."""
+        label = self.identity.label if not self.of_robot else f"{self.kind}.{self.of_robot}"
+        return f"snakesim-{label}" + (f"-{self.service}" if self.service else "")
+
+    @property
+    def kind(self) -> str:
+        """`router`, `robot`, `gnc` or `recorder`: what it may do on its machine depends on that."""
+        return self.identity.label.partition(".")[0]
+
+
+def programs(lab: Lab, machine: str) -> Iterator[Program]:
+    """All of one machine."""
+    folder = lab.file.machines[machine].folder
+    for identity in identities(lab):
+        if identity.machine != machine:
+            continue
+        file = f"{folder}/{identity.label}.json5"
+        if identity.role is None:
+            yield Program(identity, f"Zenoh router {identity.of}", ("router", file))
+        elif identity.role is Role.ROBOT:
+            robot = lab.file.robots[identity.of]
+            out = ("--out", f"{STATE}/{identity.of}")
+            arguments = ("host", *_scenario(robot), "--session", file, *out)
+            yield Program(
+                identity,
+                f"HAL host of {identity.of}",
+                arguments,
+                interfaces=tuple(interface.name for interface in can_interfaces(robot)),
+                devices=tuple(devices(robot)),
+            )
+        elif identity.role is Role.GNC:
+            robot = lab.file.robots[identity.of]
+            for service in identity.services:
+                arguments = ("service", service, *_scenario(robot), "--session", file)
+                yield Program(identity, f"{service} of {identity.of}", arguments, service)
+        elif identity.role is Role.RECORDER:
+            for name in identity.robots(lab):
+                arguments = ("record", "--session", file, "--namespace", name)  # a file with the time in its name
+                yield Program(identity, f"recorder of {name}", arguments, of_robot=name)
+
+
+def _scenario(robot: Robot) -> tuple[str, ...]:
+    """Returns the scenario and what changes it: the same for the host and for its services, which compare it."""
+    words = [robot.scenario, "--backend", robot.backend]
+    if uses_bus(robot):
+        words += ["--pace", "realtime"]  # the only one of drives on a bus, whatever the scenario says
+    for setting in (*host_settings(robot), *robot.set):
+        words += ["--set", setting]
+    return tuple(words)

@@ -1,0 +1,58 @@
+"""systemd units, CAN bring-up and a compose file for a lab's machines, from the templates beside this file."""
+
+import re
+from collections.abc import Iterator
+from ipaddress import ip_address
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from snakesim_hal.base.process import SERVICE_PRIORITY
+from snakesim_operator.features.lab.drive_buses import can_interfaces
+from snakesim_operator.features.lab.lab_file import Lab
+from snakesim_operator.features.lab.programs import STATE, Program, programs
+
+CONTAINER_USER = "10001:10001"
+NEEDS_QUOTES = re.compile(r"[\s';]")
+
+
+def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
+    """A machine's files as (path, text). origin: a line that says where they come from."""
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    entry = lab.file.machines[machine]
+    found = list(programs(lab, machine))
+    given = {"machine": entry, "origin": origin, "state": STATE, "uid": CONTAINER_USER}
+    given["priority"] = SERVICE_PRIORITY
+    unit = templates.get_template("unit.j2")
+    for program in found:
+        text = unit.render(**given, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
+        yield f"systemd/{program.name}.service", text
+    for robot in lab.file.robots.values():
+        for interface in can_interfaces(robot) if robot.machine == machine else ():
+            text = templates.get_template("can.j2").render(**given, interface=interface)
+            yield f"systemd/snakesim-{interface.name}.service", text
+    if found:
+        commands = [(program, ["snakesim", *program.arguments]) for program in found]
+        yield "compose.yaml", templates.get_template("compose.j2").render(**given, programs=commands)
+
+
+def _command_line(lab: Lab, program: Program) -> str:
+    """Returns it as systemd splits it: the file's types allow no double quotes, `%`, `$` or backslashes."""
+    words = (lab.file.machines[program.identity.machine].program, *program.arguments)
+    return " ".join(f'"{word}"' if NEEDS_QUOTES.search(word) else word for word in words)
+
+
+def _addresses(lab: Lab) -> list[str]:
+    """Of the routers, if all of them are numbers."""
+    found = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
+    try:
+        return sorted({str(ip_address(address)) for address in found})
+    except ValueError:
+        return []

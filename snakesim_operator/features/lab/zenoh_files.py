@@ -1,0 +1,72 @@
+"""Zenoh's configuration of a lab's routers and sessions, as stock Zenoh reads it: nothing of ours is in there."""
+
+from typing import Any
+
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_operator.features.lab.access import ENVELOPE_BYTES, access_control, size_limits
+from snakesim_operator.features.lab.identities import Identity
+from snakesim_operator.features.lab.lab_file import ALL, Lab
+
+ALONE = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+STAMPED = {"enabled": {"router": True, "peer": True, "client": True}}
+LEASE_MS = 2000  # after which a silent link is given up
+
+
+def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
+    """A router: TLS on the machine's address, a certificate asked of everybody, and the access rules."""
+    earlier = list(lab.file.routers)[: list(lab.file.routers).index(identity.of)]
+    folder = f"{lab.file.machines[identity.machine].folder}/tls"
+    tls = {**tls_files(identity, folder, "listen"), **tls_files(identity, folder, "connect"), "enable_mtls": True}
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [lab.endpoint(identity.of)], "exit_on_failure": True},
+        "connect": {"endpoints": [lab.endpoint(name) for name in earlier], "timeout_ms": -1, "exit_on_failure": False},
+        "scouting": ALONE,
+        "timestamping": STAMPED,
+        "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+        "transport": {
+            "unicast": {"accept_timeout": 2000, "accept_pending": 200, "max_sessions": 500},
+            "link": _link(tls),
+            "shared_memory": {"enabled": False},
+        },
+        "access_control": access_control(lab),
+        "low_pass_filter": size_limits(),
+    }
+
+
+def session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
+    """A session of one role: a client of the routers, with its certificate, listening nowhere."""
+    folder = f"{lab.file.machines[identity.machine].folder}/tls"
+    settings: dict[str, Any] = {
+        "mode": "client",
+        "connect": {"endpoints": lab.endpoints(), "timeout_ms": 5000, "exit_on_failure": True},
+        "listen": {"endpoints": []},
+        "scouting": ALONE,
+        "timestamping": STAMPED,
+        "transport": {
+            "link": _link({**tls_files(identity, folder, "connect"), "enable_mtls": True}),
+            "shared_memory": {"enabled": False},
+        },
+    }
+    if identity.of != ALL:
+        settings["namespace"] = identity.of
+    return settings
+
+
+def _link(tls: dict[str, Any]) -> dict[str, Any]:
+    # `close_link_on_expiration`: an expired certificate ends its session too.
+    return {
+        "protocols": ["tls"],
+        "tx": {"lease": LEASE_MS, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}},
+        "rx": {"max_message_size": MAX_IMAGE_BYTES + ENVELOPE_BYTES},
+        "tls": {**tls, "verify_name_on_connect": True, "close_link_on_expiration": True},
+    }
+
+
+def tls_files(identity: Identity, folder: str, side: str) -> dict[str, Any]:
+    """The authority, and the certificate and key of an identity, in a folder; side: `listen` or `connect`."""
+    return {
+        "root_ca_certificate": f"{folder}/authority.pem",
+        f"{side}_certificate": f"{folder}/{identity.label}.pem",
+        f"{side}_private_key": f"{folder}/{identity.label}.key",
+    }

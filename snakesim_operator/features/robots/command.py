@@ -1,0 +1,79 @@
+"""`snakesim robot import` and `snakesim robot export`."""
+
+from pathlib import Path
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.terminal import printable, say, say_json
+from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.textfiles import write_text
+from snakesim_operator.features.robots.exporting import urdf_of, values_beside_urdf
+from snakesim_operator.features.robots.imported import Order
+from snakesim_operator.features.robots.importing import robot_of
+from snakesim_operator.features.robots.toml_text import toml_of
+from snakesim_operator.features.robots.unused_parts import LOOKS_HEADING
+
+HEADS = {
+    "names": "names (ours: theirs)",
+    "changed": "changed",
+    "assumed": "assumed, because the file does not say it",
+    "doubtful": "please check",
+    "left_out": "left out",
+}
+
+
+def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = False) -> int:
+    """Write a robot file from a URDF, and say what differs. Raises ConfigError."""
+    found = robot_of(file, order)
+    path = out or Path(f"{found.robot.name}.toml")
+    _check_new(path, ".toml", file)
+    notes = [f"From {file.name}, by `snakesim robot import`."]
+    for key, lines in found.report.items():
+        notes += ["", f"{HEADS[key]}:", *(f"  {line}" for line in lines)] if lines else []
+    write_text(path, toml_of(found.table.values, [printable(note) for note in notes]))
+    if as_json:
+        say_json({"file": str(path), **found.report})
+        return 0
+    shown = _end_of_terminal(notes)
+    for note in notes[1:shown]:
+        say(note)
+    if shown < len(notes):
+        say(f"  (what these say is at the top of {path})")
+    robot = found.robot
+    say("")
+    say(
+        f"{path}: {robot.chain.modules} joints ({', '.join(robot.chain.axes)}), {_whole_length_m(robot):.3f} m, "
+        f"{sum(robot.link_masses_kg):.3f} kg"
+    )
+    say(f"try it: snakesim run SCENARIO --set robot={path if path.is_absolute() else f'./{path}'}")
+    return 0
+
+
+def _end_of_terminal(notes: list[str]) -> int:
+    """How many notes the terminal shows: the values of looks, many lines of no consequence, are in the file only."""
+    looks = [i for i, note in enumerate(notes) if note.startswith(f"  {LOOKS_HEADING}")]
+    return looks[0] + 1 if looks else len(notes)
+
+
+def _whole_length_m(robot: RobotFile) -> float:
+    """From the tip of the tail to the tip of the head, with the rounded caps that `length_m` leaves out."""
+    return robot.length_m + 2 * robot.module.radius_m
+
+
+def export_robot(name: str, out: Path | None) -> int:
+    """Write a URDF from a robot file. Raises ConfigError."""
+    robot = decode(read_part(name, "robots"), RobotFile)
+    path = out or Path(f"{robot.name}.urdf")
+    _check_new(path, ".urdf", None)
+    write_text(path, urdf_of(robot))
+    say(f"{path}: {robot.chain.modules + 1} links, link_0 (tail, the root) to link_{robot.chain.modules} (head)")
+    sections = dict.fromkeys(key.partition(".")[0] for key in values_beside_urdf(robot))
+    say(f"in <snakesim> elements, which other readers skip: {', '.join(sections)}")
+    return 0
+
+
+def _check_new(path: Path, suffix: str, source: Path | None) -> None:
+    if path.suffix != suffix:
+        raise ConfigError(f"--out {path}: give a name that ends with {suffix}")
+    if path == source or path.exists():
+        raise ConfigError(f"{path} is there already; remove it, or give another --out")

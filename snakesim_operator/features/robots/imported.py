@@ -1,0 +1,103 @@
+"""What an import of a URDF is asked for, and what it returns: values of a robot file, and a report on all of them."""
+
+import re
+from dataclasses import dataclass, field
+
+from snakesim_hal.base.errors import short
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.robot import RobotFile
+from snakesim_operator.features.robots.xml_tree import Element
+
+UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+
+
+@dataclass(frozen=True)
+class Order:
+    """How to read a URDF."""
+
+    tail: str | None = None  # a link at the tail; none: the root link
+    up: str = "z"  # axis of the root link's frame that points up
+    scale: float = 1.0  # metres per unit of length of the file
+    like: str = "planar13"  # the robot file with what URDF has no words for
+
+
+class Notes:
+    """Sentences of a report. The same sentence is kept once, with all the places in the file that it holds for."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, list[str]] = {}
+
+    def add(self, sentence: str, *places: str) -> None:
+        """Add a sentence, and the places that it is about, such as `line 12`."""
+        known = self._places.setdefault(sentence, [])
+        known.extend(place for place in places if place not in known)
+
+    def lines(self) -> list[str]:
+        """Every sentence with its places, in the order in which they were added."""
+        return [f"{sentence}: {joined(places)}" if places else sentence for sentence, places in self._places.items()]
+
+
+def joined(places: list[str]) -> str:
+    """Places in a row; lines alone share one word, as in `lines 5, 12`."""
+    if len(places) > 1 and all(place.startswith("line ") for place in places):
+        return f"lines {', '.join(place.removeprefix('line ') for place in places)}"
+    return ", ".join(places)
+
+
+@dataclass
+class Imported:
+    """The values of a robot file, and what to know about them."""
+
+    table: Table
+    names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
+    negated: list[bool] = field(default_factory=list[bool])  # for each joint: our angle is minus the URDF's
+    changes: Notes = field(default_factory=Notes)  # values of the file that became others
+    assumptions: Notes = field(default_factory=Notes)  # values that the file does not give
+    doubts: Notes = field(default_factory=Notes)  # values that are allowed, and unusual for a snake robot
+    omissions: Notes = field(default_factory=Notes)  # what is in the file and not in the robot file
+
+    @property
+    def changed(self) -> list[str]:
+        """Values of the file that became others, as lines."""
+        return self.changes.lines()
+
+    @property
+    def assumed(self) -> list[str]:
+        """Values that the file does not give, as lines."""
+        return self.assumptions.lines()
+
+    @property
+    def doubtful(self) -> list[str]:
+        """Values that a person should check, as lines."""
+        return self.doubts.lines()
+
+    @property
+    def left_out(self) -> list[str]:
+        """What is in the file and not in the robot file, as lines."""
+        return self.omissions.lines()
+
+    @property
+    def report(self) -> dict[str, list[str]]:
+        """All of it, by its heading for scripts."""
+        return {
+            "names": self.names,
+            "changed": self.changed,
+            "assumed": self.assumed,
+            "doubtful": self.doubtful,
+            "left_out": self.left_out,
+        }
+
+    @property
+    def robot(self) -> RobotFile:
+        """Checked. Raises ConfigError."""
+        return decode(self.table, RobotFile)
+
+    def plain_name(self, name: str, otherwise: str, element: Element) -> str:
+        """A name as a robot file may have it, reported when it differs. otherwise: instead of an empty one."""
+        allowed = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:40] or otherwise
+        if allowed != name:
+            self.changes.add(
+                f"<{element.tag} name> {short(name)!r} became {allowed!r}: letters, digits, _ and -, 40 at most",
+                element.place,
+            )
+        return allowed

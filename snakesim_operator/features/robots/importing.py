@@ -1,0 +1,138 @@
+"""URDF -> the values of a robot file, and a report on everything that was changed, assumed or left out.
+
+A robot file is a straight row of links along x, whose joints turn about z (yaw) or y (pitch). So the straight line
+through the joints, at zero angles, becomes x from tail to head, and `up` becomes z. Lengths, masses, inertias, limits
+and friction come from the URDF; what it has no words for from its <snakesim> elements, as `snakesim robot export`
+writes them, or else from another robot file.
+
+No value of the file is dropped and none is taken from elsewhere without a line in the report. That holds by
+construction: elements and attributes that no function has read are reported (`Element.unused`), and so is every default
+that stands in for something absent (`Element.note_absent`).
+"""
+
+import json
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.model.files import Table, leaves, read_part, shipped
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.textfiles import read_bytes
+from snakesim_operator.features.robots.body import put_body
+from snakesim_operator.features.robots.exporting import GEOMETRY, LOOK
+from snakesim_operator.features.robots.imported import Imported, Order
+from snakesim_operator.features.robots.joint_limits import put_limits
+from snakesim_operator.features.robots.unused_parts import report_unused
+from snakesim_operator.features.robots.urdf_sensors import gazebo_lines, put_sensors
+from snakesim_operator.features.robots.urdf_tree import row_of
+from snakesim_operator.features.robots.xml_tree import Element, parse_xml
+
+SECTIONS = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
+OF_ANOTHER_ROBOT = ("links", "joints", "checked")  # of `--like`: they say nothing of this one
+FROM_URDF = ("name", "about", "chain", "module")
+
+
+def robot_of(file: Path, order: Order) -> Imported:
+    """Read a URDF. Raises ConfigError for what is no snake, and for files that are not well formed."""
+    if not 1e-6 <= order.scale <= 1e3:
+        raise ConfigError(f"--scale {order.scale:g}: give metres per unit of length of the file, such as 0.001 for mm")
+    urdf = parse_xml(read_bytes(file), str(file))
+    if urdf.tag != "robot":
+        raise urdf.wrong("is no URDF; its outermost element is <robot>")
+    urdf.read = True
+    own = urdf.first("snakesim") is not None
+    found = Imported(_exported_values(urdf) if own else _values_of_other(urdf, order))
+    row = row_of(found, urdf, file, tail=order.tail)
+    frames = put_body(found, row, order, urdf)
+    _put_name(found, urdf, file)
+    put_limits(found, row.joints, str(file), own=own)
+    if not own:
+        put_sensors(found, urdf, row, frames, order.scale)
+        _report_values_of_other(found, order)
+    found.table.values = dict(sorted(found.table.values.items(), key=lambda item: SECTIONS.get(item[0], len(SECTIONS))))
+    robot = found.robot  # raises for numbers that no robot file may hold
+    if own:
+        _mark_exported(urdf, robot)
+    for absence in urdf.absences:
+        found.assumptions.add(absence.sentence, f"line {absence.element.line}")
+    report_unused(found.omissions, urdf)
+    _doubt_shipped_name(found)
+    return found
+
+
+def _put_name(found: Imported, urdf: Element, file: Path) -> None:
+    name = urdf.optional("name")
+    if name is None:
+        found.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
+        name = file.stem
+    found.table.put("name", found.plain_name(name, "robot", urdf), str(file))
+
+
+def _doubt_shipped_name(found: Imported) -> None:
+    name = found.table.values["name"]
+    if name in shipped("robots"):
+        found.omissions.add(
+            f"a name of its own: it is {name}, as a shipped robot is; change it, because the network and a latched "
+            f"stop tell robots apart by it"
+        )
+
+
+def _values_of_other(urdf: Element, order: Order) -> Table:
+    """The robot file with what URDF has no words for."""
+    table = read_part(order.like, "robots")
+    for section in OF_ANOTHER_ROBOT:
+        table.values.pop(section, None)
+    for mounted in ("depth", "range"):  # their places fit another body
+        table.values.get("sensors", {}).pop(mounted, None)
+    table.put("about", f"Imported from {Path(urdf.source).name}.", urdf.source)
+    return table
+
+
+def _exported_values(urdf: Element) -> Table:
+    """What an export of ours wrote beside the words of URDF."""
+    table = Table({}, urdf.source)
+    known: set[str] = set()
+    for element in urdf.all("snakesim"):
+        key = element.get("key")
+        if key.partition(".")[0] in GEOMETRY:
+            raise element.wrong(f"has `key` = {short(key)!r}, which links and joints say; remove this element")
+        if key in known:
+            raise element.wrong(f"has `key` = {short(key)!r}, as another one has; remove one of them")
+        known.add(key)
+        try:
+            table.put(key, json.loads(element.get("value")), urdf.source)
+        except ValueError as error:
+            raise element.wrong(f"has a `value` that is not JSON: {short(str(error))}") from None
+    return table
+
+
+def _report_values_of_other(found: Imported, order: Order) -> None:
+    """Name every value that is as of the robot given by `--like`."""
+    for section, values in found.table.values.items():
+        if section in FROM_URDF:
+            continue
+        kept: list[str] = []
+        for key, value in leaves(values, section):
+            is_from_urdf = found.table.origin_of(key) == found.table.origin_of("name")
+            if not is_from_urdf and value not in ({}, []):
+                kept.append(f"{key.removeprefix(f'{section}.')} = {value}")
+        if kept:
+            found.assumptions.add(f"[{section}] as of robot {order.like!r}: {', '.join(kept)}")
+    absent = [section for section in SECTIONS if section not in found.table.values and section not in OF_ANOTHER_ROBOT]
+    if absent:
+        found.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
+
+
+def _mark_exported(urdf: Element, robot: RobotFile) -> None:
+    """Mark what `snakesim robot export` derives from the same values; what was edited there is left to be reported."""
+    written = parse_xml("".join(["<robot>", LOOK, *gazebo_lines(robot), "</robot>"]).encode(), urdf.source)
+    for child in urdf.children:
+        if any(child.says_the_same_as(one) for one in written.children):
+            child.read_all()
+    material = written.children[0]
+    for link in urdf.children:
+        for look in link.children if link.tag == "link" else []:
+            for child in look.children:
+                if child.tag == "material" and child.attributes == material.attributes and not child.children:
+                    child.read_all()

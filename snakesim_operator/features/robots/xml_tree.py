@@ -1,0 +1,211 @@
+"""XML as a tree that records which parts were read, so that everything else can be reported.
+
+Document types are refused, and with them entities and anything fetched from elsewhere. Size, depth and number of
+elements are bounded.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from xml.parsers import expat
+
+from snakesim_hal.base.errors import ConfigError, short
+
+MAX_ELEMENTS, MAX_DEPTH = 100_000, 32
+
+
+@dataclass(frozen=True)
+class Absent:
+    """Something that an element leaves out, and the value that was taken in its place."""
+
+    sentence: str
+    element: "Element"
+
+
+@dataclass(frozen=True)
+class Unused:
+    """A value of the file that no part of the program has read."""
+
+    outermost: str  # path of tags of the outermost element that is unused as a whole; empty: the element was read
+    outermost_line: int
+    path: str  # path of tags, with the attribute's name: `<link><visual name>`
+    value: str | None  # None: an element without attributes, text and children
+    line: int
+
+
+@dataclass
+class Element:
+    """An element with its line in the file."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    source: str
+    absences: list[Absent]  # of the whole file, in the order in which they were noticed
+    children: list["Element"] = field(default_factory=list["Element"])
+    text: str = ""
+    read: bool = False
+    read_text: bool = False
+    read_attributes: set[str] = field(default_factory=set[str])
+
+    @property
+    def place(self) -> str:
+        """Where it is, for a report: its name, if it has one, and its line."""
+        name = self.attributes.get("name")
+        return f"{short(name)} (line {self.line})" if name else f"line {self.line}"
+
+    def all(self, tag: str) -> list["Element"]:
+        """Its children of a tag, which count as read."""
+        found = [child for child in self.children if child.tag == tag]
+        for child in found:
+            child.read = True
+        return found
+
+    def first(self, tag: str) -> "Element | None":
+        """Its first child of a tag; the others are left to be reported."""
+        child = next((child for child in self.children if child.tag == tag), None)
+        if child is not None:
+            child.read = True
+        return child
+
+    def optional(self, name: str) -> str | None:
+        """An attribute; None when it is missing, and the caller says what that means."""
+        self.read_attributes.add(name)
+        return self.attributes.get(name)
+
+    def get(self, name: str, default: str | None = None) -> str:
+        """An attribute. A default that is taken is reported. Raises ConfigError when there is none."""
+        value = self.optional(name)
+        if value is not None:
+            return value
+        if default is None:
+            raise self.wrong(f"has no attribute `{name}`; add it")
+        self.note_absent(f"`{name}`", default)
+        return default
+
+    def numbers(self, name: str, count: int, default: str | None = None) -> list[float]:
+        """An attribute of `count` finite numbers. Raises ConfigError."""
+        return self._numbers(self.get(name, default), count, f"`{name}`")
+
+    def number(self, name: str, default: str | None = None) -> float:
+        """An attribute that is a number. Raises ConfigError."""
+        return self.numbers(name, 1, default)[0]
+
+    def text_number(self, tag: str, default: float) -> float:
+        """The number in a child, as Gazebo writes them; the default when there is none. Raises ConfigError."""
+        child = self.first(tag)
+        if child is None:
+            self.note_absent(f"<{tag}>", f"{default:g}")
+            return default
+        return child.text_numbers(1)[0]
+
+    def text_numbers(self, count: int) -> list[float]:
+        """The numbers between its tags. Raises ConfigError."""
+        self.read_text = True
+        return self._numbers(self.text, count, "the text")
+
+    def note_absent(self, what: str, value: str) -> None:
+        """Record that it leaves something out, and which value is assumed."""
+        self.absences.append(Absent(f"<{self.tag}> without {what}: {value}", self))
+
+    def _numbers(self, text: str, count: int, what: str) -> list[float]:
+        try:
+            found = [float(word) for word in text.split()]
+        except ValueError:
+            found = []
+        if len(found) != count or not all(math.isfinite(number) for number in found):
+            raise self.wrong(f"{what} = {short(text)!r}; expected {count} finite number{'s' * (count > 1)}")
+        return found
+
+    def wrong(self, why: str) -> ConfigError:
+        """An error about this element."""
+        name = f" name={short(self.attributes['name'])!r}" if "name" in self.attributes else ""
+        return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}")
+
+    def read_all(self) -> None:
+        """Mark it and all within it as read."""
+        self.read = True
+        self.read_text = True
+        self.read_attributes.update(self.attributes)
+        for child in self.children:
+            child.read_all()
+
+    def says_the_same_as(self, other: "Element") -> bool:
+        """Whether tag, attributes, text and children are equal, wherever the two stand."""
+        if (self.tag, self.attributes, self.text.strip()) != (other.tag, other.attributes, other.text.strip()):
+            return False
+        if len(self.children) != len(other.children):
+            return False
+        return all(mine.says_the_same_as(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
+
+    def unused(self, path: str = "") -> Iterator[Unused]:
+        """Every value in it and below it that was not read. path: of the tags above this one and of itself."""
+        yield from self._unused_here(path, "", 0, everything=False)
+        for child in self.children:
+            inner = f"{path}<{child.tag}>"
+            if child.read:
+                yield from child.unused(inner)
+            else:
+                yield from child._everything(inner, inner, child.line)
+
+    def _unused_here(self, path: str, outermost: str, outermost_line: int, *, everything: bool) -> Iterator[Unused]:
+        own_tag = path or f"<{self.tag}>"
+        for name, value in self.attributes.items():
+            if everything or name not in self.read_attributes:
+                yield Unused(outermost, outermost_line, f"{own_tag[:-1]} {name}>", value, self.line)
+        text = self.text.strip()
+        if text and (everything or not self.read_text):
+            yield Unused(outermost, outermost_line, own_tag, text, self.line)
+
+    def _everything(self, path: str, outermost: str, outermost_line: int) -> Iterator[Unused]:
+        """All values of an element that was not read."""
+        if not (self.attributes or self.text.strip() or self.children):
+            yield Unused(outermost, outermost_line, path, None, self.line)
+        yield from self._unused_here(path, outermost, outermost_line, everything=True)
+        for child in self.children:
+            yield from child._everything(f"{path}<{child.tag}>", outermost, outermost_line)
+
+
+def parse_xml(data: bytes, source: str) -> Element:
+    """The root element. Raises ConfigError: for what is not XML, has a document type, or is too large."""
+    parser = expat.ParserCreate()
+    absences: list[Absent] = []
+    top = Element("", {}, 0, source, absences)
+    open_elements = [top]
+    count = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        line = parser.CurrentLineNumber
+        if count > MAX_ELEMENTS or len(open_elements) > MAX_DEPTH:
+            raise ConfigError(
+                f"{source}, line {line}: more than {MAX_ELEMENTS} elements, or nested deeper than {MAX_DEPTH} levels"
+            )
+        if tag.startswith("xacro:"):
+            raise ConfigError(
+                f"{source}, line {line}: <{short(tag)}> is xacro; convert it first: xacro FILE > robot.urdf"
+            )
+        element = Element(tag, attributes, line, source, absences)
+        open_elements[-1].children.append(element)
+        open_elements.append(element)
+
+    def end(_tag: str) -> None:
+        open_elements.pop()
+
+    def characters(text: str) -> None:
+        open_elements[-1].text += text
+
+    def refuse(*_: object) -> None:
+        raise ConfigError(f"{source}, line {parser.CurrentLineNumber}: has a <!DOCTYPE>; URDF needs none: remove it")
+
+    parser.buffer_text = True
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = characters, refuse
+    try:
+        parser.Parse(data, True)
+    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an encoding that nobody knows
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf") from None
+    return top.children[0]

@@ -1,0 +1,156 @@
+"""Commands to a robot: `snakesim arm`, `disarm`, `clear`, `sim`.
+
+A name is not an identity: any client on the network can answer in a robot's name. So all hosts are queried, two answers
+are an error, and an answer is accepted once the robot's host publishes the new state itself.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from snakesim_hal.base.errors import NotConnectedError, RefusedError
+from snakesim_hal.base.process import user_name
+from snakesim_hal.base.terminal import Say, say
+from snakesim_hal.host.latch import forget_stop, stops_kept
+from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, request_to_arm
+from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
+from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
+
+ANSWER_S = 5.0
+DESCRIPTION_S = 3.0
+SHOWN_S = 1.5  # until the host's status must show what its answer says
+DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
+
+
+def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unchecked: bool = False) -> int:
+    """Arm a robot, if robot and backend match. unchecked: also without a check of its joints. Raises RefusedError."""
+    link = only_robot(where, f"arm {robot} {backend}")
+    with open_session(link, CONNECT_S) as session:
+        description = _description(session, link)
+        wrong = [
+            f"{what} here is {there!r}, not {named!r}"
+            for what, there, named in (
+                ("the robot", description.robot, robot),
+                ("the backend", description.backend, backend),
+            )
+            if there != named
+        ]
+        if wrong:
+            raise RefusedError(
+                f"not armed: {'; '.join(wrong)}. To arm, name robot and backend: "
+                f"`snakesim arm {description.robot} {description.backend}`"
+            )
+        request = request_to_arm(description, user_name(), unchecked=unchecked)
+        return ask_host(session, keys.LIFECYCLE, request, "armed", link, say)
+
+
+def disarm(where: RobotSelection, say: Say = say) -> int:
+    """Make the joints passive; later commands do not move them."""
+    request = LifecycleRequest(action="disarm", who=user_name())
+    return _ask_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
+
+
+def clear(where: RobotSelection, say: Say = say) -> int:
+    """Clear a fault or an emergency stop. The robot is disarmed then.
+
+    If no robot runs, an emergency stop stored by the last run is removed.
+    """
+    try:
+        link = only_robot(where, "clear")
+    except NotConnectedError:
+        kept = [path for path in stops_kept() if where.namespace in (None, path.parent.name)]
+        if not kept or where.endpoint is not None:
+            raise
+        for path in kept:
+            say(f"{path.parent.name}: {forget_stop(path)}; cleared by {user_name()}. No robot of that name runs here")
+        return 0
+    return _ask_robot(link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", say)
+
+
+def simulator(order: SimulatorOrder, where: RobotSelection, say: Say = say) -> int:
+    """Pause, step, speed and reset of a simulator; a robot that moves something real refuses, with its reason."""
+    request = SimulatorRequest(action=order.action, who=order.who or user_name(), ticks=order.ticks, speed=order.speed)
+    return _ask_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
+
+
+def _ask_robot(link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: Say) -> int:
+    with open_session(link, CONNECT_S) as session:
+        return ask_host(session, key, request, done, link, say)
+
+
+def ask_host(
+    session: Session, key: str, request: LifecycleRequest | SimulatorRequest, done: str, link: Link, say: Say
+) -> int:
+    """Query the robot's host, and check who answers. done: in words. Raises RefusedError, NotConnectedError."""
+    statuses = session.latched_reader(keys.STATUS, Status)
+    answers = [answer for _, answer in session.ask_all(key, request, ANSWER_S)]
+    doubt, shown = judge(answers, statuses)
+    name = link.namespace
+    if not answers:
+        raise NotConnectedError(
+            f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not do this; if the "
+            "robot moves, `snakesim estop`"
+        )
+    if doubt is not None:
+        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
+        raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
+    if not answers[0].ok:
+        raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
+    say(f"{name}: {done}: {answers[0].reason}")
+    return 0
+
+
+def ask_meanwhile(
+    session: Session, request: LifecycleRequest, done: str, link: Link, turn: Callable[[], object]
+) -> None:
+    """Query the host, as `ask_host`; commands go on meanwhile, without which an armed robot would be in a fault."""
+    with ThreadPoolExecutor(1) as beside:
+        answer = beside.submit(ask_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
+        while not answer.done():
+            turn()
+        answer.result()
+
+
+def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
+    """Check answers: (why not confirmed, the newest status). None: one host answered, and its status confirms it."""
+    if len(answers) > 1:
+        return f"{len(answers)} answered in its name; at least one is an impostor", _newest(statuses, None)
+    wanted = answers[0].lifecycle if answers else None
+    shown = _newest(statuses, wanted)
+    hosts = {status.host for status in (shown,) if status is not None} | {answer.host for answer in answers}
+    if len(hosts) > 1:
+        return "the answer is not from the host that publishes its status; one of them is an impostor", shown
+    if shown is None or shown.lifecycle != wanted:
+        return "its status does not show it; the host may hang, and the answer be from an impostor", shown
+    return None, shown
+
+
+def _newest(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
+    """The newest status, once it shows a state, or after the timeout."""
+    shown: Status | None = None
+    deadline = time.monotonic() + SHOWN_S
+    while time.monotonic() < deadline:
+        shown = (statuses.drain() or [shown])[-1]
+        if shown is not None and lifecycle in (None, shown.lifecycle):
+            break
+        time.sleep(0.01)
+    return shown
+
+
+def _description(session: Session, link: Link) -> Description:
+    """The robot's description. Raises RefusedError when two hosts publish one."""
+    reader = session.latched_reader(keys.DESCRIPTION, Description)
+    deadline = time.monotonic() + DESCRIPTION_S
+    found: list[Description] = []
+    while not found and time.monotonic() < deadline:
+        time.sleep(0.05)
+        found = reader.drain()
+    if not found:
+        raise NotConnectedError(
+            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?"
+        )
+    if len({description.host for description in found}) > 1:
+        raise RefusedError(f"{link.namespace}: {len(found)} hosts describe it; at least one is an impostor. Not armed")
+    return found[-1]

@@ -1,0 +1,60 @@
+"""`snakesim fault`: inject a fault into a run that allows it, and end it."""
+
+from dataclasses import dataclass
+from math import inf
+
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, did_you_mean, short
+from snakesim_hal.base.terminal import Say, say
+from snakesim_hal.model.fault_kinds import KINDS, Injection, checked, explain
+from snakesim_hal.network.session import open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import FaultRequest
+from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
+from snakesim_operator.robot_commands.command import ANSWER_S
+
+LIST = "list"
+
+
+@dataclass(frozen=True)
+class FaultOrder:
+    """The command's options."""
+
+    kind: str
+    target: str | None = None
+    for_s: float | None = None
+    amount: float | None = None
+    end: bool = False
+
+
+def fault(order: FaultOrder, where: RobotSelection, say: Say = say) -> int:
+    """Send the request to the responsible part. Raises RefusedError if it refuses, NotConnectedError without answer."""
+    if order.kind == LIST and order.target is None:
+        for line in explain().splitlines():
+            say(line)
+        return 0
+    kinds = sorted({kind for of_target in KINDS.values() for kind in of_target})
+    if order.kind not in kinds:
+        meant = did_you_mean(order.kind, kinds)
+        raise ConfigError(
+            f"fault {short(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
+        )
+    if order.target is None:
+        raise ConfigError(f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`")
+    injection = checked(Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}")
+    if order.for_s is not None and not 0.0 < order.for_s < inf:
+        raise ConfigError(f"--for {order.for_s:g}: give more than 0 s")
+    if injection.about.once and (order.end or order.for_s is not None):
+        raise ConfigError(f"{order.kind} happens once and has no end; omit --for and --end")
+    request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
+    with open_session(only_robot(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
+        try:
+            answer = session.ask(keys.fault(injection.part), request, ANSWER_S)
+        except NotConnectedError:
+            raise NotConnectedError(
+                f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "
+                f"shows which services are alive"
+            ) from None
+    if not answer.ok:
+        raise RefusedError(f"not done: {answer.reason}")
+    say(answer.reason)
+    return 0

@@ -1,0 +1,221 @@
+"""A backend behind the real host, a real client that commands it, and an observer; over Zenoh on loopback."""
+
+import contextlib
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from snakesim_hal.backend import Backend, Samples, SetPoints
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.host.host import Host
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
+    Answer,
+    Clock,
+    Fault,
+    JointCommand,
+    JointState,
+    LifecycleRequest,
+    LifecycleState,
+    Mode,
+)
+from snakesim_testing.contract.rig import HOLDER, JointTargets
+
+LIMIT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
+Plan = Callable[[int], "JointTargets | None"]  # ticks since arming -> commanded joints; None: send nothing
+
+
+def stay(_ticks: int) -> JointTargets:
+    """Command no joint: all hold their position."""
+    return {}
+
+
+def wait_until(happened: Callable[[], Any], what: str) -> None:
+    """Wait until a condition holds; fails with its name if it does not in time."""
+    deadline = time.monotonic() + LIMIT_S
+    while not happened():
+        assert time.monotonic() < deadline, f"not within {LIMIT_S} s: {what}"
+        time.sleep(0.002)
+
+
+class RecordingBackend:
+    """A backend that forwards and records all calls; a fault can be planted in it."""
+
+    def __init__(self, inner: Backend) -> None:
+        self._inner = inner
+        self.describe, self.enact, self.advance, self.close = inner.describe, inner.enact, inner.advance, inner.close
+        self.seen: list[JointState] = []
+        self.planted: Callable[[int], Fault | None] | None = None  # tick -> a fault to report besides the backend's own
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """The backend's, recorded."""
+        samples = self._inner.sample(tick, stamp_ns)
+        self.seen.append(samples.joints)
+        return samples
+
+    def faults(self) -> list[Fault]:
+        """The backend's, and the planted one."""
+        found = self._inner.faults()
+        planted = self.planted(self.seen[-1].tick) if self.planted is not None and self.seen else None
+        return found if planted is None else [*found, planted]
+
+
+@dataclass
+class Controller:
+    """A control service with a plan that counts from arming."""
+
+    plan: Plan = stay
+    last_sent_tick: int = -1
+    epoch: int = 0
+    arming: int = 0
+    stopped: threading.Event = field(default_factory=threading.Event)
+
+    def run(self, link: Link) -> None:
+        """Until stopped."""
+        with open_session(link) as session:
+            client = Client(session, HOLDER)
+            robot = client.description()
+            joints = client.subscribe(keys.JOINTS, JointState)
+            commander = Commander(client, robot)
+            client.announce()
+            arming = armed_at = -1
+            held: SetPoints | None = None
+            for clock in client.ticks(silence_s=0.05):
+                if self.stopped.is_set():
+                    return
+                if clock is None:
+                    continue
+                measured = client.read(joints)
+                if measured is None or not commander.holds(clock):
+                    client.done(clock.tick)
+                    continue
+                if clock.lifecycle != "armed" or held is None:
+                    held = commander.stay(measured)
+                elif clock.arming != arming:
+                    arming, armed_at = clock.arming, clock.tick
+                asked = self._asked(clock, held, clock.tick - armed_at)
+                if asked is not None:
+                    commander.send(clock, measured, asked)
+                    self.last_sent_tick, self.epoch, self.arming = clock.tick, clock.lease_epoch, clock.arming
+                    client.done(clock.tick)
+
+    def _asked(self, clock: Clock, held: SetPoints, ticks: int) -> SetPoints | None:
+        asked = self.plan(ticks) if clock.lifecycle == "armed" else {}
+        if asked is None:
+            return None
+        mode, target = list(held.mode), list(held.target)
+        for joint, (wanted_mode, wanted) in asked.items():
+            mode[joint], target[joint] = wanted_mode, wanted
+        return SetPoints(mode, target, held.torque_limit_nm)
+
+
+class Hosted:
+    """Host, controller and observer, each with a session and a thread of its own, until `close`."""
+
+    def __init__(self, backend: Backend, config: RunConfig) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        link = Link(endpoint, f"contract/{config.robot.name}")
+        self.backend = RecordingBackend(backend)
+        self.controller = Controller()
+        self.config = config
+        self.armed_at = 0  # tick
+        self._threads: list[threading.Thread] = []
+        self._open = contextlib.ExitStack()
+        self._open.callback(self.backend.close)
+        self._open.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
+        try:
+            own = self._open.enter_context(open_session(replace(link, listen=True)))
+            self.host = Host(config, GuardedBackend(self.backend), own)
+            self.robot = self.host.description
+            self.session: Session = self._open.enter_context(open_session(link))
+            self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
+            wait_until(self._commands.heard, "the host receives our commands")  # earlier ones are lost
+            self._start("host", self.host.run, self.host.stop)
+            self._start("controller", lambda: self.controller.run(link), self.controller.stopped.set)
+        except BaseException:
+            self._open.close()
+            raise
+
+    @property
+    def tick(self) -> int:
+        """Of the newest sample."""
+        return self.backend.seen[-1].tick if self.backend.seen else -1
+
+    def lifecycle(self, action: Any) -> Answer:
+        """Arm (naming robot, backend and configuration), disarm or clear."""
+        robot = self.robot
+        request = LifecycleRequest(
+            action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+        )
+        return self.session.ask(keys.LIFECYCLE, request, timeout_s=10.0)
+
+    def arm(self, plan: Plan) -> None:
+        """Arm from any state; the controller acts by the plan from then on."""
+        if self.host.authority.state == "armed":
+            self.lifecycle("disarm")
+        elif self.host.authority.state != "disarmed":
+            self.lifecycle("clear")
+        self.controller.plan = plan
+        deadline = time.monotonic() + LIMIT_S
+        while not (answer := self.lifecycle("arm")).ok and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert answer.ok, f"the robot cannot be armed: {answer.reason}"
+        self.armed_at = self.tick
+
+    def reaches(self, state: LifecycleState) -> None:
+        """Wait for a lifecycle state."""
+        wait_until(
+            lambda: self.host.authority.state == state or not self._threads_live(),
+            f"lifecycle {state}",
+        )
+        assert self.host.authority.state == state, self.host.authority.why
+
+    def passes(self, periods: int) -> list[JointState]:
+        """Wait for this many more ticks, and return their joint states."""
+        since = len(self.backend.seen)
+        wait_until(lambda: len(self.backend.seen) >= since + periods or not self._threads_live(), f"{periods} ticks")
+        assert len(self.backend.seen) >= since + periods, f"the host ended: {self.host.authority.why}"
+        return self.backend.seen[since:]
+
+    def forge(self, **wrong: Any) -> None:
+        """Publish a command that would turn the first joint, valid except for the fields given here."""
+        count = len(self.robot.joints)
+        good: dict[str, Any] = {
+            "tick": self.tick,
+            "sequence": 2**40,
+            "lease_epoch": self.controller.epoch,
+            "arming": self.controller.arming,
+            "layout": self.robot.layout,
+            "valid_for_ns": self.robot.lease_ns,
+            "mode": [Mode.POSITION] * count,
+            "target": [0.5] * count,
+        }
+        self._commands.put(JointCommand(**(good | wrong)))
+
+    def close(self) -> None:
+        """Stop everything and close the backend."""
+        self._open.close()
+
+    def _start(self, name: str, run: Callable[[], None], stop: Callable[[], None]) -> None:
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        self._threads.append(thread)
+
+        def end() -> None:
+            stop()
+            thread.join(LIMIT_S)
+
+        thread.start()
+        self._open.callback(end)
+
+    def _threads_live(self) -> bool:
+        return all(thread.is_alive() for thread in self._threads)

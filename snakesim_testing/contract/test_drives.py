@@ -1,0 +1,66 @@
+"""Drives without their driver: what has stopped by itself stays off, and nothing brakes without end."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from snakesim_hal.wire.messages import Mode
+from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract.bench import EmulatedDrives
+from snakesim_testing.contract.rig import Rig
+
+
+def go_on(_rig: Rig) -> None:
+    """Do nothing: the host finds by itself that it was away."""
+
+
+@pytest.mark.parametrize("then", [go_on, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
+def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an_arming(
+    rig: Rig, drives: EmulatedDrives, then: Callable[[Rig], None]
+) -> None:
+    """A host that does nothing for 1 s while a joint moves: every drive stops by its own watchdog.
+
+    Once the host goes on, the backend reports each of those stops as a fault of its joint, whatever the operator asks
+    for first. No drive is enabled again before the fault is cleared and the robot armed.
+    """
+    rig.cruise()
+    rig.spoiled = True
+    assert all(drives.enabled()), f"armed, and enabled are {drives.enabled()}"
+    began = rig.tick
+    rig.freeze_host(t.FROZEN_S, drives.freeze_driver)
+    assert not any(drives.enabled()), f"{t.FROZEN_S} s without the driver, and still enabled are {drives.enabled()}"
+    then(rig)
+    must_stay_off(rig, drives, rig.periods(t.SETTLE_S))
+    record = rig.since(began)
+    named = {fault.joint for fault in record.faults if fault.cause}
+    silent = [joint.name for joint in rig.robot.joints if joint.name not in named]
+    assert not silent, f"their stop was never reported: {silent}; reported were {record.faults}"
+    assert rig.authority.state in ("fault", "estop"), rig.authority.state
+    rig.clear()
+    must_stay_off(rig, drives, t.ARMING_PERIODS)
+    cleared = rig.tick
+    rig.cruise()
+    assert all(drives.enabled()), f"cleared and armed, and enabled are {drives.enabled()}"
+    assert not rig.since(cleared).faults, rig.since(cleared).faults
+
+
+def must_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:
+    """Fail if a drive is enabled at any time."""
+    for _ in range(periods):
+        rig.idle()
+        assert not any(drives.enabled()), f"enabled again, in state {rig.authority.state}: {drives.enabled()}"
+
+
+def test_drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watchdogs_time(
+    rig: Rig, drives: EmulatedDrives
+) -> None:
+    """A fault that the driver gets: the drive of a moving joint brakes, for its watchdog's time at most."""
+    rig.cruise()
+    rig.fault()
+    rig.idle()
+    if rig.has(0, Mode.VELOCITY):  # otherwise the joint is led to rest by its position, which takes less than a period
+        assert drives.enabled()[0], "the joint moves, and its drive does not brake"
+    rig.idle(rig.periods(t.BRAKES_S) + t.TRANSPORT_PERIODS)
+    must_stay_off(rig, drives, rig.periods(t.SETTLE_S))
+    assert np.abs(rig.now.velocity_rad_s).max() < t.STILL_RAD_S, f"still moving: {rig.now.velocity_rad_s} rad/s"

@@ -1,0 +1,106 @@
+"""Sensor samples of a tick."""
+
+import math
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.base.errors import WireError
+from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import MountedSample
+from snakesim_hal.wire.outgoing import what_is_wrong
+from snakesim_hal.wire.own_sample import own_kind_at
+from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract.rig import Record, Rig
+
+COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
+
+
+def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: Rig, healthy: Record) -> None:
+    """One joint state a tick, stamped with the robot's own time."""
+    ticks = [joints.tick for joints in healthy.joints]
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+    assert all(joints.stamp_ns == joints.tick * rig.period_ns for joints in healthy.joints)
+
+
+def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record) -> None:
+    """Never from the future, never older than delay, interval and transport together; and in order."""
+    for sensor in rig.robot.sensors:
+        if sensor.key == keys.JOINTS:
+            continue
+        oldest_ns = 1e9 * (sensor.delay_s + 1 / sensor.rate_hz) + t.SENSOR_PERIODS * rig.period_ns
+        stamps: list[int] = []
+        for sample in healthy.samples:
+            if (message := sample.others.get(sensor.key)) is not None:
+                stamp_ns: int = message.stamp_ns  # pyright: ignore[reportAttributeAccessIssue]
+                stamps.append(stamp_ns)
+                age_ns = sample.joints.stamp_ns - stamp_ns
+                assert 0 <= age_ns <= oldest_ns, f"{sensor.key}: {age_ns * 1e-6} ms old"
+        assert all(before < after for before, after in pairwise(stamps)), f"{sensor.key}: out of order"
+
+
+def test_every_vector_has_one_entry_a_joint(rig: Rig, healthy: Record) -> None:
+    """Angle, velocity, torque, validity and age, tail to head."""
+    for joints in healthy.joints:
+        lengths = {name: len(getattr(joints, name)) for name in COLUMNS}
+        assert set(lengths.values()) == {rig.count}, lengths
+
+
+def test_every_sample_survives_the_wire(rig: Rig, healthy: Record) -> None:
+    """Finite and within the bounds of the messages: encoded and decoded by the HAL's codec it is the same.
+
+    A sensor's own message is decoded as the description says, which is all that others know of it.
+    """
+    for sample in healthy.samples:
+        for key, message in ((keys.JOINTS, sample.joints), *sample.others.items()):
+            own = own_kind_at(key, rig.robot)
+            decoder = Decoder(type(message) if own is None else own.message)
+            try:
+                decoded = decoder.decode(encode(message), encoding_of(type(message)))
+            except WireError as error:
+                pytest.fail(f"{key}: {what_is_wrong(message) or error}")
+            assert msgspec.to_builtins(decoded) == msgspec.to_builtins(message)
+        assert all(math.isfinite(number) for name in COLUMNS[:3] for number in getattr(sample.joints, name))
+
+
+def test_every_sample_fits_the_robot(rig: Rig, healthy: Record) -> None:
+    """Links and joints are those of the description, rotations are rotations, an image has all of its pixels."""
+    for sample in healthy.samples:
+        for key, message in sample.others.items():
+            assert (why := mismatch(message, rig.robot)) is None, f"{key}: {why}"
+
+
+def test_no_sample_contradicts_itself(healthy: Record) -> None:
+    """What cameras and lidars measure is within their range; the message of one's own sensor says what cannot be."""
+    for sample in healthy.samples:
+        for key, message in sample.others.items():
+            if isinstance(message, MountedSample):
+                assert not (why := message.contradiction()), f"{key}: {why}"
+
+
+def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record) -> None:
+    """In normal operation all joints are known; a reading is at most a period old, besides the stated delay."""
+    delay_s = next(sensor.delay_s for sensor in rig.robot.sensors if sensor.key == keys.JOINTS)
+    oldest_ns = t.AGE_PERIODS * rig.period_ns + delay_s * 1e9
+    for joints in healthy.joints:
+        assert all(joints.valid), f"tick {joints.tick}: {joints.valid}"
+        assert max(joints.age_ns) <= oldest_ns, f"tick {joints.tick}: {joints.age_ns} ns"
+
+
+def test_what_is_not_known_yet_is_not_reported_as_valid(rig: Rig) -> None:
+    """The very first sample: a joint has the same angle as afterwards, or it is not valid."""
+    for i, valid in enumerate(rig.first.joints.valid):
+        away = rig.first.joints.angle_rad[i] - rig.home_rad[i]
+        assert not valid or abs(away) < t.STILL_RAD, f"joint {i} was {away:+.3f} rad off and called valid"
+
+
+def test_readings_follow_the_motion(healthy: Record) -> None:
+    """A moving robot gives new readings: no joint repeats one old reading for long."""
+    angles = np.round(healthy.angle_rad, 6)
+    for i in range(angles.shape[1]):
+        fresh = len(np.unique(angles[:, i]))
+        assert fresh > len(angles) // 3, f"joint {i}: only {fresh} different readings in {len(angles)} ticks"
