@@ -1,5 +1,6 @@
 """Guidance, navigation and control: pure cores, and one thin service around each.
 
+`geometry`     a planar snake: vectors, the body as a chain, a body on a path
 `guidance`     contacts, known obstacles and body pose -> a world model
 `navigation`   mission or velocity intent -> a trajectory
 `control`      trajectory and world model -> set-points of every joint; pluggable

@@ -3,6 +3,5 @@
 `thermal`   heat of joint modules; its derating curve is also that of `safety`
 `motor`     a joint's actuator      `plant`   a model of joints that turn under torques, as module twins use it
 `motors`    all motors of a robot as vectors: the power stages of emulated drives
-`inertia`   a plant without a world: every joint turns an inertia of its own
 `hills`     heights of uneven ground
 """

@@ -1,5 +1,6 @@
-"""What is left of a host's run, on disk and in memory.
+"""The host's log of a run, on disk and in memory.
 
-`black_box`    every tick: a ring in memory, and the file's format      `recorder`   writes it while the host runs
-`host_record`  the host's own numbers, and the names of the files
+`black_box`     every tick: a ring in memory, and the format of the file
+`writer`        writes it to disk while the host runs
+`host_record`   the host's statistics, and the names of the files
 """

@@ -1,6 +1,6 @@
 """The contract of a backend as tests: run them on a backend of your own with one command.
 
-    python -m pytest --pyargs snakesim_testing.contract --snakesim-backend NAME_or_./file.py:Class
+    python -m pytest -p snakesim_testing --pyargs snakesim_testing.contract --snakesim-backend NAME_or_./file.py:Class
 
 `plugin`      the pytest plugin: options, fixtures and the table at the end
 `bench`       one backend with its settings, opened by one user at a time

@@ -23,7 +23,16 @@ from tests.whole import command as in_process
 pytestmark = pytest.mark.e2e
 
 ROBOT = REPOSITORY / "docs" / "planar13_whiskers.toml"
-PYTEST = ("-p", "no:cacheprovider", "--pyargs", "snakesim_testing.contract", "--snakesim-backend", "sim")
+PYTEST = (
+    "-p",
+    "no:cacheprovider",
+    "-p",
+    "snakesim_testing",
+    "--pyargs",
+    "snakesim_testing.contract",
+    "--snakesim-backend",
+    "sim",
+)
 LEFT = keys.own("left")
 
 

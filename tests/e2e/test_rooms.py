@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 COMMANDS: dict[str, list[str]] = {}  # of the rooms that nothing imports
 for _name, _at in PROJECT["entry-points"]["snakesim.commands"].items():
     if _at.startswith("snakesim_operator."):
-        COMMANDS.setdefault(_at.split(".")[1], []).append(_name)
+        COMMANDS.setdefault(_at.split(".")[2], []).append(_name)
 IMPORT_ALL = (
     "import importlib, pkgutil, snakesim_operator as top\n"
     "for found in pkgutil.walk_packages(top.__path__, 'snakesim_operator.'):\n"
@@ -31,8 +31,8 @@ def without(rooms: Sequence[str], folder: Path) -> Path:
     for package in REPOSITORY.glob("snakesim*"):
         shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
     for room in rooms:
-        shutil.rmtree(folder / "snakesim_operator" / room)
-    gone = tuple(f"snakesim_operator.{room}." for room in rooms)
+        shutil.rmtree(folder / "snakesim_operator" / "features" / room)
+    gone = tuple(f"snakesim_operator.features.{room}." for room in rooms)
     metadata = folder / f"snakesim-{PROJECT['version']}.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text(f"Metadata-Version: 2.4\nName: snakesim\nVersion: {PROJECT['version']}\n")

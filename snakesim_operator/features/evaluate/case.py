@@ -56,7 +56,7 @@ class TookTooLongError(BaseException):
 def code_digest() -> str:
     """Names the code that is installed here: results of other code are not mixed with these."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[2].glob("snakesim_*/**/*.py")):
+    for path in sorted(Path(__file__).parents[3].glob("snakesim_*/**/*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

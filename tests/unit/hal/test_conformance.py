@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from collections import defaultdict
-from importlib.metadata import entry_points
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,7 +14,7 @@ from tests.contract.mutants import MUTANTS
 from tests.contract.workbench import text_of_the_example
 
 ROOT = Path(__file__).parents[3]
-SUITE = ROOT / "snakesim_hal" / "conformance"
+SUITE = ROOT / "snakesim_testing" / "contract"
 PLUGIN = "snakesim_testing.contract.plugin"
 pytestmark = pytest.mark.timeout(900)  # whole suites, perhaps on an emulated machine
 NOTICED = {"failure", "error"}
@@ -29,9 +28,8 @@ def python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str
 
 
 def run_suite(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """The suite in a process of its own, as a user runs it. pytest refuses a plugin that is named twice."""
-    known = any(entry.value == PLUGIN for entry in entry_points(group="pytest11"))
-    plugins = ["-p", "no:cacheprovider", *([] if known else ["-p", PLUGIN])]
+    """Run the suite in a process of its own, as a user runs it."""
+    plugins = ["-p", "no:cacheprovider", "-p", "snakesim_testing"]
     return python("-m", "pytest", "--pyargs", "snakesim_testing.contract", *plugins, *arguments, cwd=cwd)
 
 
@@ -120,4 +118,4 @@ def test_a_project_beside_ours_may_have_options_of_the_usual_names(tmp_path: Pat
 
 def test_the_plugin_loads_nothing_of_ours_until_it_is_used() -> None:
     code = f"import sys, {PLUGIN}; print([name for name in sys.modules if name.startswith('snakesim_')])"
-    assert python("-c", code).stdout.strip() == str(["snakesim_hal", "snakesim_testing.contract", PLUGIN])
+    assert python("-c", code).stdout.strip() == str(["snakesim_testing", "snakesim_testing.contract", PLUGIN])

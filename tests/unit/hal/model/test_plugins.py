@@ -145,13 +145,15 @@ def test_a_plugin_without_settings_is_told_to_state_them() -> None:
 # --- who may import whom ---------------------------------------------------------------------------------------
 
 LINTER = Path(sys.executable).parent / "lint-imports"
-NEIGHBOURS = "Everything stands on the HAL"
-HAL, OPERATOR, CAN = "The rooms of the HAL", "The rooms of the operator's tools", "The rooms of the CAN backend"
+NEIGHBORS = "Packages: each imports only packages below it"
+HAL = "Subpackages of the HAL"
+OPERATOR = "Subpackages of the operator package"
+CAN = "Subpackages of the CAN backend"
 PURE = "What keeps a robot safe is pure"
 WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_gnc", "mujoco", "Only the simulator runs MuJoCo"),
-    ("snakesim_gnc", "snakesim_sim_backend.model", NEIGHBOURS),
-    ("snakesim_hal/host", "snakesim_gnc.guidance.service", NEIGHBOURS),
+    ("snakesim_gnc", "snakesim_sim_backend.model", NEIGHBORS),
+    ("snakesim_hal/host", "snakesim_gnc.guidance.service", NEIGHBORS),
     ("snakesim_operator/run", "zenoh", "Only the HAL's network room talks Zenoh"),
     ("snakesim_hal/host", "zenoh", "Only the HAL's network room talks Zenoh"),
     ("snakesim_gnc", "can", "Only the CAN backend touches CAN"),
@@ -164,8 +166,8 @@ WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_hal/faults", "snakesim_hal.host.host", HAL),
     ("snakesim_hal/host", "snakesim_hal.programs.service_program", HAL),
     ("snakesim_hal/faults", "snakesim_hal.service", HAL),
-    ("snakesim_operator/results", "snakesim_operator.base.targets", OPERATOR),
-    ("snakesim_operator/tools", "snakesim_operator.run.supervisor", OPERATOR),
+    ("snakesim_operator/results", "snakesim_operator.robot_commands.status", OPERATOR),
+    ("snakesim_operator/robot_commands", "snakesim_operator.run.supervisor", OPERATOR),
     ("snakesim_operator/run", "snakesim_operator.cli", OPERATOR),
     ("snakesim_can_backend/protocol", "snakesim_can_backend.settings", CAN),
     ("snakesim_can_backend/bus", "snakesim_can_backend.twin.chain", CAN),
