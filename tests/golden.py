@@ -25,7 +25,8 @@ def main() -> int:
     measured = arithmetic.measured()
     if differing := arithmetic.foreign(measured):
         print(
-            f"{' and '.join(differing)} of this computer round otherwise than COMMON in snakesim_hal/base/arithmetic.py."
+            f"{' and '.join(differing)} of this computer round otherwise than COMMON in "
+            "snakesim_hal/base/arithmetic.py."
         )
         print("If the lock has another NumPy now, change it there, and try again:", json.dumps(measured, indent=4))
         return 1

@@ -1,7 +1,7 @@
 """Injected faults of a module twin: those faults of a joint that a module can have.
 
-The vocabulary is that of `snakesim_hal.model.fault_kinds`, with times since the twins were started: `mute:joint_3@2.0-3.5` is a
-module that sends nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
+The vocabulary is that of `snakesim_hal.model.fault_kinds`, with times since the twins were started:
+`mute:joint_3@2.0-3.5` is a module that sends nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
 """
 
 import re

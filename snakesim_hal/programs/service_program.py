@@ -1,5 +1,6 @@
-"""A service as a program: `snakesim service NAME SCENARIO`, and with the same arguments `python -m snakesim_hal.programs.service_program`.
+"""A service as a program: `snakesim service NAME SCENARIO`.
 
+`python -m snakesim_hal.programs.service_program` takes the same arguments.
 It needs only the scenario, and how to reach the network. It waits for the network and for the robot, says so, and meets
 whatever host comes next: so services and hosts start in any order, on any machine, and again at will.
 """

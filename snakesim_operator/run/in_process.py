@@ -109,8 +109,8 @@ def simulate(
     Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
-    the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before the
-    first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest may
+    the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before
+    the first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest may
     be its computer's own (`summary.own_arithmetic`).
     """
     if not isinstance(config, RunConfig):
