@@ -1,6 +1,6 @@
 # What a contributor does, and what CI does. `make` alone lists it.
 #   PYTHON=python3.12   the interpreter that `make setup` builds on
-#   ARGS="-k gate"      further arguments for demo, test and bench
+#   ARGS="-k limiter"      further arguments for demo, test and bench
 #   QUICK=      takes the slow tests in
 #   WORKERS=1           how many tests run side by side (3)
 #   UPGRADE=1           lets `make lock` take the newest versions allowed
@@ -35,9 +35,9 @@ help: ## List these targets
 setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 
 demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, with a page to watch it
-	$(bin)/snakesim run peg_row --controller obstacle_aided --console --pace realtime --duration 10 --out runs/demo $(ARGS)
+	$(bin)/snakesim run peg_row --controller obstacle_aided --console --clock-mode realtime --duration 10 --out runs/demo $(ARGS)
 	@printf '%s\n' 'Next:' '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
-	  '  $(bin)/snakesim run triplet --console --pace realtime      the paper'\''s case study: one joint at a time pushes' \
+	  '  $(bin)/snakesim run triplet --console --clock-mode realtime      the paper'\''s case study: one joint at a time pushes' \
 	  '  docs/tutorial.md, 3: write a controller                       push it your way'
 
 test: test-here test-vcan ## Run the tests, but for those that are slow
@@ -45,7 +45,7 @@ test: test-here test-vcan ## Run the tests, but for those that are slow
 test-all: ## Run all tests, as before a release
 	SNAKESIM_HYPOTHESIS=explore $(MAKE) test-here test-vcan QUICK=
 
-test-here: compiled ## Run the tests that need no CAN bus (ARGS="-k gate")
+test-here: compiled ## Run the tests that need no CAN bus (ARGS="-k limiter")
 	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)
 
 test-vcan: compiled ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet, openings)

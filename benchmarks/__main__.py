@@ -96,7 +96,7 @@ def tell_bus(say: Callable[[str], None]) -> None:
     say(f"\nA saturated bus, {FULLEST_FRAMES_PER_S:.0f} frames/s, takes {share:.1%} of one core (half of one allowed).")
     took = cycle()
     say(
-        f"Control cycle at 100 Hz, 13 joints: a command is ready, and its first set-point is on the bus "
+        f"Control cycle at 100 Hz, 13 joints: a command is ready, and its first setpoint is on the bus "
         f"{took.command_to_first_ms[0]:.2f} ms later (p99 {took.command_to_first_ms[1]:.2f}), its last "
         f"{took.command_to_last_ms[0]:.2f} ms (p99 {took.command_to_last_ms[1]:.2f}). Sync is off its period by "
         f"{took.sync_jitter_ms[0]:.3f} ms (p99 {took.sync_jitter_ms[1]:.3f}).\n"

@@ -1,6 +1,6 @@
 """The control cycle on the bus, in real time: how soon a command is on it, and how regular Sync is.
 
-A whole run as a user starts it, with twins on a virtual bus in the driver's process. Its candump log says when each
+A whole run as a user starts it, with emulators on a virtual bus in the driver's process. Its candump log says when each
 frame went out, and the controller writes down when it had each command ready.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.whole import run
 from snakesim_can_backend.bus.load import MAX_LOAD, Reports, load
 from snakesim_can_backend.protocol.definitions import Opcode, opcode_of
-from tests.unit.can_backend.twin.rig import run_at
+from tests.unit.can_backend.emulator.rig import run_at
 
 WARM_UP = 100  # cycles
 RATE_HZ = 100
@@ -34,7 +34,7 @@ def cycle() -> Cycle:
     with tempfile.TemporaryDirectory() as folder:
         log, stamps = Path(folder, "bus.log"), Path(folder, "commands.txt")
         run(
-            *("--backend", "can", "--pace", "realtime", "--duration", "10"),
+            *("--backend", "can", "--clock-mode", "realtime", "--duration", "10"),
             *("--set", f"rate_hz={RATE_HZ}", "--set", f"backend.log={log}"),
             *("--controller", "benchmarks/stamped.py:Stamped", "--set", f"control.path={stamps}"),
         )
@@ -48,7 +48,7 @@ def cycle() -> Cycle:
 
 
 def _frames(log: Path) -> tuple[np.ndarray, list[tuple[float, float]]]:
-    """When each Sync went out, and first and last set-point between two Syncs."""
+    """When each Sync went out, and first and last setpoint between two Syncs."""
     syncs: list[float] = []
     bursts: list[tuple[float, float]] = []
     first = last = 0.0
@@ -66,7 +66,7 @@ def _frames(log: Path) -> tuple[np.ndarray, list[tuple[float, float]]]:
 
 
 def load_table() -> list[str]:
-    """Load of one bus, computed and measured by the twins' model of bus time, as rows of a Markdown table."""
+    """Load of one bus, computed and measured by the emulators' model of bus time, as rows of a Markdown table."""
     rows = [
         "| joints | rate | computed, worst case | measured | apart | the driver |",
         "|---|---|---|---|---|---|",

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.physics import open_simulator
 from snakesim.environments import SnakeEnv
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.model.scenario import load
 from snakesim_hal.wire.messages import Mode
 
@@ -61,14 +61,14 @@ def environment(scenario: str, **more: Any) -> Step:
 
 
 def physics(scenario: str, *, ground: bool) -> Step:
-    """The same without sensors, gate and rewards. ground: with our law of flat ground, else `mj_step` alone."""
+    """The same without sensors, limiter and rewards. ground: with our law of flat ground, else `mj_step` alone."""
     config = load(scenario).config
     backend, joints = open_simulator(config), config.robot.chain.modules
     modes, full_nm = [Mode.POSITION] * joints, [config.robot.limits.torque_nm] * joints
     wave, steps = Wave(joints), backend.sim.steps_per_tick
 
     def step() -> None:
-        backend.enact(SetPoints(modes, wave.next().tolist(), full_nm), "armed")
+        backend.enact(Setpoints(modes, wave.next().tolist(), full_nm), "armed")
         for _ in range(SKIP):
             if ground:
                 backend.physics.step(steps)
@@ -193,12 +193,12 @@ def main() -> int:
 
     say("# Environments: steps per second\n")
     say(ABOUT.format(machine=platform.machine(), python=platform.python_version()))
-    one, two = "steps per CPU s | without gate | physics | bare", "vector of 8, per CPU s | per s"
+    one, two = "steps per CPU s | without limiter | physics | bare", "vector of 8, per CPU s | per s"
     say(f"| scenario | {one} | of physics | of bare | {two} | of physics | of bare |")
     say("|---|---|---|---|---|---|---|---|---|---|---|")
     for scenario in SCENARIOS:
         say(row(scenario))
-    say("\nPer degree of freedom, beside Gymnasium's swimmer (no gate, noise, obstacles or motors), per CPU s:\n")
+    say("\nPer degree of freedom, beside Gymnasium's swimmer (no limiter, noise, obstacles or motors), per CPU s:\n")
     columns = "degrees of freedom | steps | physics steps in each | 1000 physics steps x freedoms | robot s x freedoms"
     say(f"| environment | {columns} |")
     say("|---|---|---|---|---|---|")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.session import Link, Publisher, Session, open_session
@@ -41,7 +41,7 @@ class Publishing:
 
     def put(self, tick: int, samples: Samples) -> None:
         """Publish every sample and the clock."""
-        now = clock(tick, arming=1, pace="free", newest=dict.fromkeys(samples.others, tick))
+        now = clock(tick, arm_session=1, clock_mode="free", newest=dict.fromkeys(samples.others, tick))
         for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, now)):
             if key not in self._publishers:
                 self._publishers[key] = self._session.publisher(key, type(message))  # pyright: ignore
@@ -54,8 +54,8 @@ class BareLoop:
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
 
-    def tick_us(self, points: Sequence[SetPoints]) -> float:
-        """Mean time of a control period over these set-points; handing them over is not counted."""
+    def tick_us(self, points: Sequence[Setpoints]) -> float:
+        """Mean time of a control period over these setpoints; handing them over is not counted."""
         physics, steps = self._backend.physics, self._backend.sim.steps_per_tick
         spent = 0.0
         for now in points:
@@ -65,7 +65,7 @@ class BareLoop:
             spent += time.perf_counter() - begin
         return spent / len(points) * 1e6
 
-    def mujoco_us(self, points: Sequence[SetPoints]) -> float:
+    def mujoco_us(self, points: Sequence[Setpoints]) -> float:
         """The same for `mj_step`, from the states of that motion: without ground and friction, which are ours."""
         model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
         whole = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -83,12 +83,12 @@ class BareLoop:
         return spent / len(points) * 1e6
 
 
-def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
-    """Every set-point of a run of the scenario, and the mean µs of the controller alone; all in this process."""
+def motion(config: RunConfig) -> tuple[list[Setpoints], float]:
+    """Every setpoint of a run of the scenario, and the mean µs of the controller alone; all in this process."""
     whole = run_in_process(config)
     limits = [joint.torque_limit_nm for joint in whole.record.description.joints]
     points = [
-        SetPoints([Mode(code) for code in mode], target, limits)
+        Setpoints([Mode(code) for code in mode], target, limits)
         for mode, target in zip(whole.record.mode.tolist(), whole.record.target.tolist(), strict=True)
     ]
     return points, sum(whole.update_us) / len(whole.update_us)

@@ -32,7 +32,9 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
 
 def lockstep_tick_us(timestep_s: str, *more: str) -> float:
     """Wall time of one tick of a whole lockstep run with guidance, navigation, control and recorder as processes."""
-    summary = run("--pace", "lockstep", "--duration", "10", "--set", f"backends.sim.timestep_s={timestep_s}", *more)
+    summary = run(
+        "--clock-mode", "lockstep", "--duration", "10", "--set", f"backends.sim.timestep_s={timestep_s}", *more
+    )
     return summary.wall_s / summary.ticks * 1e6
 
 
@@ -41,7 +43,7 @@ BESIDE = ("--set", "services.control.place=host")
 
 def latency_us(*arguments: str) -> float:
     """State published to command received, median, in real time."""
-    found = run("--pace", "realtime", "--duration", "5", *arguments).state_to_command_us["p50"]
+    found = run("--clock-mode", "realtime", "--duration", "5", *arguments).state_to_command_us["p50"]
     assert found is not None
     return found
 
@@ -51,7 +53,7 @@ def highest_rate_hz(*arguments: str) -> tuple[int, dict[int, float]]:
     shares: dict[int, float] = {}
     best = 0
     for rate in RATES_HZ:
-        summary = run("--pace", "realtime", "--duration", "3", "--set", f"rate_hz={rate}", *arguments)
+        summary = run("--clock-mode", "realtime", "--duration", "3", "--set", f"rate_hz={rate}", *arguments)
         shares[rate] = summary.answered_fraction or 0.0
         if shares[rate] < 0.99:
             break

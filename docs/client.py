@@ -34,7 +34,7 @@ def command(turn_rad=0.0):
     """At the next clock, the last sample of a tick, answer the newest joint state."""
     clock = newest(clocks)
     state.update(newest(joints, known=state))
-    answers = {"tick": state["tick"], "arming": clock["arming"], "sequence": time.monotonic_ns()}
+    answers = {"tick": state["tick"], "arm_session": clock["arm_session"], "sequence": time.monotonic_ns()}
     target = [*start[:number], start[number] + turn_rad, *start[number + 1 :]]
     payload = msgpack.packb({**rights, **answers, "mode": [1] * len(target), "target": target})  # mode 1: rad
     session.put("actuator/joints", payload, encoding=FORM.format("JointCommand"), congestion_control=BLOCK)

@@ -34,7 +34,7 @@ class Sonar:
         cone = np.stack([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)], -1)
         self._rays = Rays(self._mount, scope, cone, sensor.range_max_m)
 
-    def read(self, tick, stamp_ns):
+    def read(self, tick, timestamp_ns):
         sensor = self._sensor
         echoes = self._rays.cast()
         echoes = echoes[(echoes >= sensor.range_min_m) & (echoes <= sensor.range_max_m)]
@@ -43,7 +43,7 @@ class Sonar:
             nearest = max(float(echoes.min() + sensor.noise_m * self._noise.standard_normal()), 0.0)
         return Ranges(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=self._mount.link,
             position_l=self._mount.position_l,
             orientation_l_wxyz=self._mount.orientation_l_wxyz,

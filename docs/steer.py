@@ -14,9 +14,9 @@ LINK = {"mode": "client", "connect": {"endpoints": [ENDPOINT]}, "namespace": ROB
 with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
     clocks, until = session.declare_subscriber("hal/clock", zenoh.handlers.RingChannel(1)), time.monotonic() + 5
     while time.monotonic() < until:
-        now_ns = msgpack.unpackb(clocks.recv().payload.to_bytes())["stamp_ns"]
+        now_ns = msgpack.unpackb(clocks.recv().payload.to_bytes())["timestamp_ns"]
         wish = {
-            "stamp_ns": now_ns,
+            "timestamp_ns": now_ns,
             "who": "steer.py",
             "speed_m_s": 0.1,
             "heading_w_rad": 0.3,

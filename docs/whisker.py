@@ -56,17 +56,17 @@ class WhiskerModel:
         fan = np.stack([np.cos(self._bends_rad), np.sin(self._bends_rad), np.zeros(2 * STEPS + 1)], -1)
         self._rays = Rays(self._mount, scope, fan * settings.length_m, 1.0)
 
-    def read(self, tick, stamp_ns):
-        most_rad = self._settings.bend_max_rad
+    def read(self, tick, timestamp_ns):
+        upper_rad = self._settings.bend_max_rad
         free = np.flatnonzero(self._rays.cast() >= 1.0)  # in lengths of the hair
-        bend_rad = self._bends_rad[free[0]] if len(free) else math.copysign(most_rad, self._bends_rad[1])
+        bend_rad = self._bends_rad[free[0]] if len(free) else math.copysign(upper_rad, self._bends_rad[1])
         bend_rad += self._settings.noise_rad * self._noise.standard_normal()
         return Whisker(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=self._mount.link,
             position_l=self._mount.position_l,
             orientation_l_wxyz=self._mount.orientation_l_wxyz,
-            bend_rad=float(np.clip(bend_rad, -most_rad, most_rad)),
-            bend_max_rad=most_rad,
+            bend_rad=float(np.clip(bend_rad, -upper_rad, upper_rad)),
+            bend_max_rad=upper_rad,
         )

@@ -13,7 +13,7 @@ SCENARIO = sys.argv[3] if len(sys.argv) > 3 else "triplet"
 HIDDEN_NM = float(sys.argv[4]) if len(sys.argv) > 4 else 0.0  # friction of each gear that no file says
 HIDDEN = {f"backend.mounted.joint_{i}.friction_nm": HIDDEN_NM for i in range(1, 14) if HIDDEN_NM}
 NO_FORCES = {"robot.sensors.contacts": None}
-NO_POSE = {"mission.localisation": "dead_reckoning"}
+NO_POSE = {"mission.localization": "dead_reckoning"}
 BARE = {**NO_FORCES, "robot.sensors.imu": None, **NO_POSE}
 ROWS = (
     ("can", "forces, IMUs, motion capture", {}),

@@ -29,13 +29,17 @@ def _plain(value: Any) -> Any:
 
 def checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
     """The configuration of a run, for which everything is there. Raises ConfigError."""
-    pace = next((override for override in overrides if override.key == "pace"), None)
-    if pace is None and not processes:  # the only one there is in one process
-        overrides = [*overrides, Override("pace", "lockstep", "one process")]
+    clock_mode = next((override for override in overrides if override.key == "clock_mode"), None)
+    if clock_mode is None and not processes:  # the only one there is in one process
+        overrides = [*overrides, Override("clock_mode", "lockstep", "one process")]
     loaded = load(scenario, overrides)
-    if pace is not None and not processes and loaded.config.pace != "lockstep":
-        raise ConfigError(f"{pace.flag}: in one process the pace is lockstep; leave it out, or add processes=True")
+    if clock_mode is not None and not processes and loaded.config.clock_mode != "lockstep":
+        raise ConfigError(
+            f"{clock_mode.flag}: in one process the clock mode is lockstep; leave it out, or add processes=True"
+        )
     config = check_plugins(loaded.config, loaded.table)
-    if pace is not None and config.pace != pace.value:
-        raise ConfigError(f"{pace.flag}: backend {config.backend!r} cannot keep this pace, only {config.pace}")
+    if clock_mode is not None and config.clock_mode != clock_mode.value:
+        raise ConfigError(
+            f"{clock_mode.flag}: backend {config.backend!r} cannot keep this clock mode, only {config.clock_mode}"
+        )
     return config

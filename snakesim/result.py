@@ -75,7 +75,7 @@ class Result:
 
     @property
     def digest(self) -> str:
-        """Hash of every set-point as applied: the same for the same run, to the bit."""
+        """Hash of every setpoint as applied: the same for the same run, to the bit."""
         return self.summary.command_digest
 
     @property

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from snakesim_gnc.control.controller import positions
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, did_you_mean
 from snakesim_hal.base.process import user_name
 from snakesim_hal.network.commanding import READ, Commanding
@@ -145,11 +145,11 @@ class Robot:
     @property
     def time_s(self) -> float:
         """Robot time of the tick at hand, or of the newest one."""
-        return self._clock.stamp_ns * 1e-9
+        return self._clock.timestamp_ns * 1e-9
 
     def age_s(self, message: Any) -> float:
         """How old a reading is, in robot time."""
-        return self.time_s - message.stamp_ns * 1e-9
+        return self.time_s - message.timestamp_ns * 1e-9
 
     def read(self, key: str) -> Any:
         """The newest message at a key, such as "sensor/imu"; None when there is none.
@@ -174,14 +174,14 @@ class Robot:
         if self._armed and clock.lifecycle != "armed":
             self._armed = False
             raise RefusedError(f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.why}")
-        return clock.stamp_ns * 1e-9
+        return clock.timestamp_ns * 1e-9
 
-    def command(self, angles_rad: Sequence[float] | SetPoints) -> None:
-        """Command every joint, tail to head, in this tick: angles, or `SetPoints` with modes and torque limits.
+    def command(self, angles_rad: Sequence[float] | Setpoints) -> None:
+        """Command every joint, tail to head, in this tick: angles, or `Setpoints` with modes and torque limits.
 
         Raises ConfigError for what is no such command, RefusedError without the right to command.
         """
-        points = angles_rad if isinstance(angles_rad, SetPoints) else positions(self.description, list(angles_rad))
+        points = angles_rad if isinstance(angles_rad, Setpoints) else positions(self.description, list(angles_rad))
         count = len(self.names)
         for what, values in (("target", points.target), ("torque_limit_nm", points.torque_limit_nm)):
             wanted = f"{what} is {values!r:.80}, must be {count} finite numbers, tail to head"
@@ -198,9 +198,9 @@ class Robot:
         """
         control = self._commanding()
         control.turn_until(lambda: self.status.ready_to_arm, READY_S, lambda: f"not armed: {self.status.why}")
-        before = self._clock.arming
+        before = self._clock.arm_session
         self._ask(request_to_arm(self.description, user_name(), unchecked=unchecked), "armed")
-        control.turn_until(lambda: self._clock.arming > before, READY_S, lambda: f"not armed: {self.status.why}")
+        control.turn_until(lambda: self._clock.arm_session > before, READY_S, lambda: f"not armed: {self.status.why}")
         if self._clock.lifecycle != "armed":
             raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")
         self._armed = True
@@ -240,7 +240,7 @@ class Robot:
     def record(self, path: str | os.PathLike[str]) -> Iterator[Path]:
         """Record everything that the robot publishes into an MCAP file. Raises ConfigError for one that exists."""
         ended, heard = threading.Event(), threading.Event()
-        link = replace(self._link, largest_bytes=MAX_IMAGE_BYTES)
+        link = replace(self._link, max_bytes=MAX_IMAGE_BYTES)
         with ThreadPoolExecutor(1) as beside:
             recording = beside.submit(record, link, Path(path), lambda: not ended.is_set(), lambda *_: heard.set())
             try:
@@ -256,7 +256,7 @@ class Robot:
 
     def _commanding(self) -> Commanding:
         if self._control is None:
-            self._control = Commanding(self._session, self.description, self.status.pace)
+            self._control = Commanding(self._session, self.description, self.status.clock_mode)
         return self._control
 
     def _ask(self, request: LifecycleRequest, done: str) -> None:
@@ -281,7 +281,7 @@ class Robot:
             if time.monotonic() > deadline:
                 raise StalledError(f"no tick of {self._link.namespace} for {SILENCE_S:g} s")
             time.sleep(LOOK_S)
-        return clock.stamp_ns * 1e-9
+        return clock.timestamp_ns * 1e-9
 
     def _present(self, key: str, message: type[Message]) -> Any:
         """The newest message of a key that every robot writes. Raises NotConnectedError."""

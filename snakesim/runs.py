@@ -38,7 +38,8 @@ def run(
 
     scenario: shipped name, or path of a scenario or of a run's config.json. duration: s of robot time. set: any other
     value by its dotted key, as `--set` takes them. out: folder for what `snakesim run` leaves; None keeps nothing.
-    processes: host and services in processes of their own, at any pace; a backend that moves a real robot needs it.
+    processes: host and services in processes of their own, at any clock mode; a backend that moves a real robot needs
+    it.
 
     Raises ConfigError for wrong input, before anything runs; ControllerError when the controller raises, or answers
     what is not allowed; SnakesimError when a run cannot begin.

@@ -3,7 +3,7 @@
 `protocol`   ids, states, parameters, and the codec that reads the DBC file in `schemas/can`, the source of every layout
 `settings`   the schema of a scenario's [backends.can] section
 `bus`        one CAN bus: SocketCAN, or python-can's virtual bus where the kernel has no CAN
-`twin`       emulated modules: the firmware's behaviour on a real bus, with any plant driven by the motors
+`emulator`       emulated modules: the firmware's behavior on a real bus, with any physics model driven by the motors
 `driver`     CanBackend, the entry point `can`: samples, enacts and advances, tick by tick
 `can_command` is `snakesim can`
 

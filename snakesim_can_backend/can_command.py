@@ -130,7 +130,7 @@ def one(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
     for name, bus in zip(settings.channels or ["one bus"], buses, strict=True):
         lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *arithmetic(*bus)]
         busiest_ms = 1e3 * busiest_s(*bus)
-        lines.append(f"  Sync, answers, forces and set-points of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
+        lines.append(f"  Sync, answers, forces and setpoints of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
     if all(fits(*bus) for bus in buses):
         return lines, True
     return [*lines, f"Refused. {what_fits([joints for joints, _ in buses], config, settings)}"], False

@@ -21,31 +21,33 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
     # Buses, tail to head: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can, such as
-    # slcan:/dev/ttyACM0. Empty: a virtual bus in this process, with module twins on it.
+    # slcan:/dev/ttyACM0. Empty: a virtual bus in this process, with emulated joint modules on it.
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
     # Of the buses: loads are computed for it, and adapters set to it. A kernel interface has that of `ip link`.
     bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
     # Number of joints of each channel, tail to head. Empty: distributed evenly.
     joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
-    # Where module twins run: `here` (virtual bus), as a `process` that this one starts, or `none`: real modules, or
-    # `snakesim modules` in another terminal. Default: `here` without channels, `none` with them.
-    twins: Literal["here", "process", "none"] | None = None
-    plant: str = "mujoco"  # body that the twins' motors move: an entry point in the group `snakesim.plants`
-    plant_settings: dict[str, Any] = {}
-    # Of the twins: joint -> how its module is mounted in truth, to see what a wrong robot file does.
+    # Where emulated joint modules run: `here` (virtual bus), as a `process` that this one starts, or `none`: real
+    # modules, or `snakesim modules` in another terminal. Default: `here` without channels, `none` with them.
+    emulators: Literal["here", "process", "none"] | None = None
+    physics_model: str = (
+        "mujoco"  # body that the emulators' motors move: an entry point in the group `snakesim.physics_models`
+    )
+    physics_model_settings: dict[str, Any] = {}
+    # Of the emulators: joint -> how its module is mounted in truth, to see what a wrong robot file does.
     mounted: dict[str, MountedModule] = {}
-    faults: list[str] = []  # of the twins, such as "mute:joint_3@2"; `snakesim modules --help` lists them
+    faults: list[str] = []  # of the emulators, such as "mute:joint_3@2"; `snakesim modules --help` lists them
     contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # default: the robot file's
     imu_rate_hz: Annotated[float, from_zero(1e4, "Hz")] = 5.0
     watchdog_s: Annotated[float, Meta(ge=0.02, le=0.1, extra_json_schema={"unit": "s"})] = 0.1
     # Time limit for discovery and parameters of the modules.
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    # UDP address for the base's pose from motion capture: HOST:PORT. Port 0: known only to own twins.
-    # Default: "127.0.0.1:0" with own twins, none otherwise.
+    # UDP address for the base's pose from motion capture: HOST:PORT. Port 0: known only to own emulators.
+    # Default: "127.0.0.1:0" with own emulators, none otherwise.
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None
     log: str = ""  # candump file of all frames sent and received; empty: none
 
     @property
-    def twins_run(self) -> Literal["here", "process", "none"]:
-        """Where the module twins run."""
-        return self.twins or ("none" if self.channels else "here")
+    def emulators_run(self) -> Literal["here", "process", "none"]:
+        """Where the emulated joint modules run."""
+        return self.emulators or ("none" if self.channels else "here")

@@ -1,6 +1,6 @@
 """The interface of a backend.
 
-A backend is opened from the run's settings, asked for samples once a tick, given set-points once a tick, and advanced
+A backend is opened from the run's settings, asked for samples once a tick, given setpoints once a tick, and advanced
 by one period at a time. It never sees Zenoh or leases: the host handles those, for every backend alike.
 """
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import msgspec
 
-from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Message, Mode, Pace
+from snakesim_hal.wire.messages import ClockMode, Description, Fault, JointState, LifecycleState, Message, Mode
 
 if TYPE_CHECKING:
     from snakesim_hal.model.fault_kinds import Injection
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SetPoints:
-    """Set-points of all joints from now on, tail to head; already inside every limit."""
+class Setpoints:
+    """Setpoints of all joints from now on, tail to head; already inside every limit."""
 
     mode: list[Mode]
     target: list[float]  # rad, rad/s or N·m, as the mode says
@@ -43,14 +43,14 @@ class Backend(Protocol):
         """The description of the robot; available right after opening."""
         ...
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Read every sensor that is due at `tick`. Raises BackendError when it has no valid state any more."""
         ...
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Hand set-points to the motors; they hold until the next call.
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+        """Hand setpoints to the motors; they hold until the next call.
 
-        The set-points are safe in every state, so a simulator needs no more. A robot whose modules have states of their
+        The setpoints are safe in every state, so a simulator needs no more. A robot whose modules have states of their
         own makes them follow `lifecycle`: armed on "armed", and stopped by itself on anything else.
         """
         ...
@@ -82,10 +82,10 @@ class BackendFactory(Protocol):
 
     Settings: type[msgspec.Struct]  # the scenario's [backends.<name>] section
 
-    def check(self, config: "RunConfig", settings: Any) -> tuple[Pace, ...]:
+    def check(self, config: "RunConfig", settings: Any) -> tuple[ClockMode, ...]:
         """The supported paces, the preferred one first; a real robot supports real time only. Opens nothing.
 
-        Raises ConfigError for a run that this backend does not support at any pace, so that nothing is started.
+        Raises ConfigError for a run that this backend does not support at any clock mode, so that nothing is started.
         """
         ...
 

@@ -69,7 +69,7 @@ class ServiceLoop:
         schedule = config.services.get(name, Schedule())
         self._who = f"service {schedule.code or name} (class {getattr(service_type, '__name__', service_type)})"
         self._module = service_type.__module__
-        self._client = client = Client(session, name, every_ticks=schedule.every_ticks, pace=config.pace)
+        self._client = client = Client(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
         with self._named("__init__"):
             self.service = service_type(client, config)
         robot = _met(client, goes_on)
@@ -83,7 +83,7 @@ class ServiceLoop:
         """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
         clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
-            self._faults.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+            self._faults.turn(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
         self._shown = show_process(self._session, self._entry)
         self._client.announce()
 
@@ -116,7 +116,7 @@ class ServiceLoop:
             with self._named("pause"):
                 self.service.pause(clock)
             return
-        self._faults.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        self._faults.turn(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
         robot = self._client.new_description()
         if robot is not None:
             with self._named("configure"):

@@ -179,7 +179,7 @@ class SerialWire:
         waiting.register(number, select.POLLIN)
         while said := waiting.poll(max(end_s - time.monotonic(), 0.0) * 1000):
             if said[0][1] & GONE:
-                raise OSError("hung up")
+                raise OSError("suspended up")
             if data := os.read(number, READ_BYTES):
                 return data
         return b""

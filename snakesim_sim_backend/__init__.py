@@ -1,7 +1,8 @@
 """MuJoCo behind the HAL: the simulated robot, with the same interface to controllers as the real one.
 
 `backend`    SimBackend: samples, enacts and advances, tick by tick; the entry point `sim`
-`plant`      MujocoPlant: the same body for joint modules that are emulated elsewhere; the entry point `mujoco`
+`physics_model`      MujocoPhysicsModel: the same body for joint modules that are emulated elsewhere; the entry point
+`mujoco`
 `settings`   the schema of the physics settings
 `model`      robot file + scene -> compiled MuJoCo model; `ground` and `obstacles` are its parts
 `start`      lays the snake on the ground and lets it come to rest

@@ -16,7 +16,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.joints import Joint
@@ -87,26 +87,26 @@ class Motors:
         self._slots = np.empty(0, dtype=np.intp)
         self.switch_off()
 
-    def enact(self, set_points: SetPoints) -> None:
-        """Take set-points, tail to head; they hold until the next call."""
-        if set_points.mode != self._mode:
-            self._change_modes(set_points.mode)
-        self._inputs[self._slots] = set_points.target
+    def enact(self, setpoints: Setpoints) -> None:
+        """Take setpoints, tail to head; they hold until the next call."""
+        if setpoints.mode != self._mode:
+            self._change_modes(setpoints.mode)
+        self._inputs[self._slots] = setpoints.target
         if self._passive:
             self._inputs[self._passive] = 0.0
-        if set_points.torque_limit_nm != self._limit_asked:
-            self._limit_asked = list(set_points.torque_limit_nm)
+        if setpoints.torque_limit_nm != self._limit_asked:
+            self._limit_asked = list(setpoints.torque_limit_nm)
             self._bound()
 
-    def derate(self, share_left: Floats) -> None:
+    def derate(self, remaining_fraction: Floats) -> None:
         """Derate each joint's own limit to this share, (n_joints,), whatever a command allows."""
-        self._own_limit = self._full_limit * share_left
+        self._own_limit = self._full_limit * remaining_fraction
         self._bound()
 
     def switch_off(self) -> None:
         """All joints passive."""
         zeros = [0.0] * self.count
-        self.enact(SetPoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
+        self.enact(Setpoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
 
     def before_steps(self) -> None:
         """Once a tick: apply a lowered limit as fast as the motor can follow, and end wind-up above it."""
@@ -137,7 +137,7 @@ class Motors:
     def _change_modes(self, modes: list[Mode]) -> None:
         for gains, mode, name in zip(self._gains_of_mode, modes, self._names, strict=True):
             if mode not in gains:
-                raise BackendError(f"{name} was given a set-point in {mode.name.lower()} mode, which its drive lacks")
+                raise BackendError(f"{name} was given a setpoint in {mode.name.lower()} mode, which its drive lacks")
         self._mode = list(modes)
         self._gains[:, [KP, KD, MAX_VOLTS]] = [
             gains[mode] for gains, mode in zip(self._gains_of_mode, modes, strict=True)

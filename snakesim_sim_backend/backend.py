@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.fault_plan import check_backend_can
@@ -13,7 +13,7 @@ from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.physics.thermal import Thermal
-from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
+from snakesim_hal.wire.messages import ClockMode, Description, Fault, LifecycleState
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
@@ -37,7 +37,7 @@ class SimBackend:
     Settings = SimSettings
 
     @staticmethod
-    def check(config: RunConfig, _settings: SimSettings) -> tuple[Pace, ...]:
+    def check(config: RunConfig, _settings: SimSettings) -> tuple[ClockMode, ...]:
         """Simulated time supports all paces. Raises ConfigError."""
         check_gains(config.robot)
         check_models(config.robot)
@@ -88,18 +88,18 @@ class SimBackend:
         """The robot of the robot file."""
         return self._description
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Sensor samples at `tick`; after a divergence, of the last good state."""
         if not self._open:
             raise BackendError(CLOSED)
-        return self._sensors.sample(tick, stamp_ns)
+        return self._sensors.sample(tick, timestamp_ns)
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Give the motors new set-points. While disarmed they are off, whatever the set-points."""
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+        """Give the motors new setpoints. While disarmed they are off, whatever the setpoints."""
         if lifecycle in OFF:
             self._motors.switch_off()
         else:
-            self._motors.enact(set_points)
+            self._motors.enact(setpoints)
 
     def advance(self) -> None:
         """Step the physics through one control period. Raises BackendError when it has diverged."""
@@ -118,8 +118,8 @@ class SimBackend:
             raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
         if self._heats:  # from the torque of the last step: windings are slow
             self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
-            if (share_left := self._windings.share_left()) is not None:
-                self._motors.derate(share_left)
+            if (remaining_fraction := self._windings.remaining_fraction()) is not None:
+                self._motors.derate(remaining_fraction)
 
     def faults(self) -> list[Fault]:
         """Samples that came too late in real time; they stop nothing. A divergence is raised by `advance`."""

@@ -39,7 +39,7 @@ class Chain:
         self.push_links(np.array(sums).reshape(-1, 6).T)
 
     def push_links(self, wrenches: Floats) -> None:
-        """Collect moments about the centre of mass, and forces, (6, n_links)."""
+        """Collect moments about the center of mass, and forces, (6, n_links)."""
         self._wrenches = wrenches if self._wrenches is None else self._wrenches + wrenches
 
     def apply(self) -> None:

@@ -89,8 +89,8 @@ class DivergenceWatch:
 
     def _worst(self) -> str | None:
         """The greatest speed, or acceleration if that is nearer to its bound; None when they are NaN."""
-        share_v, share_a = np.abs(self._qvel) / MAX_SPEED, np.abs(self._qacc) / MAX_ACCELERATION
-        shares = np.maximum(share_v, share_a)
+        voltage_fraction, current_fraction = np.abs(self._qvel) / MAX_SPEED, np.abs(self._qacc) / MAX_ACCELERATION
+        shares = np.maximum(voltage_fraction, current_fraction)
         if not np.all(np.isfinite(shares)):
             return None
         dof = int(np.argmax(shares))

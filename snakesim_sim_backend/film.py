@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]  # (height, width, 3)
 
 AZIMUTH_DEG, ELEVATION_DEG = 60.0, -58.0
 MARKS = 400  # arrows and the like in a picture
-BLUE, ARROW_M = (0.0, 0.4, 0.75, 1.0), 0.012  # of arrows: colour and width
+BLUE, ARROW_M = (0.0, 0.4, 0.75, 1.0), 0.012  # of arrows: color and width
 BACKGROUND = (236, 240, 244)  # beyond the scene
 LINK, NEXT_LINK, HEAD = (0.20, 0.36, 0.54, 1.0), (0.30, 0.48, 0.68, 1.0), (0.09, 0.18, 0.33, 1.0)
 OBSTACLE, FLOOR, GRID = (0.80, 0.67, 0.47, 1.0), (0.90, 0.91, 0.93, 1.0), (0.62, 0.66, 0.72, 1.0)
@@ -44,7 +44,7 @@ class Film:
         view, quality = self._model.vis.global_, self._model.vis.quality
         view.offwidth, view.offheight, quality.offsamples = width, height, SAMPLES
         self._model.vis.headlight.ambient[:], self._model.vis.headlight.diffuse[:] = AMBIENT, HEADLIGHT
-        self._flat = config.scene.ground.uneven is None
+        self._flat = config.scene.ground.heightfield is None
         self._paint(config.robot.chain.modules)
         self._gl = opened_context(width, height, "the film")
         self._gl.make_current()
@@ -86,12 +86,12 @@ class Film:
         return np.flipud(picture)
 
     def _paint(self, joints: int) -> None:
-        """Colours of a film: the model's own are those that its colour cameras see."""
-        colours, first = self._model.geom_rgba, self._sim.first_link_body
-        colours[:], head = OBSTACLE, first + joints
+        """Colours of a film: the model's own are those that its color cameras see."""
+        colors, first = self._model.geom_rgba, self._sim.first_link_body
+        colors[:], head = OBSTACLE, first + joints
         for body in range(first, head + 1):
             shade = HEAD if body == head else (LINK, NEXT_LINK)[(body - first) % 2]
-            colours[self._model.geom_bodyid == body] = shade
+            colors[self._model.geom_bodyid == body] = shade
         for name in (GROUND,) if self._flat else (GROUND, HILLS):
             self._model.geom(name).rgba[:] = FLOOR
 

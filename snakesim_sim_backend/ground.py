@@ -11,13 +11,13 @@ from snakesim_sim_backend.surface import Skin
 GROUND, HILLS = "ground", "hills"
 GROUND_GROUP = 1  # MuJoCo geom group of everything that the snake may lie on, including steps
 PLANE_GROUP = 4  # of the plane: rays meet it by a formula of our own, see sensors/rays.py
-SAND = [0.76, 0.70, 0.58, 1.0]  # colour
+SAND = [0.76, 0.70, 0.58, 1.0]  # color
 DEPTH_M = 0.5  # of the height field below its lowest point
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, skin: Skin) -> list[str]:
     """Add the ground to a model. Returns the names of the geoms that have contacts: none, where it is flat."""
-    uneven = ground.uneven
+    uneven = ground.heightfield
     lowest = 0.0 if uneven is None else -uneven.height_m / 2
     plane: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 1], "pos": [0, 0, lowest]}
     if uneven is None:  # see flat_ground.py

@@ -4,7 +4,7 @@ import math
 
 import mujoco
 
-from snakesim_hal.physics.plant import LinkLoad
+from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.physics import Physics

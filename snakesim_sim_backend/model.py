@@ -36,7 +36,7 @@ from snakesim_sim_backend.yielding import FREEDOMS, check_yielding
 FREE_QPOS = 7  # of the base: position and quaternion
 CLAMP_KG = 1e6  # as rotor inertia and as damping, of all six degrees of freedom
 FOOT_GROUP = 3  # MuJoCo geom group of the feet, which are inside of the links' capsules
-ORANGE = [0.87, 0.45, 0.12, 1.0]  # colour of the robot
+ORANGE = [0.87, 0.45, 0.12, 1.0]  # color of the robot
 AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0]}
 
 
@@ -51,7 +51,7 @@ class SimModel:
     soles: Soles | None  # None: MuJoCo finds the contacts with the ground, which is not flat
     link_geoms: list[int]
     friction: Floats  # (ngeom,) of what a link touches
-    hung: bool  # its tail link is clamped
+    suspended: bool  # its tail link is clamped
     yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
 
 
@@ -83,7 +83,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         spec,
         skin=hard,
         body_radius_m=config.robot.module.radius_m,
-        hills_m=ground.uneven.height_m if ground.uneven else 0.0,
+        hills_m=ground.heightfield.height_m if ground.heightfield else 0.0,
         strike=bool(yielding),
     )
     rough = dict.fromkeys(add_ground(spec, ground, hard), ground.friction)
@@ -108,7 +108,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
     except ValueError as error:
         raise ConfigError(f"MuJoCo cannot build robot {config.robot.name!r} in this scene: {error}") from error
     first_link_body, soles = model.body("link_0").id, None
-    if ground.uneven is None:
+    if ground.heightfield is None:
         soles = soles_of(model, first_link_body, links, config.robot.module.radius_m, ground.friction)
     names = [model.geom(i).name for i in range(model.ngeom)]
     rough |= dict.fromkeys((f"link_{i}" for i in range(links)), settings.self_friction)
@@ -121,7 +121,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         soles=soles,
         link_geoms=[model.geom(f"link_{i}").id for i in range(links)],
         friction=np.array([rough.get(name, 0.0) for name in names]),
-        hung=settings.hung,
+        suspended=settings.suspended,
         yielding=yielding,
     )
 
@@ -146,7 +146,7 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, har
         body = body.add_body(name=f"link_{i}", pos=rear)
         if i == 0:
             # A clamp is more inertia and damping than the robot can move.
-            clamp = {"armature": CLAMP_KG, "damping": CLAMP_KG} if settings.hung else {}
+            clamp = {"armature": CLAMP_KG, "damping": CLAMP_KG} if settings.suspended else {}
             body.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_FREE, **clamp)
         else:
             _add_joint(body, joints[i - 1])
@@ -194,7 +194,7 @@ def _add_joint(body: mujoco.MjsBody, joint: Joint) -> None:
         type=mujoco.mjtJoint.mjJNT_HINGE,
         axis=AXES[joint.axis],
         limited=True,
-        range=[joint.limits.least_rad, joint.limits.most_rad],
+        range=[joint.limits.lower_rad, joint.limits.upper_rad],
         armature=motor.armature_kg_m2,
         damping=motor.viscous_nm_s_per_rad,
         frictionloss=motor.friction_nm,

@@ -15,7 +15,7 @@ from snakesim_sim_backend.yielding import AXES, mass_kg
 OBSTACLE = "obstacle:"
 STEP = "step:"
 OBSTACLE_GROUP = 2
-BLUE = [0.24, 0.42, 0.60, 1.0]  # colour
+BLUE = [0.24, 0.42, 0.60, 1.0]  # color
 LINKS, OBSTACLES = 1, 2  # bits of what a geom has contacts with
 
 

@@ -50,4 +50,4 @@ class SensorService(Service):
         self._data.qpos[3:FREE_QPOS] = np.asarray(pose.orientation_wxyz) / np.linalg.norm(pose.orientation_wxyz)
         of_joints(self._data, len(joints.angle_rad))[0][:] = joints.angle_rad
         mujoco.mj_kinematics(self._sim.model, self._data)
-        return [(key, reader.read(clock.tick, joints.stamp_ns)) for key, reader in self._readers]
+        return [(key, reader.read(clock.tick, joints.timestamp_ns)) for key, reader in self._readers]

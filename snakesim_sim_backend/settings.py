@@ -1,4 +1,4 @@
-"""The schema of the physics settings: a scenario's `[backends.sim]` section, and a plant's settings."""
+"""The schema of the physics settings: a scenario's `[backends.sim]` section, and a physics_model's settings."""
 
 from typing import Annotated
 
@@ -35,12 +35,12 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     motor_gain_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0
     # Longest time that the snake may take to come to rest before the run begins.
     settle_s: Annotated[float, from_zero(60, "s")] = 3.0
-    hung: bool = False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim identify`
+    suspended: bool = False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim identify`
     tether: Tether | None = None
 
 
-class PlantSettings(SimSettings, frozen=True, kw_only=True):
-    """The same for the physics under emulated joint modules, whose firmware sets the pace: one step at a time."""
+class PhysicsModelSettings(SimSettings, frozen=True, kw_only=True):
+    """The same for the physics under emulated joint modules, whose firmware sets the clock mode: one step at a time."""
 
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.001
 

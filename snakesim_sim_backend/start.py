@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
@@ -17,14 +17,14 @@ from snakesim_sim_backend.physics import Physics
 REST = 1e-3  # m/s and rad/s: slower is at rest
 REST_ROUNDS = 5
 ROUND_S = 0.01
-CLEAR_M = 0.2  # below the head of a hung robot
+CLEAR_M = 0.2  # below the head of a suspended robot
 GRIP = 2.0  # friction while settling, so that the snake stays in place
 
 
 def place_robot(
     sim: SimModel, data: mujoco.MjData, physics: Physics, config: RunConfig, motors: Motors, settle_s: float
 ) -> None:
-    """Put the snake at its start pose, at rest at time 0 with motors off; hung, its head is below its tail.
+    """Put the snake at its start pose, at rest at time 0 with motors off; suspended, its head is below its tail.
 
     It is placed above the highest ground under it and falls; the motors hold its start angles meanwhile. If it has
     not come to rest after `settle_s` it is stopped.
@@ -35,7 +35,7 @@ def place_robot(
     data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
     of_joints(data, motors.count)[0][:] = pose.angles_rad
     data.qpos[2] = highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
-    if sim.hung:
+    if sim.suspended:
         data.qpos[2] += config.robot.length_m + CLEAR_M
         yaw, down = quaternion_from_yaw(pose.yaw_rad), np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
         mujoco.mju_mulQuat(data.qpos[3:FREE_QPOS], np.array(yaw), down)
@@ -83,7 +83,7 @@ def _settle(
 ) -> None:
     count = motors.count
     limits = [joint.limits.torque_nm for joint in config.robot.joint_table]
-    motors.enact(SetPoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
+    motors.enact(Setpoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
     physics.grip(GRIP)
     steps = max(round(ROUND_S / model.opt.timestep), 1)
     at_rest = 0

@@ -104,7 +104,7 @@ def commissioning(arguments: str, file: str) -> Iterator[str]:
 @contextlib.contextmanager
 def live(arguments: str) -> Iterator[str]:
     """A run with its console, and the address."""
-    words = [*shlex.split(arguments), "--pace", "realtime", "--console"]
+    words = [*shlex.split(arguments), "--clock-mode", "realtime", "--console"]
     with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "run", *words) as run:
         yield run.console()
         run.process.terminate()

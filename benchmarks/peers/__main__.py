@@ -109,7 +109,7 @@ def _table(
         f"Printed by `make bench-peers`: state ({state_bytes} bytes) to another process and a command ({command_bytes} "
         f"bytes) back, 13 joints, {RATE_HZ} Hz, {ROUNDS} rounds, medians of {REPEATS} turns. Read the ratios, not the "
         "times. The others only echo. Ours is a run of the simulator: typed messages, five sensors and a clock, a "
-        "controller that holds the pose, lease, gate and all checks.",
+        "controller that holds the pose, lease, limiter and all checks.",
         "",
         "| loop | p50, µs | p99, µs | ours / this, p50 |",
         "|---|---|---|---|",
@@ -120,7 +120,7 @@ def _table(
 
 def _ours(scenario: str) -> Percentiles:
     """A run in real time: publishing to arrival of the command, and then its check and the decision."""
-    options = ("--pace", "realtime", "--duration", str(ROUNDS / RATE_HZ), "--controller", "hold")
+    options = ("--clock-mode", "realtime", "--duration", str(ROUNDS / RATE_HZ), "--controller", "hold")
     summary = run(*options, scenario=scenario)
     p50, p99 = (summary.state_to_command_us[name] or 0.0 for name in ("p50", "p99"))
     decided_us = _deciding_us()

@@ -9,7 +9,7 @@ import msgspec
 
 from snakesim_gnc.control.controller import Action, Controller, View
 from snakesim_gnc.control.service import SENSED
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
 from snakesim_hal.model.scenario import CONTROL, RunConfig
@@ -52,7 +52,7 @@ class AssistedRobot:
             self.newest: dict[str, Message] = {}
             self.limited: dict[int, str] = {}
             self._turn()
-            while not self._run.host.authority.arming:
+            while not self._run.host.authority.arm_session:
                 self._turn()
             self._opened = opening.pop_all()
 
@@ -118,11 +118,11 @@ def _corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:
 
         def update(self, view: View) -> Action:
             action = self._inner.update(view)
-            points = action.set_points
+            points = action.setpoints
             target = [
                 asked + by if by and mode is Mode.POSITION else asked  # by nothing: to the bit what was asked
                 for asked, by, mode in zip(points.target, residual_rad, points.mode, strict=True)
             ]
-            return Action(SetPoints(points.mode, target, points.torque_limit_nm), action.report)
+            return Action(Setpoints(points.mode, target, points.torque_limit_nm), action.report)
 
     return Corrected

@@ -1,4 +1,4 @@
-"""The environment: a scenario, an agent in the place of its controller, and the HAL's gate between agent and motors."""
+"""The environment: a scenario with an agent as its controller, and the HAL's limiter between agent and motors."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -63,8 +63,8 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         observe: parts of the observation, by name; flat: one vector of them, rather than a dict. reward: weights of
         terms. frame_skip: ticks of the robot in a step. duration: s of robot time until truncation. set: values by
         their dotted keys, as of `snakesim.run`. draw: keys whose number each seed has of its own, between two bounds.
-        new_field: each reset draws the scene's random fields anew. safe: the gate limits every command. residual_rad:
-        bound of a correction. width, height: of pictures, in pixels.
+        new_field: each reset draws the scene's random fields anew. safe: the limiter limits every command.
+        residual_rad: bound of a correction. width, height: of pictures, in pixels.
 
         Raises ConfigError for wrong input, in the words of the command.
         """
@@ -81,7 +81,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         overrides = overrides_of(set, duration_s=duration)
         if controller is not None:
             if not safe:
-                raise ConfigError(f"action={action!r}: a controller commands through the gate; leave safe=False out")
+                raise ConfigError(f"action={action!r}: a controller commands through the limiter; leave safe=False out")
             overrides.insert(0, Override("controller", controller, f"action={action}"))
         self._scenario, self._overrides, self._draws = os.fspath(scenario), overrides, draws_of(draw)
         self._scenario_config = self._drawn(0)
@@ -121,7 +121,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
     @property
     def digest(self) -> str:
-        """Hash of every set-point as applied in this episode: the same for the same seed and actions, to the bit."""
+        """Hash of every setpoint as applied in this episode: the same for the same seed and actions, to the bit."""
         return self._armed().digest
 
     def reset(
@@ -183,7 +183,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             self._film = find_plugin(FILMS, "mujoco")(self.config, *self._size)
         progress = self._observer.progress
         position_w, wxyz = (np.array(part) for part in progress.pose)
-        look_at_w = np.array([*progress.centre_w, progress.height_m])
+        look_at_w = np.array([*progress.center_w, progress.height_m])
         return self._film.picture(position_w, wxyz, np.array(robot.joints.angle_rad), look_at_w)
 
     def close(self) -> None:

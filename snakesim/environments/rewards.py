@@ -16,9 +16,9 @@ class Term:
 
 
 TERMS = {
-    "advance": Term(1.0, "m", "of the centre of mass towards the goal; without a goal along the first heading"),
+    "advance": Term(1.0, "m", "of the center of mass towards the goal; without a goal along the first heading"),
     "energy": Term(-0.005, "J", "sum over joints of |torque x velocity| over time"),
-    "limited": Term(-0.001, "1", "share of joints whose targets the gate changed, mean over the ticks of the step"),
+    "limited": Term(-0.001, "1", "share of joints whose targets the limiter changed, mean over the ticks of the step"),
     "goal": Term(1.0, "1", "1 in the step that reaches the goal"),
     "stopped": Term(-1.0, "1", "1 in the step in which the robot is stopped by a fault"),
 }

@@ -1,11 +1,11 @@
-"""A robot that is stepped tick by tick: a backend behind the gate of the HAL host, without host, services or network.
+"""A robot that is stepped tick by tick: a backend behind the HAL's limiter, without host, services or network.
 
 Lifecycle, lease, limits and the latency of commands are those of a run in lockstep, and so is the digest.
 """
 
 import msgspec
 
-from snakesim_hal.backend import Backend, Samples, SetPoints
+from snakesim_hal.backend import Backend, Samples, Setpoints
 from snakesim_hal.base.errors import BackendError, ConfigError, RefusedError
 from snakesim_hal.faults.allowed import Faults, faults_of_host
 from snakesim_hal.host.guarded_backend import GuardedBackend
@@ -38,7 +38,7 @@ class SteppedRobot:
     """A simulated robot, armed."""
 
     def __init__(self, config: RunConfig, *, safe: bool) -> None:
-        """safe: behind the gate; otherwise the motors get every target as it is, and nothing stops the robot.
+        """safe: behind the limiter; otherwise the motors get every target as it is, and nothing stops the robot.
 
         Raises ConfigError; RefusedError for a backend that moves something real, and when it cannot be armed.
         """
@@ -87,7 +87,7 @@ class SteppedRobot:
     @property
     def why(self) -> str:
         """Why it is in this state."""
-        return self._failed or ("no gate" if self._authority is None else self._authority.why)
+        return self._failed or ("no limiter" if self._authority is None else self._authority.why)
 
     @property
     def digest(self) -> str:
@@ -95,12 +95,12 @@ class SteppedRobot:
         return self._black_box.command_digest
 
     def step(self, mode: Mode, target: list[float]) -> None:
-        """One tick. A command for the present samples goes to the gate, as the host would do it in lockstep."""
+        """One tick. A command for the present samples goes to the limiter, as the host would do it in lockstep."""
         decision = self._decided([mode] * len(target), target)
         self.limited = decision.limited
         self._black_box.record(self._tick, self._tick * self._period_ns, self._samples, decision)
         try:
-            self._backend.enact(decision.set_points, self.lifecycle)
+            self._backend.enact(decision.setpoints, self.lifecycle)
             self._backend.advance()
             for fault in self._backend.faults():
                 self._fault(fault)
@@ -116,7 +116,7 @@ class SteppedRobot:
     def _decided(self, modes: list[Mode], target: list[float]) -> Decision:
         authority = self._authority
         if authority is None:
-            return Decision(SetPoints(modes, target, self._full_nm), None, {})
+            return Decision(Setpoints(modes, target, self._full_nm), None, {})
         if authority.state == "armed":
             self._offer(authority, modes, target)
         authority.expire(self._tick * self._period_ns, self._tick)
@@ -125,8 +125,8 @@ class SteppedRobot:
     def _sample(self) -> Samples:
         now_ns = self._tick * self._period_ns
         if self._faults is not None:
-            arming = 1 if self._authority is None else self._authority.arming
-            self._faults.turn(now_ns, arming, self.lifecycle)
+            arm_session = 1 if self._authority is None else self._authority.arm_session
+            self._faults.turn(now_ns, arm_session, self.lifecycle)
         samples = self._backend.sample(self._tick, now_ns)
         self.newest.update(samples.others)
         if self._authority is not None:
@@ -147,7 +147,7 @@ class SteppedRobot:
         self._sequence += 1
         command = JointCommand(
             tick=self._tick,
-            arming=authority.arming,
+            arm_session=authority.arm_session,
             sequence=self._sequence,
             lease_epoch=authority.lease.epoch,
             layout=self.description.layout,

@@ -2,7 +2,7 @@
 
     target = ramp (amplitude + x @ yielding) sin(omega t - lag) + x @ steering + tanh(x @ feeling) FELT_RAD
 
-x is the observation. Every joint has the same gains on its own and its neighbours' numbers, so that a policy has few
+x is the observation. Every joint has the same gains on its own and its neighbors' numbers, so that a policy has few
 parameters whatever the length of the robot. The same arrays compute it in NumPy and as ONNX.
 """
 
@@ -70,12 +70,12 @@ class Policy:
         time, yielding, steering, feeling = (empty.copy() for _ in range(4))
         time[first["time_s"]] = 1.0
         steering[first["goal_bearing"] + 1] = get["steering"] + get["head_steering"] * (1 - share)
-        neighbours = np.flatnonzero(bends)
-        for place, joint in enumerate(neighbours):
+        neighbors = np.flatnonzero(bends)
+        for place, joint in enumerate(neighbors):
             for where, step in (("behind", -1), ("itself", 0), ("ahead", 1)):
-                if 0 <= place + step < len(neighbours):
+                if 0 <= place + step < len(neighbors):
                     for part in ("angle_rad", "velocity_rad_s", "torque_nm"):
-                        row = first[part] + neighbours[place + step]
+                        row = first[part] + neighbors[place + step]
                         feeling[row, joint] = get[f"{part}_{where}"] / UNITS[part]
             yielding[first["contact_n"] + joint, joint] = get["contact_behind"] / UNITS["contact_n"]
             yielding[first["contact_n"] + joint + 1, joint] = get["contact_ahead"] / UNITS["contact_n"]

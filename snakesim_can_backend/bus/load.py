@@ -97,7 +97,7 @@ def load(joints: int, reports: Reports) -> float:
 
 
 def busiest_s(joints: int, reports: Reports) -> float:
-    """Bus time of one period in which forces are reported: Sync, all answers, all set-points, at worst."""
+    """Bus time of one period in which forces are reported: Sync, all answers, all setpoints, at worst."""
     once = streams(joints, Reports(1.0, min(reports.contact_every, 1), 0, reports.tail))
     each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
     return sum(stream.bits_per_s for stream in once if stream.opcode in each_period) / reports.bit_rate
@@ -200,7 +200,7 @@ def what_fits(joints: Sequence[int], config: RunConfig, settings: CanSettings) -
     fullest, total = max(joints), sum(joints)
     reports = reports_of(config, settings)
     ways = []
-    rate = most_rate_hz(fullest, config, settings)
+    rate = max_rate_hz(fullest, config, settings)
     if rate is not None:
         ways.append(f"rate_hz = {rate} on {len(joints)} bus{'es' if len(joints) > 1 else ''}")
     for buses in range(len(joints) + 1, min(total, 8) + 1):
@@ -215,7 +215,7 @@ def what_fits(joints: Sequence[int], config: RunConfig, settings: CanSettings) -
     return "What would fit: " + ("; or ".join(ways) or "nothing on classic CAN") + "."
 
 
-def most_rate_hz(joints: int, config: RunConfig, settings: CanSettings) -> int | None:
+def max_rate_hz(joints: int, config: RunConfig, settings: CanSettings) -> int | None:
     """The highest integer rate below the run's at which this many joints fit on a bus; None when none does.
 
     Bisection does not work: at some lower rate reports may come at every Sync instead of every second one.

@@ -4,5 +4,5 @@
 `bring_up`    finds and checks every module, enabling none; `parameters` checks their parameters
 `reports`     the modules' reports as arrays; `module_monitor` detects module and bus faults
 `sensors`     IMU, contacts, power
-`own_twins`   module twins, if the scenario asks for them
+`own_emulators`   emulated joint modules, if the scenario asks for them
 """

@@ -1,9 +1,9 @@
-"""The backend `can`: joint modules as a family of the driver kit, with sensors of their own."""
+"""The backend `can`: joint modules as a driver type of the driver kit, with sensors of their own."""
 
 from snakesim_can_backend.bus.adapter import check_channels
 from snakesim_can_backend.bus.load import check_load, reports_of
 from snakesim_can_backend.driver.modules import Modules
-from snakesim_can_backend.driver.own_twins import check_faults, check_twins
+from snakesim_can_backend.driver.own_emulators import check_emulators, check_faults
 from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog
 from snakesim_can_backend.driver.sensors import Sensors, described
 from snakesim_can_backend.settings import CanSettings
@@ -15,7 +15,7 @@ from snakesim_drivers.motion_capture.mocap import check_pose, receiver
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motor import check_gains
-from snakesim_hal.wire.messages import LifecycleState, Pace, SensorDescription
+from snakesim_hal.wire.messages import ClockMode, LifecycleState, SensorDescription
 
 NAME = "can"
 
@@ -29,25 +29,27 @@ class CanBackend(DriveBackend):
     _sensors: Sensors
 
     @staticmethod
-    def check(config: RunConfig, settings: CanSettings) -> tuple[Pace, ...]:
-        """Real modules support real time only; twins that this backend starts support lockstep. Raises ConfigError."""
+    def check(config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
+        """Real modules support real time only; emulators that it starts support lockstep. Raises ConfigError."""
         check_load(config, settings)
         check_gains(config.robot)
         check_drives(config.robot, settings)
-        check_mounted(config.robot, config.backend_section, settings.mounted, twins=settings.twins_run != "none")
+        check_mounted(
+            config.robot, config.backend_section, settings.mounted, emulators=settings.emulators_run != "none"
+        )
         check_ratings(config.robot)
         check_watchdog(config, settings)
         check_pose(config, settings.pose_listen)
-        check_twins(config, settings)
+        check_emulators(config, settings)
         check_faults(config, settings)
         check_channels(settings.channels)
-        return ("realtime",) if settings.twins_run == "none" else ("lockstep", "realtime")
+        return ("realtime",) if settings.emulators_run == "none" else ("lockstep", "realtime")
 
     def __init__(self, config: RunConfig, settings: CanSettings) -> None:
         """Open the buses and find every module; nothing is enabled. Raises ConfigError and BackendError."""
         self.check(config, settings)
-        clock, twins = Clock(config), settings.twins_run != "none"
-        mocap = receiver(config, settings.pose_listen, twins=twins, clock=lambda _stamp_ns: clock.ns())
+        clock, emulators = Clock(config), settings.emulators_run != "none"
+        mocap = receiver(config, settings.pose_listen, emulators=emulators, clock=lambda _timestamp_ns: clock.ns())
         self._reports = reports_of(config, settings)
 
         def make_modules(readings: Readings) -> Modules:
@@ -62,8 +64,8 @@ class CanBackend(DriveBackend):
     def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)
 
-    def _samples(self, tick: int, stamp_ns: int) -> Samples:
-        return self._sensors.sample(tick, stamp_ns)
+    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
+        return self._sensors.sample(tick, timestamp_ns)
 
     def _silent(self) -> list[Finding]:
         return []  # the monitor finds it, by the answers to Syncs

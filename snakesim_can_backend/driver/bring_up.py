@@ -101,9 +101,9 @@ def discovery_errors(
             if identity.protocol != VERSION:
                 wrong.append(f"{who} has protocol version {identity.protocol}, this driver {VERSION}: update one")
             if lockstep and not identity.stepped:
-                wrong.append(f"{who} does not support lockstep: use --pace realtime")
+                wrong.append(f"{who} does not support lockstep: use --clock-mode realtime")
             if identity.stepped and not lockstep:
-                wrong.append(f"{who} is a twin whose time stands still between Syncs: start it without --stepped")
+                wrong.append(f"{who} is an emulator whose time stands still between Syncs: start it without --stepped")
     wrong += [
         f"node {i.node} with serial {i.serial:08X} on {i.channel} is not a joint of this robot"
         for i in found

@@ -1,6 +1,6 @@
 """Joint modules on their buses: a `snakesim_drivers.kit.drive_backend.Drives`. Thin: every task has its own file.
 
-A tick: Sync is sent, every module answers with its samples of that instant, and enacts the set-point that it received
+A tick: Sync is sent, every module answers with its samples of that instant, and enacts the setpoint that it received
 in the period before. So a command acts exactly one period after the state that it answers, whatever the load.
 """
 
@@ -15,7 +15,7 @@ from snakesim_can_backend.bus.load import reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Watch
-from snakesim_can_backend.driver.own_twins import TwinProcess, modules_know, twins_here
+from snakesim_can_backend.driver.own_emulators import EmulatorProcess, emulators_here, modules_know
 from snakesim_can_backend.driver.parameters import check_ratings, parameters_of
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import contacts_due
@@ -25,7 +25,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import Readings
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
@@ -36,7 +36,7 @@ ANSWER_MARGIN = 1.25  # of the bus time that all answers take
 ANSWER_SLACK_S = 0.002
 MAX_OF_PERIOD = 0.75
 CONFIGURE_LIMIT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors off
-LOCKSTEP_ANSWER_S = 2.0  # to wait for slow twins; dead ones are not waited for again
+LOCKSTEP_ANSWER_S = 2.0  # to wait for slow emulators; dead ones are not waited for again
 FIRST_STATE_SYNCS = 20
 FIRST_STATE_PAUSE_S = 0.02
 LEFT_BEHIND = {"watchdog", "stream"}  # faults of a module whose driver was killed
@@ -45,7 +45,7 @@ _log = logging.getLogger("snakesim.can")
 
 
 @dataclass
-class Arming:
+class ArmSession:
     """The newest arming: its first Sync, and which joints have followed."""
 
     sync: int = -1
@@ -62,25 +62,25 @@ class Modules:
     ) -> None:
         """Open the buses. Raises ConfigError and BackendError.
 
-        pose: where own twins send motion capture; readings: are told who each module is.
+        pose: where own emulators send motion capture; readings: are told who each module is.
         """
         self._readings = readings
         self._config, self._settings, self._clock = config, settings, clock
-        self._lockstep = config.pace == "lockstep"
+        self._lockstep = config.clock_mode == "lockstep"
         self._reports = reports_of(config, settings)
         self._names = [joint.name for joint in config.robot.joint_table]
         self.reading = Reading(len(self._names))
         self.wires: list[Wire] = []
-        self.local_twins: VirtualPeer | None = None
-        self._twins: TwinProcess | None = None
+        self.local_emulators: VirtualPeer | None = None
+        self._emulators: EmulatorProcess | None = None
         # Whether no other host uses the modules: before that is known, nothing that disturbs them is sent.
         self._ours = False
         self._unconfigured = set(range(len(self._names)))  # joints whose parameters may differ from the robot file
-        self._set_points = commands.SetPointWriter(len(self._names))
+        self._setpoints = commands.SetpointWriter(len(self._names))
         self._lifecycle: LifecycleState = "disarmed"
-        self._isolated: frozenset[int] = frozenset()  # isolated joints: motors off, and no set-points
+        self._isolated: frozenset[int] = frozenset()  # isolated joints: motors off, and no setpoints
         self._unsent: list[str] = []
-        self._arming = Arming()
+        self._arm_session = ArmSession()
         self._arms = self._all_cleared = False  # of this tick's change of the lifecycle
         self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else FIRST_STATE_PAUSE_S
         try:
@@ -124,7 +124,7 @@ class Modules:
         self._unsent = [wire.channel for wire in self.wires if not wire.send(frame)]
         for wire, question in questions:
             wire.send(question)
-        if reading.complete:  # no answer is expected; but twins in this process run only while this one waits
+        if reading.complete:  # no answer is expected; but emulators in this process run only while this one waits
             wait(self.wires, 0.0)
         end = time.monotonic() + self._answer_limit_s
         while not reading.complete and (left_s := end - time.monotonic()) > 0:
@@ -138,7 +138,7 @@ class Modules:
         if lifecycle == before:
             self._remind(lifecycle)
         elif lifecycle == "armed":
-            self._arming = Arming(self.reading.sync)
+            self._arm_session = ArmSession(self.reading.sync)
         frames = commands.on_change(before, lifecycle)
         self._arms = any(map(commands.is_arming, frames))
         self._all_cleared = before in commands.LATCHED
@@ -173,19 +173,19 @@ class Modules:
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """Armed: send the set-points. Otherwise send none: the modules bring themselves to rest and stay passive."""
+        """Armed: send the setpoints. Otherwise send none: the modules bring themselves to rest and stay passive."""
         if self._arms and not self._unconfigured - self._isolated:
             self._arm()
         self._arms = False
         if self._lifecycle != "armed":
             return
-        points = SetPoints(modes, targets.tolist(), limits_nm.tolist(), self._isolated)
-        for i, frame in enumerate(self._set_points.frames(points)):
+        points = Setpoints(modes, targets.tolist(), limits_nm.tolist(), self._isolated)
+        for i, frame in enumerate(self._setpoints.frames(points)):
             if i not in following:
                 continue
             if self._wire_of[i].send(frame):
-                self._set_points.sent(i)
-            else:  # the queue is full or the interface down: the next set-point replaces it
+                self._setpoints.sent(i)
+            else:  # the queue is full or the interface down: the next setpoint replaces it
                 self._unsent.append(self._wire_of[i].channel)
 
     def findings(self) -> list[Finding]:
@@ -197,26 +197,26 @@ class Modules:
 
     def let_run(self) -> None:
         """Process frames received meanwhile."""
-        if self._twins is not None and (how := self._twins.how_it_ended()) is not None:
+        if self._emulators is not None and (how := self._emulators.how_it_ended()) is not None:
             raise BackendError(how)
         self._receive()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Faults of own twins and buses; False for other kinds. Raises ConfigError."""
+        """Faults of own emulators and buses; False for other kinds. Raises ConfigError."""
         if inject_into(self.wires, injection, begins=begins):
             return True
-        twins = self._twins or self.local_twins
-        if twins is None or not modules_know(injection, len(self._wire_of)):
+        emulators = self._emulators or self.local_emulators
+        if emulators is None or not modules_know(injection, len(self._wire_of)):
             return False
-        twins.inject(injection, begins=begins)
+        emulators.inject(injection, begins=begins)
         return True
 
     def close(self) -> None:
-        """Motors off, buses closed, own twins ended."""
+        """Motors off, buses closed, own emulators ended."""
         for wire in self.wires:
             self._let_go(wire)
-        if self._twins is not None:
-            self._twins.stop()
+        if self._emulators is not None:
+            self._emulators.stop()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -235,14 +235,14 @@ class Modules:
 
     def _open_buses(self, joints_of: list[int], pose: str | None) -> list[Bus]:
         settings = self._settings
-        if settings.twins_run == "process":
-            self._twins = TwinProcess(self._config, settings, pose, stepped=self._lockstep)
+        if settings.emulators_run == "process":
+            self._emulators = EmulatorProcess(self._config, settings, pose, stepped=self._lockstep)
         for name in settings.channels or [virtual_channel()]:
             if settings.channels:
                 self.wires.append(open_wire(name, bit_rate=settings.bit_rate))
             else:
-                self.local_twins = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
-                self.wires.append(VirtualWire(name, self.local_twins))
+                self.local_emulators = emulators_here(self._config, settings, name, pose, stepped=self._lockstep)
+                self.wires.append(VirtualWire(name, self.local_emulators))
         if settings.log:
             log = open_log(Path(settings.log))
             self.wires = [LoggedWire(wire, log) for wire in self.wires]
@@ -285,11 +285,11 @@ class Modules:
         raise BackendError(f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled")
 
     def _questions(self) -> list[tuple[Wire, Frame]]:
-        """In lockstep, a question to twins after each Sync: once it is answered, all earlier frames have arrived.
+        """In lockstep, a question to emulators after each Sync: once it is answered, all earlier frames have arrived.
 
         Some reports come only at some Syncs, so that otherwise a missing one could still be on its way.
         """
-        if self._twins is None or not self._lockstep:
+        if self._emulators is None or not self._lockstep:
             return []
         asked: dict[str, tuple[Wire, Frame]] = {}
         for module, wire in zip(self.reading.modules, self._wire_of, strict=True):
@@ -316,17 +316,17 @@ class Modules:
 
     def _remind(self, lifecycle: LifecycleState) -> None:
         """Repeat a command to modules that missed it. A module that was armed, and no longer is, has been stopped."""
-        arming = self._arming
-        in_time = self.reading.sync - arming.sync <= ARM_GRACE and not self._unconfigured - self._isolated
+        arm_session = self._arm_session
+        in_time = self.reading.sync - arm_session.sync <= ARM_GRACE and not self._unconfigured - self._isolated
         for i, module in enumerate(self.reading.modules):
             if lifecycle == "armed" and i in self._isolated:
                 if module.state in (ModuleState.ARMED, ModuleState.STOPPING):
                     self._wire_of[i].send(commands.command(Action.DISARM, module.node))
                 continue
             if lifecycle == "armed" and module.state == ModuleState.ARMED:
-                arming.done.add(i)
+                arm_session.done.add(i)
             frame = commands.reminder(lifecycle, module.state, module.node)
-            if frame is not None and (lifecycle != "armed" or (in_time and i not in arming.done)):
+            if frame is not None and (lifecycle != "armed" or (in_time and i not in arm_session.done)):
                 self._wire_of[i].send(frame)
 
     def _arm(self) -> None:
@@ -341,7 +341,7 @@ class Modules:
 
 def answer_limit_s(config: RunConfig, settings: CanSettings) -> float:
     """How long all answers to a Sync may take on the fullest bus; the rest of the period is for the controller."""
-    if config.pace == "lockstep":
+    if config.clock_mode == "lockstep":
         return LOCKSTEP_ANSWER_S
     reports = reports_of(config, settings)
     frames = max(shares(config, settings)) * (1 + (reports.contact_every > 0)) + reports.tail

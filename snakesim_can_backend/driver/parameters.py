@@ -11,7 +11,7 @@ from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
-MIN_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the next be a little late
+MIN_PERIODS = 2.2  # in a watchdog's time: one setpoint may be lost, and the next be a little late
 SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
 
 
@@ -20,7 +20,7 @@ def parameters_of(robot: RobotFile, settings: CanSettings, reports: Reports) -> 
     safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
     common = {
         Parameter.WATCHDOG: settings.watchdog_s,
-        Parameter.SAFE_ACTION: float(safe),
+        Parameter.STOP_MODE: float(safe),
         Parameter.CONTACT_EVERY: float(reports.contact_every),
         Parameter.IMU_EVERY: float(reports.imu_every),
     }
@@ -33,7 +33,7 @@ def parameters_of(robot: RobotFile, settings: CanSettings, reports: Reports) -> 
             Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
             Parameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
             Parameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
-            Parameter.ANGLE_LIMIT: _furthest_rad(joint),  # the gate keeps to the nearer side
+            Parameter.ANGLE_LIMIT: _furthest_rad(joint),  # the limiter keeps to the nearer side
             **common,
             Parameter.TAIL: float(node == 1 and reports.tail),
         }
@@ -43,7 +43,7 @@ def parameters_of(robot: RobotFile, settings: CanSettings, reports: Reports) -> 
 def _furthest_rad(joint: Joint) -> float:
     """Of the module's shaft, from its own zero."""
     drive = joint.drive
-    ends = (drive.zero_rad + drive.sign * drive.gear * end for end in (joint.limits.least_rad, joint.limits.most_rad))
+    ends = (drive.zero_rad + drive.sign * drive.gear * end for end in (joint.limits.lower_rad, joint.limits.upper_rad))
     return max(map(abs, ends))
 
 
@@ -110,11 +110,11 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
 
 
 def check_watchdog(config: RunConfig, settings: CanSettings) -> None:
-    """Raise ConfigError if one lost set-point would stop the modules."""
-    least_s = MIN_PERIODS / config.rate_hz
-    if settings.watchdog_s < least_s:
-        least_hz = MIN_PERIODS / settings.watchdog_s
+    """Raise ConfigError if one lost setpoint would stop the modules."""
+    min_s = MIN_PERIODS / config.rate_hz
+    if settings.watchdog_s < min_s:
+        min_rate_hz = MIN_PERIODS / settings.watchdog_s
         raise ConfigError(
             f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
-            f"set-point would stop the modules; give them {least_s:.3g} s or more, or a rate from {least_hz:.0f} Hz on"
+            f"setpoint would stop the modules; give them {min_s:.3g} s or more, or a rate from {min_rate_hz:.0f} Hz on"
         )

@@ -16,8 +16,8 @@ from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.felt_force import FeltForce
 from snakesim_hal.model.kinematics import tangents
+from snakesim_hal.model.measured_force import FeltForce
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, Message, Power, SensorDescription
@@ -48,22 +48,22 @@ class Sensors:
         self._health_every = max(round(HEALTH_PERIOD_S * config.rate_hz), 1)
         self._health_lasts = round(HEALTH_LASTS_S * config.rate_hz)  # Syncs
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """All new samples at `tick`."""
         others: dict[str, Message] = {}
         if contacts_due(self._reports, self._reading.sync):
-            others[keys.CONTACTS] = self._contacts(tick, stamp_ns)
-        imu = self._imu(tick, stamp_ns)
+            others[keys.CONTACTS] = self._contacts(tick, timestamp_ns)
+        imu = self._imu(tick, timestamp_ns)
         if imu is not None:
             others[keys.IMU] = imu
         if tick % self._health_every == 0:
-            others[keys.POWER] = self._power(tick, stamp_ns)
-        pose = self._mocap.newest(tick, stamp_ns) if self._mocap is not None else None
+            others[keys.POWER] = self._power(tick, timestamp_ns)
+        pose = self._mocap.newest(tick, timestamp_ns) if self._mocap is not None else None
         if pose is not None:
             others[keys.POSE] = pose
-        return Samples(self._joints(tick, stamp_ns), others)
+        return Samples(self._joints(tick, timestamp_ns), others)
 
-    def _joints(self, tick: int, stamp_ns: int) -> JointState:
+    def _joints(self, tick: int, timestamp_ns: int) -> JointState:
         reading = self._reading
         angle, velocity, torque = joint_values(reading, self._mounting).tolist()
         ages = [
@@ -72,7 +72,7 @@ class Sensors:
         ]
         return JointState(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             angle_rad=angle,
             velocity_rad_s=velocity,
             torque_nm=torque,
@@ -80,11 +80,11 @@ class Sensors:
             age_ns=ages,
         )
 
-    def _contacts(self, tick: int, stamp_ns: int) -> Contacts:
+    def _contacts(self, tick: int, timestamp_ns: int) -> Contacts:
         felt = [self._contact(link, raw) for link, raw in self._reading.links_touched()]
         strong = [contact for contact in felt if math.hypot(*contact.force_l) >= self._threshold_n]
         self._felt.add({contact.link: math.hypot(*contact.force_l) for contact in felt})
-        return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=strong, felt_n=self._felt.largest_n)
+        return Contacts(tick=tick, timestamp_ns=timestamp_ns, contacts=strong, measured_force_n=self._felt.max_n)
 
     def _contact(self, link: int, raw: tuple[int, ...]) -> Contact:
         newton, metre, radian = self._contact_scales
@@ -102,26 +102,26 @@ class Sensors:
             torque_l=NO_TORQUE,
         )
 
-    def _imu(self, tick: int, stamp_ns: int) -> Imu | None:
+    def _imu(self, tick: int, timestamp_ns: int) -> Imu | None:
         found = self._reading.imus()
         if not found:
             return None
         return Imu(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=[link for link, _, _ in found],
             angular_velocity_rad_s=[_scaled(rates, self._rate_scale) for _, rates, _ in found],
             acceleration_m_s2=[_scaled(values, self._acceleration_scale) for _, _, values in found],
         )
 
-    def _power(self, tick: int, stamp_ns: int) -> Power:
+    def _power(self, tick: int, timestamp_ns: int) -> Power:
         rows = self._reading.health()
         columns = [
             [0.0 if row is None else signal.value(row[i]) for row in rows] for i, signal in enumerate(self._health)
         ]
         return Power(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             voltage_v=columns[0],
             current_a=columns[1],
             motor_c=columns[2],

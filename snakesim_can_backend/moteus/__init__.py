@@ -1,8 +1,8 @@
 """The backend `moteus`: mjbots' controllers, by registers on CAN FD.
 
 `backend`   MoteusBackend: settings and checks      `controllers`  what a tick says to a controller, and hears
-`protocol`  registers and frames as bytes           `twin`         emulated controllers
+`protocol`  registers and frames as bytes           `emulator`         emulated controllers
 
-All else is in `snakesim_can_backend.family` and `snakesim_drivers.kit`.
+All else is in `snakesim_can_backend.can_drives` and `snakesim_drivers.kit`.
 Numbers are those of the controller's output shaft: turns, turns/s, N·m.
 """

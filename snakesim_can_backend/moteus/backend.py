@@ -5,12 +5,12 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSettings
-from snakesim_can_backend.family.command import run
-from snakesim_can_backend.family.traffic import Traffic
+from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
+from snakesim_can_backend.can_drives.command import run
+from snakesim_can_backend.can_drives.traffic import Traffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
+from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
-from snakesim_can_backend.moteus.twin import MoteusTwin
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -36,7 +36,7 @@ class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
 class MoteusBackend(CanDriveBackend):
     """A `snakesim_hal.backend.Backend` on moteus controllers, real or emulated."""
 
-    Settings, drives, twin = MoteusSettings, Controllers, MoteusTwin
+    Settings, drives, emulator = MoteusSettings, Controllers, EmulatedMoteus
     name, a_drive, first_id, last_id = "moteus", "controllers", HOST_ID + 1, LAST_ID
     reserved_ids = f"{HOST_ID} is the host's, {BROADCAST_ID} the broadcast address"
     says_every_s = 0.05  # it says so whenever it is asked; but it takes a while to get ready

@@ -1,6 +1,6 @@
-"""moteus controllers as a family of drives on CAN FD.
+"""moteus controllers as a driver type of drives on CAN FD.
 
-Every set-point is a whole command in position mode: gains of the robot file as shares of the configured ones. Velocity
+Every setpoint is a whole command in position mode: gains of the robot file as shares of the configured ones. Velocity
 mode is a proportional gain of 0, torque mode both gains 0, passive that without torque. Answers say mode and fault.
 """
 
@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from snakesim_can_backend.family.drives import HOST, CanDrives
+from snakesim_can_backend.can_drives.drives import HOST, CanDrives
 from snakesim_can_backend.moteus.protocol import (
     FAULTS,
     FLOAT,
@@ -120,7 +120,7 @@ class Controllers(CanDrives):
         self._send(i, *HEALTH, reply=True)
         self._send(i, SERIAL, reply=True)
 
-    def set_point(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
+    def setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """A command, which would also start it: so none to one that was restarted, or may be restarting."""
         restarted = self.following.drives[i].followed and self._mode[i] != Mode.POSITION
         if restarted or self.readings.unanswered(i):
@@ -142,7 +142,7 @@ class Controllers(CanDrives):
         )
 
     def tell(self, i: int, word: Word) -> None:
-        """A set-point is what makes it follow; a stop clears whatever has stopped a controller before."""
+        """A setpoint is what makes it follow; a stop clears whatever has stopped a controller before."""
         if self._mode[i] in OFF_BY_ITSELF:
             return  # its reason is for the operator to reset
         match word:

@@ -1,4 +1,4 @@
-"""ODrive axes as a family of drives on CAN.
+"""ODrive axes as a driver type of drives on CAN.
 
 Position mode is the axis' own cascade, with gains that make it the PD law of the robot file; passive is a torque of 0,
 without a change of state. Heartbeats say state and errors.
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from snakesim_can_backend.family.drives import HOST, CanDrives
+from snakesim_can_backend.can_drives.drives import HOST, CanDrives
 from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, Endpoints, Setting, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
     FIRMWARE,
@@ -36,7 +36,7 @@ from snakesim_hal.wire.messages import Mode
 
 TURN = 2 * math.pi
 _log = logging.getLogger("snakesim.drivers")
-TWIN_CONSTANT = 1.0  # N·m/A, of twins whose robot file says none
+TWIN_CONSTANT = 1.0  # N·m/A, of emulators whose robot file says none
 UNKNOWN_MAX_CURRENT_A = 1.0  # where it cannot be read what an axis is configured for: even a small motor stands it
 NO_LIMIT_SENT = -1.0
 READING = 1e-3  # relative: settings are single precision, and people round them
@@ -223,7 +223,7 @@ class Axes(CanDrives):
         """Supply, temperatures and errors; and the serial number, to notice a second axis of its id."""
         self._ask(i, Message.SUPPLY, Message.TEMPERATURE, Message.ERROR, Message.ADDRESS)
 
-    def set_point(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+    def setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
         """An input; before it limits, after it gains and mode, if they change."""
         axis = self.axes[i]
         if limit_nm != axis.limit_nm:

@@ -6,13 +6,13 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSettings
-from snakesim_can_backend.family.command import run
-from snakesim_can_backend.family.traffic import Traffic
+from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
+from snakesim_can_backend.can_drives.command import run
+from snakesim_can_backend.can_drives.traffic import Traffic
 from snakesim_can_backend.odrive.axes import READING, TWIN_CONSTANT, UNKNOWN_MAX_CURRENT_A, Axes, needed_current_a
+from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
-from snakesim_can_backend.odrive.twin import HEARTBEAT_US, OdriveTwin
 from snakesim_drivers.emulation.mounted import Mounted
 from snakesim_drivers.kit.drive_settings import who
 from snakesim_hal.base.errors import ConfigError
@@ -46,7 +46,7 @@ class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
 class OdriveBackend(CanDriveBackend):
     """A `snakesim_hal.backend.Backend` on ODrive axes, real or emulated."""
 
-    Settings, drives, twin = OdriveSettings, Axes, OdriveTwin
+    Settings, drives, emulator = OdriveSettings, Axes, EmulatedOdrive
     name, a_drive, last_id, says_every_s = "odrive", "axes", LAST_NODE, HEARTBEAT_US * 1e-6
     reserved_ids = "63 is the broadcast address"
     # A tick is two questions, two answers and an input; of one axis four questions more. Then heartbeats.

@@ -1,6 +1,6 @@
-"""Frames to the modules: set-points in raw numbers, and commands for changes of the robot's lifecycle.
+"""Frames to the modules: setpoints in raw numbers, and commands for changes of the robot's lifecycle.
 
-Pure: returns frames, and the caller sends them. A set-point that the bus did not accept is replaced by the next;
+Pure: returns frames, and the caller sends them. A setpoint that the bus did not accept is replaced by the next;
 nothing is ever queued.
 """
 
@@ -23,7 +23,7 @@ from snakesim_can_backend.protocol.definitions import (
     Operation,
     Parameter,
 )
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.wire.messages import LifecycleState
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
@@ -31,8 +31,8 @@ MAX_RAW = 32767
 MAX_LIMIT_RAW = 65535
 
 
-class SetPointWriter:
-    """Makes the set-point frames of all joints; tracks the next count that each module expects."""
+class SetpointWriter:
+    """Makes the setpoint frames of all joints; tracks the next count that each module expects."""
 
     def __init__(self, joints: int) -> None:
         layout = codec()[Opcode.SET_POINT]
@@ -42,21 +42,21 @@ class SetPointWriter:
         self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; the bits of a passive one are 0
         self._limit_steps = 1.0 / layout.signals["torque_limit"].scale
 
-    def frames(self, set_points: SetPoints) -> list[Frame]:
+    def frames(self, setpoints: Setpoints) -> list[Frame]:
         """One frame a joint, tail to head."""
-        modes = np.array(set_points.mode, dtype=np.intp)
-        target = _steps(np.array(set_points.target) * self._steps_per_unit[modes], -MAX_RAW, MAX_RAW)
-        limit = _steps(np.array(set_points.torque_limit_nm) * self._limit_steps, 0, MAX_LIMIT_RAW)
-        rows = zip(set_points.mode, self._count, target.tolist(), limit.tolist(), strict=True)
+        modes = np.array(setpoints.mode, dtype=np.intp)
+        target = _steps(np.array(setpoints.target) * self._steps_per_unit[modes], -MAX_RAW, MAX_RAW)
+        limit = _steps(np.array(setpoints.torque_limit_nm) * self._limit_steps, 0, MAX_LIMIT_RAW)
+        rows = zip(setpoints.mode, self._count, target.tolist(), limit.tolist(), strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 
     def sent(self, joint: int) -> None:
-        """The bus accepted the set-point of a joint; only then does its module expect the next count."""
+        """The bus accepted the setpoint of a joint; only then does its module expect the next count."""
         self._count[joint] = (self._count[joint] + 1) % COUNTS
 
 
 def _steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
-    """The nearest integer steps. Values are finite: the gate rejects NaN."""
+    """The nearest integer steps. Values are finite: the limiter rejects NaN."""
     return np.clip(np.rint(values), low, high).astype(np.int64)
 
 

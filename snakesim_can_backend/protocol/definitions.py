@@ -15,8 +15,8 @@ FIRST_NODE, LAST_NODE = 1, 62
 NODE_BITS = 6
 NODE_MASK = (1 << NODE_BITS) - 1
 COMMAND_KEY = 0x5AAE
-COUNTS = 16  # set-point and state counters have four bits
-MAX_LOST = 2  # set-points that may be missing before one; a count further ahead, or an earlier one, is wrong
+COUNTS = 16  # setpoint and state counters have four bits
+MAX_LOST = 2  # setpoints that may be missing before one; a count further ahead, or an earlier one, is wrong
 WRONG_COUNTS = 5  # in a row, after which a module stops
 HEARTBEAT_PERIOD_S = 0.1
 UPTIME_RANGE_MS = 1 << 32  # of a heartbeat: 49.7 days
@@ -49,7 +49,7 @@ WITH_CHECKSUM = frozenset((Opcode.COMMAND, Opcode.SET_POINT, Opcode.JOINT_STATE)
 
 
 class ModuleState(IntEnum):
-    """State of a module. Only `ARMED` follows set-points; only `ARMED` and `STOPPING` drive the motor."""
+    """State of a module. Only `ARMED` follows setpoints; only `ARMED` and `STOPPING` drive the motor."""
 
     BOOT = 0
     DISARMED = 1
@@ -64,7 +64,7 @@ class Action(IntEnum):
 
     ARM = 1
     DISARM = 2  # passive at once
-    STOP = 3  # safe action, then disarmed
+    STOP = 3  # stop mode, then disarmed
     CLEAR = 4
     REBOOT = 5
     IDENTIFY = 6
@@ -125,7 +125,7 @@ class Result(IntEnum):
 
 
 class SafeMotion(IntEnum):
-    """Parameter `safe_action`: action in `STOPPING`."""
+    """Parameter `stop_mode`: action in `STOPPING`."""
 
     PASSIVE = 0
     DAMP = 1
@@ -141,7 +141,7 @@ class Parameter(IntEnum):
     SPEED_LIMIT = 5
     ANGLE_LIMIT = 6
     WATCHDOG = 7
-    SAFE_ACTION = 8
+    STOP_MODE = 8
     CONTACT_EVERY = 9
     IMU_EVERY = 10
     TAIL = 11
@@ -167,7 +167,7 @@ PARAMETERS: dict[Parameter, ParameterRange] = {
     Parameter.SPEED_LIMIT: ParameterRange(0.0, 32.767, "rad/s"),
     Parameter.ANGLE_LIMIT: ParameterRange(0.0, 3.2767, "rad"),
     Parameter.WATCHDOG: ParameterRange(0.02, 0.1, "s"),
-    Parameter.SAFE_ACTION: ParameterRange(0, 1, "0 passive, 1 damp"),
+    Parameter.STOP_MODE: ParameterRange(0, 1, "0 passive, 1 damp"),
     Parameter.CONTACT_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
     Parameter.IMU_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
     Parameter.TAIL: ParameterRange(0, 1, "1: sends TailContact too"),

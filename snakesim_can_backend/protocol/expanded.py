@@ -22,10 +22,10 @@ def expanded_dbc() -> str:
     messages: list[Message] = []
     for message in source.messages:
         for node in nodes_of(Opcode(message.frame_id >> NODE_BITS)):
-            twin = copy.deepcopy(message)
-            twin.frame_id = message.frame_id | node
-            twin.name = message.name if node == BROADCAST else f"{message.name}_{node:02d}"
-            messages.append(twin)
+            emulator = copy.deepcopy(message)
+            emulator.frame_id = message.frame_id | node
+            emulator.name = message.name if node == BROADCAST else f"{message.name}_{node:02d}"
+            messages.append(emulator)
     database = Database(messages, nodes=source.nodes, version=source.version, dbc_specifics=source.dbc, strict=True)
     return database.as_dbc_string(sort_signals="default").replace("\r\n", "\n")
 

@@ -1,4 +1,4 @@
-"""A plant without a world: every joint turns an inertia of its own. For tests of the bus without physics.
+"""A physics model without a world: every joint turns an inertia of its own. For tests of the bus without physics.
 
 It does *not* simulate gravity, ground, obstacles, or coupling between joints.
 """
@@ -12,7 +12,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import RunConfig, start_of
-from snakesim_hal.physics.plant import LinkLoad
+from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import from_zero
 
@@ -27,8 +27,8 @@ class InertiaSettings(FileStruct, frozen=True, kw_only=True):
     drag_nm: Annotated[float, from_zero(100, "N·m")] = 0.1
 
 
-class InertiaPlant:
-    """A `Plant`: rotor and one link, turned about the link's middle, with friction and end stops."""
+class InertiaModel:
+    """A `PhysicsModel`: rotor and one link, turned about the link's middle, with friction and end stops."""
 
     Settings = InertiaSettings
 
@@ -46,8 +46,8 @@ class InertiaPlant:
         self._keep = 1.0 / (1.0 + self._speed_per_nm * viscous)  # implicit: stable at any friction
         dry_nm = np.array([joint.motor.friction_nm for joint in joints]) + settings.drag_nm
         self._rubbed_off = self._speed_per_nm * dry_nm
-        self._least = np.array([joint.limits.least_rad for joint in joints])
-        self._most = np.array([joint.limits.most_rad for joint in joints])
+        self._least = np.array([joint.limits.lower_rad for joint in joints])
+        self._most = np.array([joint.limits.upper_rad for joint in joints])
         self._angle: Floats = np.array(start_of(config).angles_rad, dtype=np.float64)
         self._velocity = np.zeros(len(self._angle))
         self._torque = np.zeros(len(self._angle))
@@ -97,6 +97,6 @@ class InertiaPlant:
 
     def _stop(self, back_rad: Floats) -> None:
         if not np.isfinite(self._angle).all():
-            raise BackendError("inertia plant: a joint angle is NaN or infinite, because a torque was")
+            raise BackendError("inertia physics model: a joint angle is NaN or infinite, because a torque was")
         self._velocity[self._velocity * back_rad < 0] = 0.0
         np.clip(self._angle, self._least, self._most, out=self._angle)

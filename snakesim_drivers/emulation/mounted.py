@@ -58,7 +58,7 @@ def built(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
 
 
 def as_built(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
-    """The run's configuration for the plant that the drives move: with their motors as they are in truth."""
+    """The run's configuration for the physics model that the drives move: with their motors as they are in truth."""
     joints = dict(config.robot.joints)
     for name, truth in mounted.items():
         if differs := _said(truth, Motor):
@@ -67,17 +67,17 @@ def as_built(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
 
 
 def _said(truth: Mounted, section: type[Drive | Motor]) -> dict[str, Any]:
-    """What is known to be otherwise in a section; a family may add fields of its own to both."""
+    """What is known to be otherwise in a section; a driver type may add fields of its own to both."""
     fields = set(section.__struct_fields__) & set(Mounted.__struct_fields__)
     said = {field: getattr(truth, field) for field in fields}
     return {field: value for field, value in said.items() if value is not None}
 
 
-def check_mounted(robot: RobotFile, section: str, mounted: Mapping[str, Mounted], *, twins: bool) -> None:
+def check_mounted(robot: RobotFile, section: str, mounted: Mapping[str, Mounted], *, emulators: bool) -> None:
     """Raise ConfigError for joints that the robot does not have, and for drives that are not emulated here."""
     names = [joint.name for joint in robot.joint_table]
     for name in mounted:
         if name not in names:
             raise ConfigError(f"`{section}.mounted.{name}`: robot {robot.name!r} has {names[0]} to {names[-1]}")
-    if mounted and not twins:
-        raise ConfigError(f"`{section}.mounted` is for twins; the modules on this bus are mounted as they are")
+    if mounted and not emulators:
+        raise ConfigError(f"`{section}.mounted` is for emulators; the modules on this bus are mounted as they are")

@@ -16,7 +16,7 @@ class Braking:
     """The joints that still brake in a fault, by their numbers in the robot."""
 
     def __init__(self, limits_ns: Sequence[int], *, holds: bool) -> None:
-        """limits_ns: of every joint; holds: the safe action is `hold`, which has no end."""
+        """limits_ns: of every joint; holds: the stop mode is `hold`, which has no end."""
         self._limits_ns, self._holds = limits_ns, holds
         self._began_ns: int | None = None
         self._done: set[int] = set()  # joints, in this fault
@@ -31,7 +31,7 @@ class Braking:
     ) -> frozenset[int]:
         """Return those of the following joints that go on in this period of a fault.
 
-        modes: of the safe action's set-points, where a passive joint is let go.
+        modes: of the stop mode's setpoints, where a passive joint is let go.
         """
         if self._began_ns is None:
             self._began_ns = now_ns

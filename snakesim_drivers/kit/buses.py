@@ -1,8 +1,8 @@
 """The buses of a robot, each with its own drives and, in real time, in a thread of its own.
 
-A bus is asked once a tick, or every so many, for what its drives measure, and told their set-points. Whoever is slow
+A bus is asked once a tick, or every so many, for what its drives measure, and told their setpoints. Whoever is slow
 delays nobody: the host waits for a bus only if that answered in time when it was last asked; until then its joints keep
-their last values, whose age grows. Of set-points the newest is sent; none that is older than a lease: a bus that gets
+their last values, whose age grows. Of setpoints the newest is sent; none that is older than a lease: a bus that gets
 no others lets its drives go. What cannot be sent is the business of the drives' own watchdogs.
 
 Drives stop by themselves while a driver is away. After a pause in which a watchdog may have expired, a bus first reads
@@ -49,12 +49,12 @@ class Bus:
     name: str  # such as can0
     joints: tuple[int, ...]  # numbers in the robot
     open: Callable[[Readings], Drives]  # with readings of these drives alone. Raises ConfigError and BackendError
-    every_ticks: int = 1
+    decimation: int = 1
     watchdog_s: float = 0.1  # of its drives
 
 
 class Told(NamedTuple):
-    """Set-points of the drives of a bus, at their shafts."""
+    """Setpoints of the drives of a bus, at their shafts."""
 
     following: frozenset[int]
     modes: list[Mode]
@@ -75,9 +75,9 @@ class BusInTurn:
         self.last: tuple[frozenset[int], bool, bool] | None = None  # who was told to follow, or to stop
         self.slower_s = 0.0  # an injected fault, of a bus in a thread
         self._gap_ns = round(GAP_OF_WATCHDOG * bus.watchdog_s * 1e9)
-        grace_ns = CLEAR_GRACE * bus.every_ticks * period_ns
+        grace_ns = CLEAR_GRACE * bus.decimation * period_ns
         self._guard = DriveGuard(clock_ns, gap_ns=self._gap_ns, grace_ns=grace_ns)
-        self._found_early: list[Finding] = []  # before set-points were sent
+        self._found_early: list[Finding] = []  # before setpoints were sent
 
     def begin(self) -> None:
         """Ticks begin."""
@@ -97,7 +97,7 @@ class BusInTurn:
         readings.take(self.readings, self.bus.joints)
 
     def tell(self, told: Told) -> None:
-        """Set-points; any earlier ones need not be sent any more."""
+        """Setpoints; any earlier ones need not be sent any more."""
         self._read_states_after_a_pause()
         self.drives.command(
             self._guard.drives_to_command(told.following, may_enable=told.may_enable),
@@ -190,7 +190,7 @@ class BusInThread(BusInTurn):
         self._again = False  # asked since then: it reads again at once, at its own rate
         self._told: tuple[Told, float] | None = None  # and when, until it is sent
         self._to_clear: frozenset[int] = frozenset()
-        self._fed_s: float | None = None  # when the set-points that its drives follow were told; None: none follows
+        self._fed_s: float | None = None  # when the setpoints that its drives follow were told; None: none follows
         self._found: list[Finding] = []
         self._failed: Exception | None = None
 
@@ -234,7 +234,7 @@ class BusInThread(BusInTurn):
             self._has.notify_all()
 
     def clear(self, joints: frozenset[int]) -> None:
-        """Before the next set-points."""
+        """Before the next setpoints."""
         with self._has:
             self._to_clear |= joints
             self._found = of_buses(self._found)  # of drives it is of before the clear
@@ -244,7 +244,7 @@ class BusInThread(BusInTurn):
         """It does by itself."""
 
     def findings(self) -> list[Finding]:
-        """Whatever was wrong when it was told set-points, since the last call."""
+        """Whatever was wrong when it was told setpoints, since the last call."""
         with self._has:
             self._raise()
             found, self._found = self._found, []
@@ -335,7 +335,7 @@ class BusInThread(BusInTurn):
 
     def _starved(self) -> str:
         lease_ms = 1e3 * self._lease_s
-        return f"{self.bus.name}: no set-points for {lease_ms:.0f} ms, one lease: its drives were switched off"
+        return f"{self.bus.name}: no setpoints for {lease_ms:.0f} ms, one lease: its drives were switched off"
 
     def _report_findings(self) -> None:
         found = self._collect_findings()
@@ -371,7 +371,7 @@ class Buses:
         joints = config.robot.joint_table
         try:
             for bus in buses:
-                if config.pace == "lockstep":
+                if config.clock_mode == "lockstep":
                     self.lines.append(BusInTurn(bus, joints, clock_ns, config.period_ns))
                 else:
                     self.lines.append(BusInThread(bus, joints, clock_ns, config.period_ns, config.lease_ns, waits_s))
@@ -471,4 +471,4 @@ class Buses:
                 everyone.callback(line.close, until_s)
 
     def _is_turn(self, line: BusInTurn) -> bool:
-        return self._ticks % line.bus.every_ticks == 0
+        return self._ticks % line.bus.decimation == 0

@@ -1,7 +1,7 @@
-"""A whole backend over a family of drives. The family speaks the protocol, in `Drives`; all else is here.
+"""A whole backend over a driver type of drives. The driver type speaks the protocol, in `Drives`; all else is here.
 
-A tick: every drive is asked what it measures, and answers; it then gets its set-point, which holds until the next. All
-numbers between here and a family are those of the drives' shafts, in SI units.
+A tick: every drive is asked what it measures, and answers; it then gets its setpoint, which holds until the next. All
+numbers between here and a driver type are those of the drives' shafts, in SI units.
 """
 
 import time
@@ -15,7 +15,7 @@ from snakesim_drivers.kit.braking import Braking
 from snakesim_drivers.kit.findings import Finding, Told
 from snakesim_drivers.kit.readings import Readings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
@@ -31,7 +31,7 @@ HEALTH_ROUNDS = 3  # in which a drive may not say its health before that is unkn
 
 
 class Drives(Protocol):
-    """The drives of one family on their buses, tail to head. Every method returns within a period."""
+    """The drives of one driver type on their buses, tail to head. Every method returns within a period."""
 
     emulated: bool  # nothing real moves
 
@@ -53,9 +53,9 @@ class Drives(Protocol):
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """Set-points of the drives that follow; any other is to be idle, and is told again if it is not.
+        """Setpoints of the drives that follow; any other is to be idle, and is told again if it is not.
 
-        A drive that begins to follow is enabled after it has its set-point. may_enable: the robot is armed; otherwise
+        A drive that begins to follow is enabled after it has its setpoint. may_enable: the robot is armed; otherwise
         a drive that is not on stays off. emergency: by the drives' own stop.
         """
         ...
@@ -85,7 +85,7 @@ class Clock:
     """The time of a driver: a steady clock, or in lockstep the robot's own time, which `sample` sets."""
 
     def __init__(self, config: RunConfig) -> None:
-        self._lockstep, self.robot_ns = config.pace == "lockstep", 0
+        self._lockstep, self.robot_ns = config.clock_mode == "lockstep", 0
 
     def ns(self) -> int:
         """Now."""
@@ -93,7 +93,7 @@ class Clock:
 
 
 class DriveBackend:
-    """A `snakesim_hal.backend.Backend`. What a family with more than `Drives` may add is at the end."""
+    """A `snakesim_hal.backend.Backend`. What a driver type with more than `Drives` may add is at the end."""
 
     clear_grace = CLEAR_GRACE
 
@@ -106,19 +106,19 @@ class DriveBackend:
         mocap: MocapReceiver | None,
         make_drives: Callable[[Readings], Drives],
         watchdogs_s: Sequence[float],
-        every_ticks: int = 1,
+        decimation: int = 1,
     ) -> None:
-        """make_drives: opens the buses; watchdogs_s: of every joint's drive; every_ticks: of the slowest bus.
+        """make_drives: opens the buses; watchdogs_s: of every joint's drive; decimation: of the slowest bus.
 
         Raises ConfigError and BackendError.
         """
         joints = config.robot.joint_table
         self._clock, self._mocap, self._open = clock, mocap, True
-        self._period_ns, self._lease_ns, self._every = config.period_ns, config.lease_ns, every_ticks
+        self._period_ns, self._lease_ns, self._every = config.period_ns, config.lease_ns, decimation
         self._names = [joint.name for joint in joints]
         self._readings = Readings(joints, clock.ns)
         self._mounting = self._readings.mounting
-        self._may_lose = config.robot.safety.may_lose_joints
+        self._max_isolated = config.robot.safety.max_isolated_joints
         self._told = Told()
         self._braking = Braking(
             [round(watchdog_s * 1e9) for watchdog_s in watchdogs_s], holds=config.robot.safety.action == "hold"
@@ -146,33 +146,33 @@ class DriveBackend:
         """The robot of the robot file, with the sensors that its drives are."""
         return self._description
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Ask all drives."""
         self._must_be_open()
-        self._tick, self._clock.robot_ns, self._quiet = tick, stamp_ns, self._quiet - 1
+        self._tick, self._clock.robot_ns, self._quiet = tick, timestamp_ns, self._quiet - 1
         self._readings.ask()
         self._drives.read()
-        return self._samples(tick, stamp_ns)
+        return self._samples(tick, timestamp_ns)
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
         """Armed: all that are not isolated follow. At fault those go on that did, while they brake."""
         if not self._open:
             return
-        self._announce(lifecycle, set_points.isolated)
-        back = (self._isolated | self._pending) - set_points.isolated
-        self._isolated, self._pending = set_points.isolated, frozenset()
+        self._announce(lifecycle, setpoints.isolated)
+        back = (self._isolated | self._pending) - setpoints.isolated
+        self._isolated, self._pending = setpoints.isolated, frozenset()
         everybody = frozenset(range(len(self._names))) - self._isolated
         if lifecycle not in LATCHED and (back or self._lifecycle in LATCHED):
             self._told.forget()
             self._drives.clear(everybody if self._lifecycle in LATCHED else back)
             self._quiet = self.clear_grace * self._every
-        self._following = self._joints_to_drive(lifecycle, everybody, set_points.mode)
+        self._following = self._joints_to_drive(lifecycle, everybody, setpoints.mode)
         self._lifecycle = lifecycle
         self._drives.command(
             self._following,
-            set_points.mode,
-            self._mounting.drive_targets(set_points.mode, set_points.target),
-            self._mounting.drive_torque_limit_nm(np.array(set_points.torque_limit_nm)),
+            setpoints.mode,
+            self._mounting.drive_targets(setpoints.mode, setpoints.target),
+            self._mounting.drive_torque_limit_nm(np.array(setpoints.torque_limit_nm)),
             may_enable=lifecycle == "armed",
             emergency=lifecycle == "estop",
         )
@@ -193,7 +193,7 @@ class DriveBackend:
             found = [finding for finding in found if finding.joint is None]
         fresh = self._told.fresh(found)
         failed = frozenset(finding.joint for finding in fresh if finding.joint is not None)
-        few = len(self._isolated | failed) <= self._may_lose
+        few = len(self._isolated | failed) <= self._max_isolated
         if self._lifecycle == "armed" and few and all(finding.alone for finding in fresh):
             self._pending |= failed  # the HAL isolates them
         elif fresh and self._lifecycle not in LATCHED:
@@ -222,7 +222,7 @@ class DriveBackend:
     def _joints_to_drive(
         self, lifecycle: LifecycleState, connected: frozenset[int], modes: Sequence[Mode]
     ) -> frozenset[int]:
-        """Return the joints whose drives get set-points in this lifecycle state. A fault begins with no new one."""
+        """Return the joints whose drives get setpoints in this lifecycle state. A fault begins with no new one."""
         if lifecycle != "fault":
             self._braking.reset()
         match lifecycle:
@@ -244,20 +244,20 @@ class DriveBackend:
         delay_s = camera.delay_s if self._mocap is not None and camera is not None else None
         return msgspec.structs.replace(plain, sensors=self._described(config, delay_s), hardware=hardware)
 
-    # --- what a family may replace ------------------------------------------------------------------------------
+    # --- what a driver type may replace ------------------------------------------------------------------------------
 
     def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         """Before anything else of a tick, and at once for a fault: for drives that know the robot's lifecycle."""
 
-    def _samples(self, tick: int, stamp_ns: int) -> Samples:
+    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
         """Joints and other sensors, from what was read."""
         others: dict[str, Message] = {}
         if tick % len(self._names) == 0:
             lasts_ns = HEALTH_ROUNDS * len(self._names) * self._every * self._period_ns
-            others[keys.POWER] = self._readings.power(tick, stamp_ns, lasts_ns)
-        if self._mocap is not None and (pose := self._mocap.newest(tick, stamp_ns)) is not None:
+            others[keys.POWER] = self._readings.power(tick, timestamp_ns, lasts_ns)
+        if self._mocap is not None and (pose := self._mocap.newest(tick, timestamp_ns)) is not None:
             others[keys.POSE] = pose
-        return Samples(self._readings.joints(tick, stamp_ns, self._lease_ns), others)
+        return Samples(self._readings.joints(tick, timestamp_ns, self._lease_ns), others)
 
     def _silent(self) -> list[Finding]:
         """Drives that do not answer."""

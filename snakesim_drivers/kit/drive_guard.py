@@ -1,7 +1,7 @@
 """Which drives of a bus may be driven: none that has stopped by itself, until the operator resets the fault. Pure.
 
 A drive stops by itself when its watchdog expires, when it finds an error, or when it restarts. Two things must not
-happen to such a stop: a command clears it before the driver has read it, or a later set-point enables the drive again.
+happen to such a stop: a command clears it before the driver has read it, or a later setpoint enables the drive again.
 """
 
 from collections.abc import Callable, Iterable
@@ -52,7 +52,7 @@ class DriveGuard:
     # --- who is driven ---------------------------------------------------------------------------------------
 
     def drives_to_command(self, wanted: frozenset[int], *, may_enable: bool) -> frozenset[int]:
-        """Return those of the wanted drives that get set-points now.
+        """Return those of the wanted drives that get setpoints now.
 
         may_enable: whether the robot is armed. Otherwise only drives go on that are driven already.
         """

@@ -1,14 +1,14 @@
-"""What the scenario may say about any family of drives, and checks of it."""
+"""What the scenario may say about any driver type of drives, and checks of it."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any
 
 from msgspec import Meta
 
+from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, Motion, make_physics_model
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
-from snakesim_drivers.emulation.twin_body import FAULTS, Motion, TwinBody, make_plant
+from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_drivers.motion_capture.mocap import check_pose
-from snakesim_drivers.motion_capture.mocap_twin import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_plan import check_backend_can
 from snakesim_hal.model.files import FileStruct
@@ -25,38 +25,40 @@ class BodySettings(FileStruct, frozen=True, kw_only=True):
     """Fields that concern a robot as a whole, whatever its drives."""
 
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None  # of motion capture: HOST:PORT
-    plant: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.plants`
-    plant_settings: dict[str, Any] = {}
+    physics_model: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.physics_models`
+    physics_model_settings: dict[str, Any] = {}
     mounted: Mapping[str, Mounted] = {}  # of emulated drives: joint -> how it is mounted in truth
 
 
 class DriveSettings(BodySettings, frozen=True, kw_only=True):
-    """Fields that the settings of every family have; a family adds its ports."""
+    """Fields that the settings of every driver type have; a driver type adds its ports."""
 
     watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1  # of the drives
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    every_ticks: Annotated[int, Meta(ge=1, le=100)] = 1  # of the run: how often its buses ask and tell
+    decimation: Annotated[int, Meta(ge=1, le=100)] = 1  # of the run: how often its buses ask and tell
 
 
-def body_of(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> TwinBody:
+def body_of(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> EmulatedBody:
     """What emulated drives move. pose: where its motion capture sends, HOST:PORT. Raises ConfigError."""
-    plant = make_plant(config, settings, backend)
-    motion = Motion(config, plant, settings.mounted, PoseSender(pose) if pose else None)
-    return TwinBody(motion, range(config.robot.chain.modules))
+    physics_model = make_physics_model(config, settings, backend)
+    motion = Motion(config, physics_model, settings.mounted, PoseSender(pose) if pose else None)
+    return EmulatedBody(motion, range(config.robot.chain.modules))
 
 
 def check_body(
-    config: RunConfig, settings: BodySettings, *, twins: bool, buses: int, bus_faults: Collection[str] = ()
+    config: RunConfig, settings: BodySettings, *, emulators: bool, buses: int, bus_faults: Collection[str] = ()
 ) -> None:
     """Raise ConfigError for what no robot of drives could do.
 
-    twins: emulated drives are in this process; bus_faults: injected kinds.
+    emulators: emulated drives are in this process; bus_faults: injected kinds.
     """
     check_pose(config, settings.pose_listen)
-    check_mounted(config.robot, config.backend_section, settings.mounted, twins=twins)
-    does = {*bus_faults, *(FAULTS if twins else ())}
-    because = f"its emulated drives know {', '.join(FAULTS)}" if twins else "its drives are not emulated in its process"
-    if config.pace == "lockstep" and twins:
+    check_mounted(config.robot, config.backend_section, settings.mounted, emulators=emulators)
+    does = {*bus_faults, *(FAULTS if emulators else ())}
+    because = (
+        f"its emulated drives know {', '.join(FAULTS)}" if emulators else "its drives are not emulated in its process"
+    )
+    if config.clock_mode == "lockstep" and emulators:
         because += "; and in lockstep no bus is slow"
     else:
         does.add("slow")
@@ -76,27 +78,27 @@ def check_buses(
                 f"{who(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
                 f"`{section}`: {', '.join(ports) or 'none'}"
             )
-    every, least_s = settings.every_ticks, MIN_PERIODS * settings.every_ticks / config.rate_hz
-    if settings.watchdog_s < least_s:
-        often = f" and `every_ticks` = {every}" if every > 1 else ""
+    every, min_s = settings.decimation, MIN_PERIODS * settings.decimation / config.rate_hz
+    if settings.watchdog_s < min_s:
+        often = f" and `decimation` = {every}" if every > 1 else ""
         raise ConfigError(
             f"`{section}.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}{often}: "
-            f"one lost set-point would stop the drives; give them {least_s:.3g} s or more"
+            f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more"
         )
     most = int(config.lease_ns / (MIN_ROUNDS * config.period_ns))
     if every > most:
         raise ConfigError(
-            f"`{section}.every_ticks` = {every} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
+            f"`{section}.decimation` = {every} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
             f"{1000 * every / config.rate_hz:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; "
             f"at most {most}"
         )
 
 
-def answer_limit_s(config: RunConfig, every_ticks: int = 1) -> float:
+def answer_limit_s(config: RunConfig, decimation: int = 1) -> float:
     """How long a tick, or a bus, may wait for answers; in lockstep a busy computer changes nothing."""
-    if config.pace == "lockstep":
+    if config.clock_mode == "lockstep":
         return LOCKSTEP_ANSWER_S
-    return ANSWERS_WITHIN * every_ticks * config.period_ns * 1e-9
+    return ANSWERS_WITHIN * decimation * config.period_ns * 1e-9
 
 
 def port_of(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:

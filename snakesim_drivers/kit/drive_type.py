@@ -1,7 +1,7 @@
-"""A backend over the drives of one family, or of several: settings, checks before a start, and the buses that it opens.
+"""A backend over drives of one type, or of several: settings, checks before a start, and the buses that it opens.
 
-A family is a class below `FamilyBackend`. As a backend it has all joints of a robot; beside others, in `mixed`, those
-whose `family` is its name.
+A driver type is a class below `DriverTypeBackend`. As a backend it has all joints of a robot; beside others, in
+`mixed`, those whose `driver` is its name.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
-from snakesim_drivers.emulation.twin_body import TwinBody
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.buses import Bus, Buses
 from snakesim_drivers.kit.drive_backend import Clock, DriveBackend, Drives
 from snakesim_drivers.kit.drive_settings import DriveSettings, body_of, check_body, check_buses, port_of, who
@@ -19,29 +19,29 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motor import check_gains
-from snakesim_hal.wire.messages import Pace
+from snakesim_hal.wire.messages import ClockMode
 
 
 @dataclass(frozen=True)
 class Part:
-    """The joints of a robot that are of one family."""
+    """The joints of a robot that are of one driver type."""
 
-    family: "type[FamilyBackend]"
-    settings: Any  # the family's own `Settings`
+    driver_type: "type[DriverTypeBackend]"
+    settings: Any  # the driver_type's own `Settings`
     section: str  # where they are in the scenario
     joints: Mapping[int, Joint]  # by their numbers in the robot
 
     @property
     def ports(self) -> Sequence[str]:
         """Its buses."""
-        return self.family.ports(self.settings)
+        return self.driver_type.ports(self.settings)
 
 
-class FamilyBackend(DriveBackend):
-    """A `snakesim_hal.backend.Backend` on drives, real or emulated. A family gives what is declared first."""
+class DriverTypeBackend(DriveBackend):
+    """A `snakesim_hal.backend.Backend` on drives, real or emulated. A driver type gives what is declared first."""
 
     Settings: ClassVar[type[Any]]  # `BodySettings`; of drives, `DriveSettings`
-    name: ClassVar[str]  # of the backend, and of the family in a robot file
+    name: ClassVar[str]  # of the backend, and of the driver type in a robot file
 
     @classmethod
     def ports(cls, settings: Any) -> Sequence[str]:
@@ -55,43 +55,43 @@ class FamilyBackend(DriveBackend):
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
-        """Raise ConfigError for joints that no drive of this family can be, and for buses that cannot carry them."""
+        """Raise ConfigError for joints that no drive of this type can be, and for buses that cannot carry them."""
         raise NotImplementedError
 
     @classmethod
     def buses(
-        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: TwinBody | None
+        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: EmulatedBody | None
     ) -> list[Bus]:
         """Each bus that has some of the joints. body: of these joints, if their drives are emulated here."""
         raise NotImplementedError
 
-    # --- of all families ----------------------------------------------------------------------------------------
+    # --- of all driver types ----------------------------------------------------------------------------------------
 
     @classmethod
     def parts(cls, config: RunConfig, settings: Any) -> list[Part]:
-        """The robot, by families. Raises ConfigError."""
+        """The robot, by driver types. Raises ConfigError."""
         joints = dict(enumerate(config.robot.joint_table))
         for joint in joints.values():
-            if joint.drive.family not in ("", cls.name):
+            if joint.drive.driver not in ("", cls.name):
                 raise ConfigError(
-                    f"{who(config, joint)}: `family` = {joint.drive.family!r} in the robot file, and backend "
+                    f"{who(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
                     f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
                 )
         return [Part(cls, settings, config.backend_section, joints)]
 
     @classmethod
-    def check(cls, config: RunConfig, settings: Any) -> tuple[Pace, ...]:
+    def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
         """Drives on a bus support real time only; emulated ones in this process lockstep, too. Raises ConfigError."""
         check_gains(config.robot)
         parts = cls.parts(config, settings)
         here = not any(part.ports for part in parts)
-        bus_faults = set[str].intersection(*({*part.family.bus_faults(part.settings)} for part in parts))
+        bus_faults = set[str].intersection(*({*part.driver_type.bus_faults(part.settings)} for part in parts))
         buses = sum(max(len(part.ports), 1) for part in parts)
-        check_body(config, settings, twins=here, buses=buses, bus_faults=bus_faults)
+        check_body(config, settings, emulators=here, buses=buses, bus_faults=bus_faults)
         for part in parts:
             joints = list(part.joints.values())
             check_buses(config, part.settings, part.section, joints, part.ports)
-            part.family.check_drives(config, part.settings, joints)
+            part.driver_type.check_drives(config, part.settings, joints)
         return ("lockstep", "realtime") if here else ("realtime",)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:
@@ -99,7 +99,7 @@ class FamilyBackend(DriveBackend):
         self.check(config, settings)
         parts, clock = self.parts(config, settings), Clock(config)
         here = not any(part.ports for part in parts)
-        mocap = receiver(config, settings.pose_listen, twins=here, clock=lambda _stamp_ns: clock.ns())
+        mocap = receiver(config, settings.pose_listen, emulators=here, clock=lambda _timestamp_ns: clock.ns())
 
         def open_buses(readings: Readings) -> Buses:
             pose = mocap.address if mocap is not None else None
@@ -107,19 +107,19 @@ class FamilyBackend(DriveBackend):
             buses: list[Bus] = []
             for part in parts:
                 body = whole.part(list(part.joints)) if whole is not None else None
-                buses += part.family.buses(config, part.settings, part.joints, clock, body)
+                buses += part.driver_type.buses(config, part.settings, part.joints, clock, body)
             return Buses(config, readings, buses, clock.ns)
 
         hardware = "+".join(port for part in parts for port in part.ports)
-        slowest = max(self.every_ticks(part.settings) for part in parts)
+        slowest = max(self.decimation(part.settings) for part in parts)
         watchdog_s = {joint: part.settings.watchdog_s for part in parts for joint in part.joints}
         watchdogs_s = [watchdog_s[joint] for joint in range(len(watchdog_s))]
         super().__init__(config, self.name, hardware, clock, mocap, open_buses, watchdogs_s, slowest)
 
     @staticmethod
-    def every_ticks(settings: DriveSettings) -> int:
+    def decimation(settings: DriveSettings) -> int:
         """Of the run: how often its buses ask and tell."""
-        return settings.every_ticks
+        return settings.decimation
 
 
 def buses_of(
@@ -128,12 +128,12 @@ def buses_of(
     ports: Sequence[str],
     open_drives: Callable[[str, Sequence[int], Readings], Drives],
 ) -> list[Bus]:
-    """A bus for each port that has some of the joints, which a family opens by its name."""
+    """A bus for each port that has some of the joints, which a driver type opens by its name."""
     on = port_of(list(joints.values()), ports)
     found: list[Bus] = []
     for number, port in enumerate(ports):
         mine = tuple(j for j, bus in zip(joints, on, strict=True) if bus == number)
         if mine:
             open_these = partial(open_drives, port, mine)
-            found.append(Bus(port, mine, open_these, settings.every_ticks, settings.watchdog_s))
+            found.append(Bus(port, mine, open_these, settings.decimation, settings.watchdog_s))
     return found

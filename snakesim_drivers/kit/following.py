@@ -1,6 +1,6 @@
 """Whether drives follow as they were told: whom to tell again, and who does not. Pure, for drives on any bus.
 
-A family says what a drive reports of itself, and sends the words that come out of here.
+A driver type says what a drive reports of itself, and sends the words that come out of here.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,7 +25,7 @@ class Follower:
     stopped: bool = False  # by an emergency stop, since the last clear
     told_ns: int = -1
     enabled: bool | None = None  # as it says; None: not yet
-    state: str = ""  # in the family's words
+    state: str = ""  # in the driver_type's words
     said_ns: int = -1
     errors: str = ""  # in words; empty: none
 

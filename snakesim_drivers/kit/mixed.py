@@ -1,7 +1,7 @@
-"""The backend `mixed`: a robot whose joints are drives of several families, such as a head of servos on ODrive axes.
+"""The backend `mixed`: a robot with drives of several types, such as a head of servos on ODrive axes.
 
-The robot file says of each joint of what `family` it is, and each family has its own section in the scenario. What
-concerns the whole robot is in `[backends.mixed]`: motion capture, and the body that emulated drives move together.
+The robot file says of each joint of what `driver` it is, and each driver type has its own section in the scenario.
+What concerns the whole robot is in `[backends.mixed]`: motion capture, and the body that emulated drives move together.
 """
 
 from collections.abc import Collection
@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from snakesim_drivers.kit.drive_settings import BodySettings
-from snakesim_drivers.kit.drive_type import FamilyBackend, Part
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, Part
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
@@ -22,59 +22,61 @@ class MixedSettings(BodySettings, frozen=True, kw_only=True):
     """The scenario's `[backends.mixed]` section."""
 
 
-class MixedBackend(FamilyBackend):
-    """A `snakesim_hal.backend.Backend` on drives of several families, real or emulated."""
+class MixedBackend(DriverTypeBackend):
+    """A `snakesim_hal.backend.Backend` on drives of several driver types, real or emulated."""
 
     Settings, name = MixedSettings, "mixed"
 
     @classmethod
     def parts(cls, config: RunConfig, settings: MixedSettings) -> list[Part]:
-        """The joints of each family, with the settings of its section."""
-        families = {joint.drive.family: family_of(config.robot, joint) for joint in config.robot.joint_table}
+        """The joints of each driver type, with the settings of its section."""
+        driver_types = {joint.drive.driver: driver_type_of(config.robot, joint) for joint in config.robot.joint_table}
         parts: list[Part] = []
-        for family_name, family in families.items():
-            name = family_name.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
+        for driver_type_name, driver_type in driver_types.items():
+            name = driver_type_name.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
             section, given = f"backends.{name}", config.backends.get(name, {})
-            joints = {i: j for i, j in enumerate(config.robot.joint_table) if j.drive.family == family_name}
+            joints = {i: j for i, j in enumerate(config.robot.joint_table) if j.drive.driver == driver_type_name}
             if others := sorted(given.keys() & {*BodySettings.__struct_fields__}):
                 raise ConfigError(
-                    f"`{section}.{others[0]}` is of a robot of {name} alone; of a mixed one it concerns all families: "
+                    f"`{section}.{others[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
                     f"say `backends.mixed.{others[0]}`"
                 )
-            own = plugin_settings(family, given, f"scenario {config.name!r}", section)
-            parts.append(Part(family, own, section, joints))
+            own = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
+            parts.append(Part(driver_type, own, section, joints))
         real = [part for part in parts if part.ports]
         if real and len(real) < len(parts):
             without = next(part for part in parts if not part.ports)
             raise ConfigError(
                 f"`{without.section}` names no bus, and `{real[0].section}` does: drives that are emulated here do not "
-                f"move with those on a bus. Name the buses of all families, or of none"
+                f"move with those on a bus. Name the buses of all driver types, or of none"
             )
         return parts
 
     @staticmethod
     def as_driven(robot: RobotFile) -> RobotFile:
-        """The robot with the modes that each joint has in its family, whatever else its file says."""
+        """The robot with the modes that each joint has in its driver type, whatever else its file says."""
         joints = dict(robot.joints)
         for joint in robot.joint_table:
-            known: Collection[str] | None = getattr(family_of(robot, joint), "MODES", None)
+            known: Collection[str] | None = getattr(driver_type_of(robot, joint), "MODES", None)
             if known is not None:
                 modes = [mode for mode in joint.drive.modes if mode in known]
                 joints[joint.name] = msgspec.structs.replace(joints.get(joint.name, JointExceptions()), modes=modes)
         return msgspec.structs.replace(robot, joints=joints)
 
 
-def family_of(robot: RobotFile, joint: Joint) -> type[FamilyBackend]:
+def driver_type_of(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     """Of a joint. Raises ConfigError."""
-    name = joint.drive.family
-    where = f"robot {robot.name!r}, {joint.name}: `family`"
+    name = joint.drive.driver
+    where = f"robot {robot.name!r}, {joint.name}: `driver`"
     fix = f"say it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
     if not name:
-        raise ConfigError(f"{where} is not given, and the backend `mixed` drives each joint by its family: {fix}")
+        raise ConfigError(f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}")
     try:
         found: Any = find_plugin(BACKENDS, name)
     except ConfigError as error:
         raise ConfigError(f"{where} = {name!r}: {error}; {fix}") from None
-    if not (isinstance(found, type) and issubclass(found, FamilyBackend)) or issubclass(found, MixedBackend):
-        raise ConfigError(f"{where} = {name!r}, a backend that drives whole robots, and no family of drives; {fix}")
+    if not (isinstance(found, type) and issubclass(found, DriverTypeBackend)) or issubclass(found, MixedBackend):
+        raise ConfigError(
+            f"{where} = {name!r}, a backend that drives whole robots, and no driver type of drives; {fix}"
+        )
     return found

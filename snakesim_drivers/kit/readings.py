@@ -122,12 +122,12 @@ class Readings:
         heard_ns = min(self._motion_ns[i], self._torque_ns[i]) if self._feels[i] else self._motion_ns[i]
         return max(self._clock_ns() - heard_ns, 0)
 
-    def joints(self, tick: int, stamp_ns: int, lease_ns: int) -> JointState:
+    def joints(self, tick: int, timestamp_ns: int, lease_ns: int) -> JointState:
         """The joint state; a value older than the lease is invalid, and a torque that is not measured is 0."""
         ages, mounting = [self.age_ns(i) for i in range(len(self._feels))], self.mounting
         return JointState(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             angle_rad=mounting.joint_angle_rad(self.angle_rad).tolist(),
             velocity_rad_s=mounting.joint_velocity_rad_s(self.velocity_rad_s).tolist(),
             torque_nm=mounting.joint_torque_nm(self.torque_nm).tolist(),
@@ -135,12 +135,12 @@ class Readings:
             age_ns=ages,
         )
 
-    def power(self, tick: int, stamp_ns: int, lasts_ns: int) -> Power:
+    def power(self, tick: int, timestamp_ns: int, lasts_ns: int) -> Power:
         """Supply and heat; what is older than `lasts_ns` is unknown."""
         now_ns = self._clock_ns()
         return Power(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             voltage_v=list(self._voltage_v),
             current_a=list(self._current_a),
             motor_c=list(self._motor_c),

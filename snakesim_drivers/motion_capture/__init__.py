@@ -3,5 +3,5 @@
 `mocap`          receives one UDP datagram for each captured frame
 `mocap_sample`   the datagram
 `mocap_times`    checks the timestamps of frames: their order, delay, and jumps of the system's clock
-`mocap_twin`     an emulated motion-capture system
+`emulated_mocap`     an emulated motion-capture system
 """

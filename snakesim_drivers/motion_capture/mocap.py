@@ -1,8 +1,8 @@
 """The base's pose from a motion-capture system: one JSON datagram by UDP for every captured frame.
 
-    {"stamp_ns": 1234567890, "position_w": [x, y, z], "orientation_wxyz": [w, x, y, z]}
+    {"timestamp_ns": 1234567890, "position_w": [x, y, z], "orientation_wxyz": [w, x, y, z]}
 
-in m, in the world of the scene file, of the tail end of link 0. `stamp_ns` is the capture time by any steady
+in m, in the world of the scene file, of the tail end of link 0. `timestamp_ns` is the capture time by any steady
 clock of the motion-capture system; `mocap_times` relates it to ours. `velocity_w` and
 `angular_velocity_w` are optional; otherwise both are derived from two poses and their stamps, and a pose without a
 velocity is dropped.
@@ -49,10 +49,10 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
 
 
 def receiver(
-    config: RunConfig, pose_listen: str | None, *, twins: bool, clock: Callable[[int], int]
+    config: RunConfig, pose_listen: str | None, *, emulators: bool, clock: Callable[[int], int]
 ) -> "MocapReceiver | None":
-    """A receiver, if the robot has a [sensors.pose] and there is an address; twins send to any free port."""
-    address = pose_listen or ("127.0.0.1:0" if twins else "")
+    """A receiver, if the robot has a [sensors.pose] and there is an address; emulators send to any free port."""
+    address = pose_listen or ("127.0.0.1:0" if emulators else "")
     camera = config.robot.sensors.pose
     if camera is None or not address:
         return None
@@ -91,22 +91,22 @@ class MocapReceiver:
         host, port = self._socket.getsockname()
         return f"{host}:{port}"
 
-    def newest(self, tick: int, stamp_ns: int) -> Pose | None:
+    def newest(self, tick: int, timestamp_ns: int) -> Pose | None:
         """The newest pose since the last call, stamped with the robot time of its capture; None without a valid one."""
-        now_ns = self._clock(stamp_ns)
+        now_ns = self._clock(timestamp_ns)
         sample = self._newest_sample(now_ns)
         if sample is None:
             return None
         before, self._last = self._last, sample
         velocities = self._velocities(before, sample)
-        age_ns = self._times.late_ns(sample.stamp_ns, now_ns) + self._delay_ns
-        if velocities is None or age_ns > stamp_ns:  # the latter: captured before the robot's time began
+        age_ns = self._times.late_ns(sample.timestamp_ns, now_ns) + self._delay_ns
+        if velocities is None or age_ns > timestamp_ns:  # the latter: captured before the robot's time began
             return None
         # A late tick makes poses that arrived meanwhile seem older; but each was captured after the one before.
-        self._told_ns = max(stamp_ns - age_ns, self._told_ns + 1)
+        self._told_ns = max(timestamp_ns - age_ns, self._told_ns + 1)
         return Pose(
             tick=tick,
-            stamp_ns=self._told_ns,
+            timestamp_ns=self._told_ns,
             position_w=sample.position_w,
             orientation_wxyz=sample.orientation_wxyz,
             velocity_w=velocities[0],
@@ -125,12 +125,12 @@ class MocapReceiver:
     def _newest_sample(self, now_ns: int) -> MocapSample | None:
         samples = self._read()
         newest: MocapSample | None = None
-        refusals = self._times.judge([sample.stamp_ns for sample in samples], now_ns)
+        refusals = self._times.judge([sample.timestamp_ns for sample in samples], now_ns)
         for sample, refusal in zip(samples, refusals, strict=True):
             if refusal is None:
                 newest = sample
             else:
-                self._refuse(refusal, f"stamp_ns = {sample.stamp_ns}")
+                self._refuse(refusal, f"timestamp_ns = {sample.timestamp_ns}")
         if self._times.jumps != self._jumps:
             self._jumps, self._last = self._times.jumps, None
             _log.warning("pose: the clock of the motion-capture system has jumped; its new time is accepted")
@@ -167,9 +167,9 @@ class MocapReceiver:
         """Linear and angular, in the world; None if they are neither sent nor derived from two poses."""
         if now.velocity_w is not None and now.angular_velocity_w is not None:
             return now.velocity_w, now.angular_velocity_w
-        if before is None or now.stamp_ns - before.stamp_ns > LONGEST_GAP_NS:
+        if before is None or now.timestamp_ns - before.timestamp_ns > LONGEST_GAP_NS:
             return None
-        seconds = (now.stamp_ns - before.stamp_ns) * 1e-9
+        seconds = (now.timestamp_ns - before.timestamp_ns) * 1e-9
         if math.dist(before.position_w, now.position_w) > MAX_SPEED_M_S * seconds:
             self._refuse("leap", f"from {before.position_w} to {now.position_w} m in {seconds:.3g} s")
             return None

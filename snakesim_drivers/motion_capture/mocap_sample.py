@@ -8,7 +8,7 @@ from snakesim_hal.wire import quantities as q
 class MocapSample(msgspec.Struct, frozen=True, kw_only=True):
     """One datagram: pose of the base (tail end of link 0) in the world, and its capture time."""
 
-    stamp_ns: q.Nanoseconds  # of the motion-capture system's own clock
+    timestamp_ns: q.Nanoseconds  # of the motion-capture system's own clock
     position_w: q.Vector
     orientation_wxyz: q.Quaternion
     velocity_w: q.VelocityVector | None = None

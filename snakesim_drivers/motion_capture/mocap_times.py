@@ -35,52 +35,56 @@ class CaptureTimes:
         self._other: _Candidate | None = None
         self.jumps = 0  # of the other clock
 
-    def judge(self, stamps_ns: Sequence[int], now_ns: int) -> list[Refusal | None]:
+    def judge(self, timestamps_ns: Sequence[int], now_ns: int) -> list[Refusal | None]:
         """Why each of the stamps of one reading is rejected; None for the valid ones."""
-        if not stamps_ns:
+        if not timestamps_ns:
             return []
         if self._newest_ns is None:
-            self._offset.take(now_ns - max(stamps_ns), now_ns)
-        verdicts: list[Refusal | None] = [self._take(stamp_ns, now_ns) for stamp_ns in stamps_ns]
+            self._offset.take(now_ns - max(timestamps_ns), now_ns)
+        verdicts: list[Refusal | None] = [self._take(timestamp_ns, now_ns) for timestamp_ns in timestamps_ns]
         if None in verdicts:
             self._other = None
             return verdicts
         strange = [at for at, why in enumerate(verdicts) if why != "duplicate"]
-        if strange and self._believed(stamps_ns[strange[-1]], now_ns):
+        if strange and self._believed(timestamps_ns[strange[-1]], now_ns):
             verdicts[strange[-1]] = None
         return verdicts
 
-    def late_ns(self, stamp_ns: int, now_ns: int) -> int:
+    def late_ns(self, timestamp_ns: int, now_ns: int) -> int:
         """Delay of a sample relative to the fastest ones."""
-        return max(now_ns - stamp_ns - self._offset.least_ns, 0)
+        return max(now_ns - timestamp_ns - self._offset.min_ns, 0)
 
-    def _take(self, stamp_ns: int, now_ns: int) -> Refusal | None:
+    def _take(self, timestamp_ns: int, now_ns: int) -> Refusal | None:
         newest_ns = self._newest_ns
-        if newest_ns is not None and stamp_ns < newest_ns:
+        if newest_ns is not None and timestamp_ns < newest_ns:
             return "reordered"
-        if newest_ns is not None and stamp_ns < newest_ns + MIN_APART_NS:
+        if newest_ns is not None and timestamp_ns < newest_ns + MIN_APART_NS:
             return "duplicate"
-        late_ns = now_ns - stamp_ns - self._offset.least_ns
+        late_ns = now_ns - timestamp_ns - self._offset.min_ns
         if late_ns > MAX_LATE_NS:
             return "late"
         if late_ns < -MAX_EARLY_NS:
             return "future"
-        self._newest_ns = stamp_ns
-        self._offset.take(now_ns - stamp_ns, now_ns)
+        self._newest_ns = timestamp_ns
+        self._offset.take(now_ns - timestamp_ns, now_ns)
         return None
 
-    def _believed(self, stamp_ns: int, now_ns: int) -> bool:
+    def _believed(self, timestamp_ns: int, now_ns: int) -> bool:
         """A reading brought only rejected stamps; this is its last. True when the other clock has jumped."""
-        other, offset_ns = self._other, now_ns - stamp_ns
-        agrees = other is not None and abs(offset_ns - other.offset_ns) <= SAME_CLOCK_NS and stamp_ns > other.stamp_ns
+        other, offset_ns = self._other, now_ns - timestamp_ns
+        agrees = (
+            other is not None
+            and abs(offset_ns - other.offset_ns) <= SAME_CLOCK_NS
+            and timestamp_ns > other.timestamp_ns
+        )
         if other is None or not agrees:
-            other = self._other = _Candidate(offset_ns, stamp_ns)
+            other = self._other = _Candidate(offset_ns, timestamp_ns)
         other.readings += 1
-        other.stamp_ns = stamp_ns
+        other.timestamp_ns = timestamp_ns
         if other.readings < READINGS_TO_BELIEVE:
             return False
         self.jumps += 1
-        self._newest_ns, self._other, self._offset = stamp_ns, None, _Offset()
+        self._newest_ns, self._other, self._offset = timestamp_ns, None, _Offset()
         self._offset.take(offset_ns, now_ns)
         return True
 
@@ -90,7 +94,7 @@ class _Candidate:
     """The other clock's offset if the rejected stamps were right."""
 
     offset_ns: int
-    stamp_ns: int
+    timestamp_ns: int
     readings: int = 0
 
 
@@ -102,7 +106,7 @@ class _Offset:
         self._before_ns = self._now_ns = 0
 
     @property
-    def least_ns(self) -> int:
+    def min_ns(self) -> int:
         return min(self._before_ns, self._now_ns)
 
     def take(self, difference_ns: int, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Control: from trajectory and world model to set-points of every joint. Controllers are plug-ins.
+"""Control: from trajectory and world model to setpoints of every joint. Controllers are plug-ins.
 
 `controller`        the interface of a controller
 `hold`, `path_following`, `obstacle_triplet`   the shipped controllers

@@ -10,22 +10,22 @@ SMOOTHED_S = 0.1  # time constant: filters the noise of the pose
 
 
 class Advance:
-    """Tracks the body's centre of mass, which hardly moves when the body only wriggles."""
+    """Tracks the body's center of mass, which hardly moves when the body only wriggles."""
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[float, Vector]] = deque()  # time, smoothed centre; a window long
+        self._recent: deque[tuple[float, Vector]] = deque()  # time, smoothed center; a window long
 
-    def put(self, time_s: float, centre_w: Vector) -> None:
-        """The centre at a time; times must grow."""
+    def put(self, time_s: float, center_w: Vector) -> None:
+        """The center at a time; times must grow."""
         recent = self._recent
         if recent and time_s <= recent[-1][0]:
             return
-        smooth = centre_w
+        smooth = center_w
         if not recent or time_s - recent[-1][0] > WINDOW_S:
             recent.clear()
         else:
             last_s, (a, b, c) = recent[-1]
-            keep, (x, y, z) = math.exp(-(time_s - last_s) / SMOOTHED_S), centre_w
+            keep, (x, y, z) = math.exp(-(time_s - last_s) / SMOOTHED_S), center_w
             smooth = (x + keep * (a - x), y + keep * (b - y), z + keep * (c - z))
         recent.append((time_s, smooth))
         while time_s - recent[0][0] > WINDOW_S:
@@ -33,7 +33,7 @@ class Advance:
 
     @property
     def metres(self) -> float | None:
-        """Distance of the centre from its position a window ago, or at the first time; None: it was never known."""
+        """Distance of the center from its position a window ago, or at the first time; None: it was never known."""
         if not self._recent:
             return None
         return math.dist(self._recent[0][1], self._recent[-1][1])

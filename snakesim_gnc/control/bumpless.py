@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, JointState
 from snakesim_hal.wire.quantities import about, above
@@ -67,7 +67,7 @@ class HandOver:
 
 
 class BumplessReference:
-    """The reference of joints that are all in position mode, and set-points that follow it without a jump."""
+    """The reference of joints that are all in position mode, and setpoints that follow it without a jump."""
 
     def __init__(self, robot: Description, blend_s: float) -> None:
         """blend_s: in which a jump of the reference fades out."""
@@ -76,7 +76,7 @@ class BumplessReference:
         self._hand_over = HandOver(robot)
         self.reference_rad: Floats | None = None  # of the tick before; None before the first
 
-    def to(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> SetPoints:
+    def to(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> Setpoints:
         """Follow a reference. restarted: it may have jumped."""
         if self.reference_rad is None:
             self._hand_over.start(view.joints, reference_rad)

@@ -1,7 +1,7 @@
 """What measured contacts do to a body that stands: whether they push it on, or hold it back.
 
 Of a body that stands, all forces are in balance: what its contacts push it on with in sum, the ground's friction takes.
-Forces are means over the last 50 ms: those of one instant depend on how hard the surfaces are (`felt_force`).
+Forces are means over the last 50 ms: those of one instant depend on how hard the surfaces are (`measured_force`).
 """
 
 import math
@@ -9,14 +9,14 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.model.felt_force import FELT_OVER_S
+from snakesim_hal.model.measured_force import FELT_OVER_S
 from snakesim_hal.wire.messages import World, WorldContact
 
 HELD_SHARE = 0.5  # of the push: contacts that hold a body back with more than that jam it
 
 
 @dataclass(frozen=True)
-class Carried:
+class NetContactForce:
     """Measured contact forces on the body, counted along a direction."""
 
     strongest_n: float  # 0: nothing touches the body
@@ -34,14 +34,14 @@ class FeltContacts:
 
     def take(self, world: World) -> None:
         """A newer world model, or again the last one. Estimated contacts tell where the body touches, not how hard."""
-        stamp_ns = world.contacts_stamp_ns
-        if stamp_ns is None or world.contacts_from == "joint_torques":
+        timestamp_ns = world.contacts_timestamp_ns
+        if timestamp_ns is None or world.contacts_from == "joint_torques":
             self._last.clear()
             return
-        if self._last and stamp_ns == self._last[-1][0]:
+        if self._last and timestamp_ns == self._last[-1][0]:
             return
-        self._last.append((stamp_ns, world.contacts))
-        while not 0 <= stamp_ns - self._last[0][0] < round(FELT_OVER_S * 1e9):
+        self._last.append((timestamp_ns, world.contacts))
+        while not 0 <= timestamp_ns - self._last[0][0] < round(FELT_OVER_S * 1e9):
             self._last.popleft()
 
     def at(self, obstacles: Sequence[str | None]) -> list[float | None]:
@@ -61,7 +61,7 @@ class FeltContacts:
         count, sizes = len(self._last), [sums.get(name, (0.0, 0.0)) for name in obstacles]
         return [(x / count, y / count) for x, y in sizes]
 
-    def along(self, direction_w: Sequence[float]) -> Carried | None:
+    def along(self, direction_w: Sequence[float]) -> NetContactForce | None:
         """What they do along a direction, (2,) of any length; None when no sensor tells."""
         if not self._last:
             return None
@@ -75,7 +75,7 @@ class FeltContacts:
                 along[at] = along.get(at, 0.0) + share * ahead_n
                 strength[at] = strength.get(at, 0.0) + share * math.hypot(*force)
         holder = min(along, key=lambda at: along[at], default=None)
-        return Carried(
+        return NetContactForce(
             strongest_n=max(strength.values(), default=0.0),
             ahead_n=math.fsum(force for force in along.values() if force > 0.0),
             back_n=-math.fsum(force for force in along.values() if force < 0.0),
@@ -84,7 +84,7 @@ class FeltContacts:
         )
 
 
-def what_holds(force_n: float, carried: Carried | None, push_points: Sequence[str]) -> tuple[bool, str]:
+def what_holds(force_n: float, carried: NetContactForce | None, push_points: Sequence[str]) -> tuple[bool, str]:
     """Whether a body that stands is jammed, and why it stands, as far as its contacts show it.
 
     force_n: propulsion that is commanded. push_points: names of the obstacles that are to carry it.

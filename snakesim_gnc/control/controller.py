@@ -1,4 +1,4 @@
-"""The interface of a controller: settings in, then a view of the world each tick, set-points out. No clock, no I/O.
+"""The interface of a controller: settings in, then a view of the world each tick, setpoints out. No clock, no I/O.
 
 A controller is a class with a `Settings` Struct, a constructor that takes the robot and the settings, and `update`.
 It is created again at every arming, and called once a tick while the robot is armed. Any view may lack the world or the
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, start_of
 from snakesim_hal.wire.messages import Description, JointState, Message, Mode, Trajectory, World, WorldContact
@@ -66,7 +66,7 @@ class Report:
     propulsion_joint: int | None = None
     propulsion_n: float | None = None
     push_points: Sequence[WorldContact] = ()
-    solved_force_n: Sequence[float] = ()
+    desired_force_n: Sequence[float] = ()
     propulsion_torque_nm: float | None = None
     bending_torque_nm: Sequence[float] = ()
     reference_rad: Sequence[float] = ()
@@ -80,7 +80,7 @@ class Report:
 class Action:
     """A controller's answer to a view."""
 
-    set_points: SetPoints
+    setpoints: Setpoints
     report: Report = field(default_factory=Report)
 
 
@@ -96,7 +96,7 @@ class Controller(Protocol):
     def __init__(self, robot: Description, settings: Any) -> None: ...
 
     def update(self, view: View) -> Action:
-        """Set-points for the next period, in the order of `robot.joints`."""
+        """Setpoints for the next period, in the order of `robot.joints`."""
         ...
 
 
@@ -105,9 +105,9 @@ def motion_wanted(view: View) -> bool:
     return view.world is not None and view.trajectory is not None and view.trajectory.speed_m_s != 0.0
 
 
-def positions(robot: Description, angles_rad: Sequence[float]) -> SetPoints:
+def positions(robot: Description, angles_rad: Sequence[float]) -> Setpoints:
     """Every joint to an angle, tail to head, with its full torque."""
-    return SetPoints(
+    return Setpoints(
         [Mode.POSITION] * len(robot.joints),
         [float(angle) for angle in angles_rad],
         [joint.torque_limit_nm for joint in robot.joints],

@@ -1,4 +1,4 @@
-"""A wave whose joints yield to, and join in with, what they and their neighbours measure. Needs no map.
+"""A wave whose joints yield to, and join in with, what they and their neighbors measure. Needs no map.
 
     target = (amplitude + growth share + gains x contact forces) sin(phase - lag turns) + bend
              + FELT_RAD tanh(sum of gains x measured), which changes by at most FELT_RAD_S
@@ -49,8 +49,8 @@ class FeltWave(LateralUndulation):
         count = len(self._body.bends)
         share = np.arange(count)[::-1] / max(count - 1, 1)
         self._swing_rad = apart * (AMPLITUDE_RAD + GROWTH_RAD * share)
-        self._felt_rad: NDArray[np.float64] | None = None
-        self._most_felt_rad, self._felt_rad_s = apart * FELT_RAD, apart * FELT_RAD_S / slower
+        self._measured_rad: NDArray[np.float64] | None = None
+        self._max_measured_rad, self._measured_rad_s = apart * FELT_RAD, apart * FELT_RAD_S / slower
         self._gains = ANGLE_GAINS / apart, VELOCITY_GAINS / apart, TORQUE_GAINS
         self._limits = np.array(self._body.torque_limit_nm) / TRAINED_TORQUE_NM  # as multiples of the trained one's
         self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - share)) / count
@@ -58,7 +58,7 @@ class FeltWave(LateralUndulation):
     def start_from(self, angles_rad: NDArray[np.float64]) -> None:
         """What is felt then counts at once: the change to a wave is smooth anyway."""
         super().start_from(angles_rad)
-        self._felt_rad = None
+        self._measured_rad = None
 
     def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
         """Angles of all joints, a time later than before."""
@@ -68,10 +68,10 @@ class FeltWave(LateralUndulation):
         for measured, gains in zip((joints.angle_rad, joints.velocity_rad_s, shares), self._gains, strict=True):
             beside = np.pad(np.array(measured)[bends], 1)
             felt += gains[0] * beside[:-2] + gains[1] * beside[1:-1] + gains[2] * beside[2:]
-        felt, most_rad = self._most_felt_rad * np.tanh(felt), self._felt_rad_s * passed_s
-        if self._felt_rad is not None:
-            felt = self._felt_rad + np.clip(felt - self._felt_rad, -most_rad, most_rad)
-        self._felt_rad = felt
+        felt, upper_rad = self._max_measured_rad * np.tanh(felt), self._measured_rad_s * passed_s
+        if self._measured_rad is not None:
+            felt = self._measured_rad + np.clip(felt - self._measured_rad, -upper_rad, upper_rad)
+        self._measured_rad = felt
         reference[bends] += felt
         return reference
 

@@ -3,7 +3,7 @@
 Ages are in robot time, from the time of measurement. The limits are the scenario's `[max_age]`; the
 defaults follow from the normal rate of a stream:
 
-joints      as in the gate: three periods or 30 ms, and the sensor's delay; at most a lease
+joints      as in the limiter: three periods or 30 ms, and the sensor's delay; at most a lease
 world       guidance's lag, and three of its turns missed, or 0.2 s
 pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s; so of a pose that the
 contacts    service `sensor` tells, by its schedule
@@ -42,9 +42,9 @@ class Limits:
         period_s, own = robot.period_ns * 1e-9, config.max_age
         guidance = config.services.get("guidance", Service())
         navigation = config.services.get("navigation", Service())
-        turn_s, lag_s = guidance.every_ticks * period_s, guidance.lag_ticks * period_s
-        plan_s = navigation.every_ticks * period_s
-        planned_s = turn_s + lag_s + navigation.lag_ticks * period_s
+        turn_s, lag_s = guidance.decimation * period_s, guidance.latency_ticks * period_s
+        plan_s = navigation.decimation * period_s
+        planned_s = turn_s + lag_s + navigation.latency_ticks * period_s
         said = {keys.POSE: own.pose_s, keys.CONTACTS: own.contacts_s}
         sensors_s = {
             sensor.key: said[sensor.key] or sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz)
@@ -55,7 +55,7 @@ class Limits:
             sensors_s.pop(keys.POSE, None)
         elif keys.POSE not in sensors_s and SENSOR in config.services and config.mission.map == "known":
             teller = config.services[SENSOR]  # what it tells is in no description
-            told_s = teller.lag_ticks * period_s + _margin_s(teller.every_ticks * period_s)
+            told_s = teller.latency_ticks * period_s + _margin_s(teller.decimation * period_s)
             sensors_s[keys.POSE] = own.pose_s or turn_s + lag_s + told_s
         looking = [sensor for sensor in robot.sensors if sensor.key.startswith(LOOKING)]
         if looking and config.mission.map == "perceived":
@@ -70,38 +70,42 @@ class Limits:
 
     def against_joints(self, joints: JointState, now_ns: int) -> str:
         """Why a joint state is rejected; empty when it is fresh. now_ns: robot time."""
-        return _off(keys.JOINTS, joints.stamp_ns, now_ns, self.joints_s)
+        return _off(keys.JOINTS, joints.timestamp_ns, now_ns, self.joints_s)
 
     def against_world(self, world: World, now_ns: int) -> str:
         """Why a world model is rejected; empty when it is fresh."""
-        off = _off(keys.WORLD, world.stamp_ns, now_ns, self.world_s)
+        off = _off(keys.WORLD, world.timestamp_ns, now_ns, self.world_s)
         if off:
             return off
-        stamps = {keys.POSE: world.pose_stamp_ns, keys.CONTACTS: world.contacts_stamp_ns, DEPTH: world.depth_stamp_ns}
+        stamps = {
+            keys.POSE: world.pose_timestamp_ns,
+            keys.CONTACTS: world.contacts_timestamp_ns,
+            DEPTH: world.depth_timestamp_ns,
+        }
         found = [_off(key, stamps[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
         return "; ".join(filter(None, found))
 
-    def of_sensors(self, stamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
-        """Why samples are rejected, by key. stamps_ns: of the newest sample of each key that has had one."""
-        limits = {key: self.sensors_s[key] for key in stamps_ns if key in self.sensors_s}
-        found = {key: _off(key, stamps_ns[key], now_ns, limit_s) for key, limit_s in limits.items()}
+    def of_sensors(self, timestamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
+        """Why samples are rejected, by key. timestamps_ns: of the newest sample of each key that has had one."""
+        limits = {key: self.sensors_s[key] for key in timestamps_ns if key in self.sensors_s}
+        found = {key: _off(key, timestamps_ns[key], now_ns, limit_s) for key, limit_s in limits.items()}
         return {key: why for key, why in found.items() if why}
 
     def against_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
         """Why a trajectory is rejected; empty when it is fresh."""
-        if trajectory.stamp_ns is None:
+        if trajectory.timestamp_ns is None:
             return f"{keys.TRAJECTORY} was planned without a world model"
-        return _off(keys.TRAJECTORY, trajectory.stamp_ns, now_ns, self.trajectory_s)
+        return _off(keys.TRAJECTORY, trajectory.timestamp_ns, now_ns, self.trajectory_s)
 
 
 def _margin_s(turn_s: float) -> float:
     return max(MISSED * turn_s, MIN_MARGIN_S)
 
 
-def _off(key: str, stamp_ns: int | None, now_ns: int, limit_s: float) -> str:
-    if stamp_ns is None:
+def _off(key: str, timestamp_ns: int | None, now_ns: int, limit_s: float) -> str:
+    if timestamp_ns is None:
         return f"{keys.WORLD} was made without {key}"
-    age_s = (now_ns - stamp_ns) * 1e-9
+    age_s = (now_ns - timestamp_ns) * 1e-9
     if age_s > limit_s:
         return f"{key} is {age_s:.3g} s old, at most {limit_s:.3g} s"
     if age_s < -limit_s:

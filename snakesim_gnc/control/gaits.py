@@ -44,8 +44,8 @@ class _Gait:
         self._phase_rad += math.tau * view.period_s / self._set.period_s
         reference = np.zeros(len(self._from_head))
         self._shape(reference, self._phase_rad)
-        set_points = self._bumpless.to(view, reference)
-        return Action(set_points, Report(why=self.stays, reference_rad=reference.tolist()))
+        setpoints = self._bumpless.to(view, reference)
+        return Action(setpoints, Report(why=self.stays, reference_rad=reference.tolist()))
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:
         """Fill in the angles of all joints."""

@@ -33,7 +33,7 @@ class Progress:
         nodes = nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
         origins, self._head_w = nodes[:-1, :2], nodes[-1, :2]
         halves = 0.5 * (origins[1:] + origins[:-1])
-        self.centre_w = self._shares[:-1] @ halves + self._shares[-1] * 0.5 * (origins[-1] + self._head_w)
+        self.center_w = self._shares[:-1] @ halves + self._shares[-1] * 0.5 * (origins[-1] + self._head_w)
         self.height_m = float(nodes[:-1, 2].mean())
         forward = self._head_w - origins[0]
         self._heading_rad = math.atan2(forward[1], forward[0])
@@ -55,7 +55,7 @@ class Progress:
 
     def _begin(self) -> None:
         self._begun = True
-        self._origin_w = self.centre_w
+        self._origin_w = self.center_w
         heading_rad = self._heading_rad
         match self._goal:
             case HeadingGoal():
@@ -63,7 +63,7 @@ class Progress:
             case WaypointGoal():
                 self.goal_m = self._to_go()
             case None:
-                to_head = self._head_w - self.centre_w
+                to_head = self._head_w - self.center_w
                 heading_rad = math.atan2(to_head[1], to_head[0])
         self._direction_rad = heading_rad
         self._forward = np.array([math.cos(heading_rad), math.sin(heading_rad)])
@@ -77,7 +77,7 @@ class Progress:
 
     def _along(self) -> float:
         if not isinstance(self._goal, WaypointGoal):
-            return float((self.centre_w - self._origin_w) @ self._forward)
+            return float((self.center_w - self._origin_w) @ self._forward)
         while self._next < len(self._points_m) and self._head_to(self._next) <= self._goal.within_m:
             self._next += 1
         return (self.goal_m or 0.0) - self._to_go()

@@ -2,7 +2,7 @@
 
 For a robot that hangs by its tail, head down: on the ground, friction under the body would be taken for that of joints.
 Each joint goes slowly back and forth, for dry friction, and on top shakes at frequencies of its own, none of which
-another joint has. Neighbours start in opposite directions, so that the body stays near the vertical. The record is
+another joint has. Neighbors start in opposite directions, so that the body stays near the vertical. The record is
 judged by `snakesim identify`.
 """
 
@@ -77,9 +77,9 @@ def triangle(turns: float) -> float:
 def tones(joints: int, to_hz: float) -> list[list[tuple[float, float, float]]]:
     """Frequency, share and phase of each joint's tones: no two joints have one in common, and shares sum to 1."""
     pick = random.Random(SEED)
-    least_hz = to_hz / 10
+    min_rate_hz = to_hz / 10
     count = SPREAD * joints
-    grid_hz = [least_hz * (to_hz / least_hz) ** (k / max(count - 1, 1)) for k in range(count)]
+    grid_hz = [min_rate_hz * (to_hz / min_rate_hz) ** (k / max(count - 1, 1)) for k in range(count)]
     made: list[list[tuple[float, float, float]]] = []
     for i in range(joints):
         own = [grid_hz[i + joints * k] for k in range(SPREAD)]

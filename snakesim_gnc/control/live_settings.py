@@ -101,7 +101,7 @@ class LiveSettings:
         self._publisher.put(
             ControlSettings(
                 tick=clock.tick,
-                stamp_ns=clock.stamp_ns,
+                timestamp_ns=clock.timestamp_ns,
                 controller=self._name,
                 settings=settings,
                 schema=schema,

@@ -61,15 +61,15 @@ class ObstacleAided:
     """Speed along the path, with every joint."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
-        """Look-ahead l = lead_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
+        """Look-ahead l = speed_kp_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
 
-        lead_s: Annotated[
+        speed_kp_s: Annotated[
             float, from_zero(5, "s"), about("look-ahead of the shape for each m/s that the speed is too low")
         ] = 0.2
         integral_per_s: Annotated[
             float, from_zero(50, "1/s"), about("how fast the look-ahead grows while the speed stays too low")
         ] = 0.4
-        largest_look_ahead_m: Annotated[
+        max_look_ahead_m: Annotated[
             float, from_zero(1, "m"), about("bound of the look-ahead: how far ahead on its path the shape is at most")
         ] = 0.05
         fresh_look_ahead_m: Annotated[
@@ -83,23 +83,25 @@ class ObstacleAided:
             from_zero(100, "s"),
             about("for control experiments: after each such time the sign of the push is drawn at random; 0: never"),
         ] = 0.0
-        push_ns_m: Annotated[
+        speed_kp_n_s_per_m: Annotated[
             float, from_zero(1000, "N*s/m"), about("push on obstacles for each m/s that the speed is too low")
         ] = 25.0
-        push_n_m: Annotated[
+        lag_kp_n_per_m: Annotated[
             float, from_zero(1000, "N/m"), about("push on obstacles for each metre that the body has fallen behind")
         ] = 60.0
-        largest_push_n: Annotated[float, from_zero(1000, "N"), about("bound of the push along the path")] = 60.0
-        largest_torque_nm: Annotated[
+        max_push_n: Annotated[float, from_zero(1000, "N"), about("bound of the push along the path")] = 60.0
+        max_torque_nm: Annotated[
             float,
             from_zero(1000, "N*m"),
             about("bound of a joint's torque for pushing"),
         ] = 5.0
-        largest_contact_n: Annotated[
-            float, above(1000, "N"), about("bound of the force that is asked of one contact")
-        ] = 60.0
+        max_contact_n: Annotated[float, above(1000, "N"), about("bound of the force that is asked of one contact")] = (
+            60.0
+        )
         reach_m: Annotated[float, above(1, "m"), about("an obstacle so near to the body is pushed")] = 0.03
-        loose_m: Annotated[float, above(1, "m"), about("gap to an obstacle at which a contact counts half")] = 0.005
+        contact_gap_scale_m: Annotated[
+            float, above(1, "m"), about("gap to an obstacle at which a contact counts half")
+        ] = 0.005
         push_filter_s: Annotated[
             float, above(5, "s"), about("time constant of the filter of how the push is shared among contacts")
         ] = 0.05
@@ -114,7 +116,7 @@ class ObstacleAided:
         search_s: Annotated[float, above(1000, "s"), about("how long it does so, and then tries its path again")] = 30.0
         blend_s: Blend = 0.3
         speed_filter_s: SpeedFilter = 0.05
-        empty_price: Annotated[
+        no_contact_cost: Annotated[
             float,
             from_zero(1000, "1"),
             about("how many times dearer the force on an obstacle is that is not felt; 0: as dear as on others"),
@@ -176,9 +178,9 @@ class ObstacleAided:
         restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
         if restarted and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
-        set_points, self._waits = self._bumpless.to(view, reference, restarted=restarted), False
+        setpoints, self._waits = self._bumpless.to(view, reference, restarted=restarted), False
         force_n = ahead_m * float(self._stiffness @ turns_per_m**2)
-        return Action(set_points, self._report(view, located, force_n, reference))
+        return Action(setpoints, self._report(view, located, force_n, reference))
 
     def _balanced(self, time_s: float) -> bool:
         """Whether the obstacles beside the body have been able to hold a push for a while."""
@@ -196,22 +198,22 @@ class ObstacleAided:
         holding_nm = config.shape_nm_per_rad * off_rad + config.shape_nm_s_per_rad * slower_rad_s
         along = turns_per_m[bends]
         holding_nm = holding_nm - turns_per_m * float(along @ holding_nm[bends]) / (along @ along + STRAIGHT_PER_M2)
-        set_points = self._bumpless.to(view, reference)
+        setpoints = self._bumpless.to(view, reference)
         self._bumpless.let_go()
         self._integral_m, self._waits = min(self._integral_m, config.fresh_look_ahead_m), False
         for i in bends:
-            limit_nm = set_points.torque_limit_nm[i]
-            set_points.mode[i] = Mode.TORQUE
-            set_points.target[i] = min(max(float(holding_nm[i] + torques_nm[i]), -limit_nm), limit_nm)
-        return Action(set_points, self._report(view, located, 0.0, reference))
+            limit_nm = setpoints.torque_limit_nm[i]
+            setpoints.mode[i] = Mode.TORQUE
+            setpoints.target[i] = min(max(float(holding_nm[i] + torques_nm[i]), -limit_nm), limit_nm)
+        return Action(setpoints, self._report(view, located, 0.0, reference))
 
     def _undulate(self, view: View, wave: LateralUndulation, lifted: Floats) -> Action:
         """In search of something to push off."""
         self._torques_nm[:] = self._push_n = self._force_n = 0.0
         reference = wave.reference_rad(view, view.period_s) + lifted
-        set_points = self._bumpless.to(view, reference, restarted=self._search.changed)
+        setpoints = self._bumpless.to(view, reference, restarted=self._search.changed)
         why = "it does not come on: it moves by a wave, in search of contacts"
-        return Action(set_points, Report(why=why, reference_rad=reference.tolist()))
+        return Action(setpoints, Report(why=why, reference_rad=reference.tolist()))
 
     def _sign(self, time_s: float) -> float:
         """The same for every run, so that runs can be repeated."""
@@ -236,40 +238,40 @@ class ObstacleAided:
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + force_n,
             push_points=points,
-            solved_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
+            desired_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
             bending_torque_nm=self._torques_nm.tolist(),
             reference_rad=reference.tolist(),
-            torque_headroom_nm=self._set.largest_torque_nm - float(np.abs(self._torques_nm).max()),
+            torque_headroom_nm=self._set.max_torque_nm - float(np.abs(self._torques_nm).max()),
             saturated=0.0 < self._max_force_n <= force_n,
             jammed=bool(why) and jammed,
         )
 
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
-        largest_m = self._set.largest_look_ahead_m
+        max_m = self._set.max_look_ahead_m
         wanted_m_s = located.trajectory.speed_m_s
         error_m_s = wanted_m_s - located.speed_m_s
         self._integral_m += self._set.integral_per_s * error_m_s * period_s
-        self._integral_m = min(max(self._integral_m, -largest_m), largest_m)
-        return min(max(self._integral_m + self._set.lead_s * error_m_s, -largest_m), largest_m)
+        self._integral_m = min(max(self._integral_m, -max_m), max_m)
+        return min(max(self._integral_m + self._set.speed_kp_s * error_m_s, -max_m), max_m)
 
     def _push_nm(self, view: View, located: Located, turns_per_m: Floats) -> Floats:
         """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
         config, wanted_m_s, period_s = self._set, located.trajectory.speed_m_s, view.period_s
-        if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
+        if wanted_m_s <= 0.0 or config.max_push_n == 0.0:
             self._push_n = self._force_n = 0.0
             self._last_push = None
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
         sooner = SETS_OFF if abs(located.speed_m_s) < CREEPS_M_S else 1.0
-        self._push_n += sooner * config.push_n_m * error * period_s
-        self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
-        force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
+        self._push_n += sooner * config.lag_kp_n_per_m * error * period_s
+        self._push_n = min(max(self._push_n, 0.0), config.max_push_n)
+        force_n = min(max(self._push_n + config.speed_kp_n_s_per_m * error, 0.0), config.max_push_n)
         self._look(view.time_s, located, turns_per_m)
         self._push_n = min(self._push_n, self._max_force_n)  # who cannot push stores no force up for later
         self._force_n = force_n = min(force_n, self._max_force_n)
         keep = np.exp(-period_s / config.torque_filter_s)
         self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
-        bound = config.largest_torque_nm
+        bound = config.max_torque_nm
         return np.clip(self._torques_nm, -bound, bound)
 
     def _look(self, time_s: float, located: Located, turns_per_m: Floats) -> None:
@@ -283,18 +285,20 @@ class ObstacleAided:
         touches = find_touches(nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction)
         names = [located.world.obstacles[k].name for k in touches.obstacle.tolist()]
         felt = self._felt.forces_w(names)
-        felt_w = np.array(felt).reshape(-1, 2)  # none without a sensor
-        dearer = config.empty_price * np.exp(-np.hypot(*felt_w.T) / FELT_N) if felt else 0.0
+        measured_w = np.array(felt).reshape(-1, 2)  # none without a sensor
+        dearer = config.no_contact_cost * np.exp(-np.hypot(*measured_w.T) / FELT_N) if felt else 0.0
         turns_per_m = turns_per_m[self._bends]
-        push = push_forward(nodes_w, touches, turns_per_m, loose_m=config.loose_m, dearer=dearer)
+        push = push_forward(
+            nodes_w, touches, turns_per_m, contact_gap_scale_m=config.contact_gap_scale_m, dearer=dearer
+        )
         push = self._filter.take(time_s, push, names)
         self._last_push = PushSnapshot(located.world, touches, push)
         self._unit_nm, self._max_force_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))
         if push.rest < LARGEST_REST and largest > 0.0:  # a body bent into a U has hardly any drag, and needs no push
             self._unit_nm[self._bends] = push.torques_nm
-            largest_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-            self._max_force_n = min(config.largest_torque_nm / largest_nm, config.largest_contact_n / largest)
+            max_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
+            self._max_force_n = min(config.max_torque_nm / max_nm, config.max_contact_n / largest)
 
     def _rest(self, view: View) -> Action:
         """At speed 0 every joint stays where it is, and nothing pushes."""
@@ -306,7 +310,7 @@ class ObstacleAided:
             action = self._bumpless.hold(view, "")
         else:
             reference = np.array(view.joints.angle_rad)
-            set_points = self._bumpless.to(view, reference, restarted=True)
-            action = Action(set_points, Report(reference_rad=reference.tolist()))
+            setpoints = self._bumpless.to(view, reference, restarted=True)
+            action = Action(setpoints, Report(reference_rad=reference.tolist()))
         self._waits = True
         return action

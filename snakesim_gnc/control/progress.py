@@ -16,7 +16,7 @@ from snakesim_hal.wire.quantities import about, from_zero
 SpeedFilter = Annotated[
     float, from_zero(1, "s"), about("time constant of the filter of the speed along the path; 0: none")
 ]
-AGAIN_STEPS = 8  # to localise a body again that may have slid meanwhile
+AGAIN_STEPS = 8  # to localize a body again that may have slid meanwhile
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Located:
     nodes_w: Floats  # (2, n_nodes), last measurement
     measured_s_m: float  # arc length of the tail end then
     fresh: bool  # there is a new world model
-    restarted: bool  # on a new path, or localised again after it was unknown: the position may have jumped
+    restarted: bool  # on a new path, or localized again after it was unknown: the position may have jumped
     world: World
     trajectory: Trajectory
 
@@ -56,7 +56,7 @@ class Progress:
 
     def update(self, view: View) -> Located | str:
         """Position of the body at this tick, or why it is unknown."""
-        self._angles.put(view.joints.stamp_ns, view.joints.angle_rad)
+        self._angles.put(view.joints.timestamp_ns, view.joints.angle_rad)
         world, trajectory = view.world, view.trajectory
         if world is None or trajectory is None:
             self._measured_ns = None
@@ -78,7 +78,7 @@ class Progress:
         elif pose_ns > before_ns:
             self._filter(body, max(_seconds(pose_ns - before_ns, view), view.period_s))
         assert self._measured_ns is not None
-        s = self._s_m + self._speed_m_s * _seconds(view.joints.stamp_ns - self._measured_ns, view)
+        s = self._s_m + self._speed_m_s * _seconds(view.joints.timestamp_ns - self._measured_ns, view)
         restarted = new_path or before_ns is None
         fresh, self._world_tick = world.tick != self._world_tick, world.tick
         return Located(body, s, self._speed_m_s, self._nodes, self._s_m, fresh, restarted, world, trajectory)

@@ -98,27 +98,28 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
 
 
 def push_forward(
-    nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, loose_m: float, dearer: Floats | float = 0.0
+    nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, contact_gap_scale_m: float, dearer: Floats | float = 0.0
 ) -> Push:
     """Forces and torques for 1 N along the chain.
 
-    turns_per_m: (n_joints,) theta_i', rad per metre of the way, of the joints that bend. loose_m: a gap that makes a
-    contact count half. dearer: (k,) by how many times more than its size a contact's force counts, beside that.
+    turns_per_m: (n_joints,) theta_i', rad per metre of the way, of the joints that bend. contact_gap_scale_m: a gap
+    that makes a contact count half. dearer: (k,) by how many times more than its size a contact's force counts, beside
+    that.
     """
     rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
     lengths = np.hypot(*run.T)
     middles, tangents = rear + 0.5 * run, run / lengths[:, None]
     share = lengths / lengths.sum()
-    centre = share @ middles
-    drag = np.array([*(share @ tangents), share @ cross(middles - centre, tangents)])
-    arms = touches.places_w - centre
+    center = share @ middles
+    drag = np.array([*(share @ tangents), share @ cross(middles - center, tangents)])
+    arms = touches.places_w - center
     matrix = np.column_stack([touches.directions_w, cross(arms, touches.directions_w)]).T
     joints = nodes_w[:, 1:-1].T
     ahead = touches.body_s_m[None, :] > np.cumsum(lengths)[:-1, None]
     lever = -(ahead * cross(touches.places_w[None] - joints[:, None], touches.directions_w[None]))
     later = np.triu(np.ones((len(joints), len(lengths)), dtype=bool), 1)
     braked = (later * cross(middles[None] - joints[:, None], tangents[None])) @ share
-    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m + dearer
+    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / contact_gap_scale_m + dearer
     costs = THRIFT * np.abs(turns_per_m)
     full = np.vstack([BALANCE * matrix / weight, costs[:, None] * lever / weight, SMALL * np.eye(len(touches))])
     lambdas = _least_squares(full, np.concatenate([BALANCE * drag, -costs * braked, np.zeros(len(touches))])) / weight

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.control.carried import Carried, what_holds
+from snakesim_gnc.control.carried import NetContactForce, what_holds
 from snakesim_gnc.control.push import Push, Touches
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.wire.messages import World, WorldContact
@@ -37,7 +37,12 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, fo
 
 
 def why_it_stands(
-    touches: Touches, push: Push, force_n: float, max_force_n: float, carried: Carried | None, names: Sequence[str]
+    touches: Touches,
+    push: Push,
+    force_n: float,
+    max_force_n: float,
+    carried: NetContactForce | None,
+    names: Sequence[str],
 ) -> tuple[bool, str]:
     """Whether it is jammed, and the class of the stall.
 

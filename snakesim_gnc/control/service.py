@@ -57,7 +57,7 @@ class Control(Service):
         self._sensed: dict[str, Message] = {}
         self._task = Task.of(config) if asked else None
         self._statuses = client.session.reader(keys.STATUS, Status)
-        self._arming = -1
+        self._arm_session = -1
         self._armed_at_ns = 0
         self._noted: set[str] = set()  # streams that are too old, as the log has it
         self._last_clock: Clock | None = None
@@ -90,7 +90,7 @@ class Control(Service):
         if not mine:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
             return _state_messages(self._reports.state(clock, armed=armed, missing=why))
-        late = self._limits.against_joints(joints, clock.stamp_ns)
+        late = self._limits.against_joints(joints, clock.timestamp_ns)
         if late:
             self._note(clock, [late], "no commands")
             return _state_messages(self._reports.state(clock, armed=armed, missing=late))
@@ -126,7 +126,7 @@ class Control(Service):
             controller = self._made_for(clock)
             view = View(
                 tick=clock.tick,
-                time_s=(clock.stamp_ns - self._armed_at_ns) * 1e-9,
+                time_s=(clock.timestamp_ns - self._armed_at_ns) * 1e-9,
                 period_s=clock.period_ns * 1e-9,
                 joints=joints,
                 world=world,
@@ -136,7 +136,7 @@ class Control(Service):
             began_s = time.perf_counter()
             action = controller.update(view)
             self._note_time(clock, time.perf_counter() - began_s)
-            self._commander.send(clock, joints, action.set_points)
+            self._commander.send(clock, joints, action.setpoints)
             rests = _why_it_rests(trajectory)
             try:
                 state = self._reports.state(clock, action.report, armed=True, missing=missing, rests=rests)
@@ -151,9 +151,9 @@ class Control(Service):
         """World and trajectory as far as they are available and fresh, and why they are not."""
         world, trajectory = self._client.read(self._world), self._client.read(self._trajectory)
         late: list[str] = []
-        if world is not None and (why := self._limits.against_world(world, clock.stamp_ns)):
+        if world is not None and (why := self._limits.against_world(world, clock.timestamp_ns)):
             world, late = None, [why]
-        if trajectory is not None and (why := self._limits.against_trajectory(trajectory, clock.stamp_ns)):
+        if trajectory is not None and (why := self._limits.against_trajectory(trajectory, clock.timestamp_ns)):
             trajectory, late = None, [*late, why]
         self._note(clock, late, "the controller holds")
         if world is not None:
@@ -167,15 +167,15 @@ class Control(Service):
         for key, feed in self._feeds.items():
             if (sample := self._client.read(feed)) is not None:
                 self._sensed[key] = sample
-        stamps = {key: getattr(sample, "stamp_ns", None) for key, sample in self._sensed.items()}
-        return Senses(dict(self._sensed), self._limits.of_sensors(stamps, clock.stamp_ns), self._task)
+        stamps = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensed.items()}
+        return Senses(dict(self._sensed), self._limits.of_sensors(stamps, clock.timestamp_ns), self._task)
 
     def _made_for(self, clock: Clock) -> Guarded:
         """The controller of this arming, and of the settings in force."""
-        if self._controller is None or clock.arming != self._arming:
+        if self._controller is None or clock.arm_session != self._arm_session:
             self._controller = self._settings.controller()
-            if clock.arming != self._arming:
-                self._arming, self._armed_at_ns = clock.arming, clock.stamp_ns
+            if clock.arm_session != self._arm_session:
+                self._arm_session, self._armed_at_ns = clock.arm_session, clock.timestamp_ns
         return self._controller
 
     def _note_time(self, clock: Clock, took_s: float) -> None:
@@ -183,17 +183,19 @@ class Control(Service):
         before = self.too_slow
         self._times.add(took_s)
         self.too_slow = self._times.too_slow
-        if clock.pace == "realtime":  # elsewhere there are no deadlines, and no message may depend on the wall clock
+        if (
+            clock.clock_mode == "realtime"
+        ):  # elsewhere there are no deadlines, and no message may depend on the wall clock
             self._reports.too_slow = self.too_slow
         if self.too_slow and not before:
-            print_stderr(f"{clock.stamp_ns * 1e-9:.3f} s: {self.too_slow}")
+            print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {self.too_slow}")
 
     def _note(self, clock: Clock, late: Sequence[str] = (), so: str = "") -> None:
         """Write into the log when other streams are too old than before, and when all is fresh again."""
         streams = {why.partition(" ")[0] for why in late}
         if streams != self._noted:
             text = f"{'; '.join(late)}: {so}" if late else "all inputs of control are fresh again"
-            print_stderr(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
+            print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {text}")
         self._noted = streams
 
 

@@ -29,8 +29,8 @@ class StateReports:
     def follow(self, world: World) -> None:
         """Take where the body is, and what it feels, from a world model that is fresh."""
         self._felt.take(world)
-        if world.centre_w is not None:
-            self._advance.put(world.stamp_ns * 1e-9, world.centre_w)
+        if world.center_w is not None:
+            self._advance.put(world.timestamp_ns * 1e-9, world.center_w)
 
     def state(
         self,
@@ -67,12 +67,12 @@ class StateReports:
             report.propulsion_joint,
             report.jammed,
             clock.lifecycle,
-            clock.arming,
+            clock.arm_session,
             bool(self.too_slow),
         )
-        if not (silent or stands) and mark == self._last and clock.stamp_ns < self._next_ns:
+        if not (silent or stands) and mark == self._last and clock.timestamp_ns < self._next_ns:
             return None
-        self._last, self._next_ns = mark, clock.stamp_ns + round(TELEMETRY_S * 1e9)
+        self._last, self._next_ns = mark, clock.timestamp_ns + round(TELEMETRY_S * 1e9)
         return self._message(clock, state, reason, report)
 
     def failure(self, clock: Clock, why: str) -> ControlState:
@@ -83,7 +83,7 @@ class StateReports:
         joint = report.propulsion_joint
         message = ControlState(
             tick=clock.tick,
-            stamp_ns=clock.stamp_ns,
+            timestamp_ns=clock.timestamp_ns,
             controller=self._controller,
             state=state,
             reason=reason[:LONGEST],
@@ -91,8 +91,8 @@ class StateReports:
             propulsion_joint=None if joint is None else self._joints[joint],
             propulsion_n=report.propulsion_n,
             push_points=report.push_points,  # pyright: ignore[reportArgumentType] - any sequence can be sent
-            solved_force_n=report.solved_force_n,  # pyright: ignore[reportArgumentType]
-            felt_force_n=self._felt.at([point.obstacle for point in report.push_points]),
+            desired_force_n=report.desired_force_n,  # pyright: ignore[reportArgumentType]
+            measured_force_n=self._felt.at([point.obstacle for point in report.push_points]),
             propulsion_torque_nm=report.propulsion_torque_nm,
             bending_torque_nm=report.bending_torque_nm,  # pyright: ignore[reportArgumentType]
             reference_rad=report.reference_rad,  # pyright: ignore[reportArgumentType]

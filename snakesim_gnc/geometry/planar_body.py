@@ -32,7 +32,7 @@ class PlanarBody:
         self.segments_m = yaw_segments_m(axes, lengths)
         self.node_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]
         self.length_m = self.node_s_m[-1]
-        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighbouring joints that bend
+        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighboring joints that bend
         self.joint_s_m = np.cumsum(lengths)[:-1]
         self._joint_s: list[float] = self.joint_s_m.tolist()
         self._all_bend = len(self.bends) == len(axes)
@@ -76,18 +76,18 @@ class RecentAngles:
     def __bool__(self) -> bool:
         return bool(self._kept)
 
-    def put(self, stamp_ns: int, angles_rad: list[float]) -> None:
+    def put(self, timestamp_ns: int, angles_rad: list[float]) -> None:
         """Those of the newest joint state, which may be the one before again."""
-        if not self._kept or stamp_ns > self._kept[-1][0]:
-            self._kept.append((stamp_ns, angles_rad))
+        if not self._kept or timestamp_ns > self._kept[-1][0]:
+            self._kept.append((timestamp_ns, angles_rad))
 
-    def at(self, stamp_ns: int) -> list[float]:
+    def at(self, timestamp_ns: int) -> list[float]:
         """Those measured nearest to an instant."""
-        return min(self._kept, key=lambda held: abs(held[0] - stamp_ns))[1]
+        return min(self._kept, key=lambda held: abs(held[0] - timestamp_ns))[1]
 
 
 def pose_instant_ns(world: World) -> int:
     """When the body was at the world's base pose: that of the sensor, or dead-reckoned up to the world's own stamp."""
-    if world.pose_stamp_ns is None or world.base_position_sd_m is not None:
-        return world.stamp_ns
-    return world.pose_stamp_ns
+    if world.pose_timestamp_ns is None or world.base_position_sd_m is not None:
+        return world.timestamp_ns
+    return world.pose_timestamp_ns

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from snakesim_gnc.guidance.body_history import Body
-from snakesim_gnc.guidance.localisation import Localiser
+from snakesim_gnc.guidance.localization import Localizer
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Contact, Description, Obstacle
@@ -50,11 +50,11 @@ class Anchors:
         self._radii = np.array([link.radius_m for link in robot.links])
         self._share = (np.arange(POINTS) + 0.5) / POINTS
 
-    def hold(self, localiser: Localiser, angles_rad: Floats, felt: Sequence[Contact], trust: Trust) -> None:
-        """Correct the localiser's base, at the joint angles of its last move. felt: contacts of that time."""
+    def hold(self, localizer: Localizer, angles_rad: Floats, felt: Sequence[Contact], trust: Trust) -> None:
+        """Correct the localizer's base, at the joint angles of its last move. felt: contacts of that time."""
         if not len(self._outlines):
             return
-        body = localiser.history.lay(localiser.base, angles_rad)
+        body = localizer.history.lay(localizer.base, angles_rad)
         steps = (self._lengths[:, None] * body.rotations[:, :2, 0])[:, None]
         axis = (body.origins_w[:, None, :2] + self._share[:, None] * steps).reshape(-1, 2)
         gaps = self._outlines.distance_m(axis) - np.repeat(self._radii, POINTS)[:, None]
@@ -66,16 +66,16 @@ class Anchors:
         for obstacle, normal in zip(near.tolist(), normals, strict=True):
             at = int(nearest[obstacle])
             gap_m = float(gaps[at, obstacle])
-            if gap_m >= 0.0 and self._felt_n(body, felt, at, normal) <= MIN_FORCE_N:
+            if gap_m >= 0.0 and self._measured_force_n(body, felt, at, normal) <= MIN_FORCE_N:
                 continue
             found.append((gap_m, trust.sunk_m if gap_m < 0.0 else trust.touch_m))
-            x, y = axis[at] - localiser.base.planar_w[:2]
+            x, y = axis[at] - localizer.base.planar_w[:2]
             rows.append(np.array([normal[0], normal[1], normal[1] * x - normal[0] * y]))
         if rows:
             gaps_m, sds_m = np.array(found).T
-            localiser.correct_along(np.array(rows), -gaps_m, sds_m)
+            localizer.correct_along(np.array(rows), -gaps_m, sds_m)
 
-    def _felt_n(self, body: Body, felt: Sequence[Contact], at: int, normal_w: Floats) -> float:
+    def _measured_force_n(self, body: Body, felt: Sequence[Contact], at: int, normal_w: Floats) -> float:
         """Forces near a point of the axis that push the way that an obstacle there would."""
         place = (at + 0.5) / POINTS
         return math.fsum(

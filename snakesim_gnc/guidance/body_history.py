@@ -61,23 +61,23 @@ class BodyHistory:
         self._stamps: list[int] = []
         self._kept: list[tuple[Base, Floats]] = []
 
-    def add(self, stamp_ns: int, base: Base, angles_rad: Sequence[float]) -> None:
+    def add(self, timestamp_ns: int, base: Base, angles_rad: Sequence[float]) -> None:
         """Stamps must grow; an older or equal one is ignored."""
-        if self._stamps and stamp_ns <= self._stamps[-1]:
+        if self._stamps and timestamp_ns <= self._stamps[-1]:
             return
-        self._stamps.append(stamp_ns)
+        self._stamps.append(timestamp_ns)
         self._kept.append((base, np.asarray(angles_rad, dtype=np.float64)))
-        old = bisect_left(self._stamps, stamp_ns - KEPT_NS)
+        old = bisect_left(self._stamps, timestamp_ns - KEPT_NS)
         del self._stamps[:old], self._kept[:old]
 
-    def base_at(self, stamp_ns: int) -> Base | None:
+    def base_at(self, timestamp_ns: int) -> Base | None:
         """The base at a time; None when that is not in the history."""
-        found = self._at(stamp_ns)
+        found = self._at(timestamp_ns)
         return None if found is None else found[0]
 
-    def body_at(self, stamp_ns: int) -> Body | None:
+    def body_at(self, timestamp_ns: int) -> Body | None:
         """All links at a time; None when that is not in the history."""
-        found = self._at(stamp_ns)
+        found = self._at(timestamp_ns)
         return None if found is None else self.lay(*found)
 
     def lay(self, base: Base, angles_rad: Floats) -> Body:
@@ -93,17 +93,17 @@ class BodyHistory:
             x, y = around_w[0] + c * dx - s * dy + by[0], around_w[1] + s * dx + c * dy + by[1]
             self._kept[i] = Base(np.array([x, y, base.planar_w[2] + by[2]]), base.z_m, base.tilt), angles
 
-    def _at(self, stamp_ns: int) -> tuple[Base, Floats] | None:
-        if not self._stamps or not self._stamps[0] <= stamp_ns <= self._stamps[-1] + AHEAD_NS:
+    def _at(self, timestamp_ns: int) -> tuple[Base, Floats] | None:
+        if not self._stamps or not self._stamps[0] <= timestamp_ns <= self._stamps[-1] + AHEAD_NS:
             return None
-        after = bisect_left(self._stamps, stamp_ns)
+        after = bisect_left(self._stamps, timestamp_ns)
         if after == len(self._stamps):
             return self._kept[-1]
         (late, late_rad), late_ns = self._kept[after], self._stamps[after]
-        if after == 0 or late_ns == stamp_ns:
+        if after == 0 or late_ns == timestamp_ns:
             return late, late_rad
         (early, early_rad), early_ns = self._kept[after - 1], self._stamps[after - 1]
-        share = (stamp_ns - early_ns) / (late_ns - early_ns)
+        share = (timestamp_ns - early_ns) / (late_ns - early_ns)
         step = late.planar_w - early.planar_w
         step[2] = wrapped(step[2])
         nearer = late if share > 0.5 else early

@@ -28,10 +28,10 @@ FINE_RAD = np.array([-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]) * math.pi / 180
 class Boxes:
     """One a row."""
 
-    centre_w: Floats  # (b, 2)
+    center_w: Floats  # (b, 2)
     yaw_rad: Floats  # (b,)
     half_m: Floats  # (b, 2) along and across yaw
-    centre_sd_m: Floats  # (b, 2) along and across yaw
+    center_sd_m: Floats  # (b, 2) along and across yaw
     half_sd_m: Floats  # (b, 2)
     misfit: Floats  # (b,)
     faces: NDArray[np.int_]  # (b,) how many were seen
@@ -94,7 +94,7 @@ def _faces(points: Floats, weight: Floats, outward: Floats, yaw: Floats) -> tupl
 
 
 def _between(misfit: Floats, best: NDArray[np.intp]) -> Floats:
-    """Offset of the minimum of the parabola through the best heading and its neighbours, (b,)."""
+    """Offset of the minimum of the parabola through the best heading and its neighbors, (b,)."""
     rows, at = np.arange(len(best)), np.clip(best, 1, misfit.shape[1] - 2)
     left, middle, right = misfit[rows, at - 1], misfit[rows, at], misfit[rows, at + 1]
     bend = left - 2 * middle + right
@@ -119,8 +119,8 @@ def _closed(points: Floats, weight: Floats, outward: Floats, yaw: Floats, faces:
             information.append(np.where(mine, weight, 0.0).sum(axis=1))
     longest = np.maximum(high[0] - low[0], high[1] - low[1])
     depth = np.where(longest > WALL_M, THICKNESS_M, DEPTH_M)
-    centre, half = np.empty((len(yaw), 2)), np.empty((len(yaw), 2))
-    centre_sd, half_sd = np.empty_like(centre), np.empty_like(half)
+    center, half = np.empty((len(yaw), 2)), np.empty((len(yaw), 2))
+    center_sd, half_sd = np.empty_like(center), np.empty_like(half)
     for k in (0, 1):
         has_low, has_high = seen[2 * k], seen[2 * k + 1]
         ends = seen[2 - 2 * k] | seen[3 - 2 * k]  # a face of the other pair was seen: this pair is where its points end
@@ -133,8 +133,8 @@ def _closed(points: Floats, weight: Floats, outward: Floats, yaw: Floats, faces:
         sd_low, sd_high = (
             np.where(seen[2 * k + j], 1.0 / np.sqrt(np.maximum(information[2 * k + j], 1.0)), open_sd) for j in (0, 1)
         )
-        centre[:, k], half[:, k] = 0.5 * (bottom + top), np.maximum(0.5 * (top - bottom), 0.005)
-        centre_sd[:, k] = half_sd[:, k] = 0.5 * np.hypot(sd_low, sd_high)
+        center[:, k], half[:, k] = 0.5 * (bottom + top), np.maximum(0.5 * (top - bottom), 0.005)
+        center_sd[:, k] = half_sd[:, k] = 0.5 * np.hypot(sd_low, sd_high)
     c, s = np.cos(yaw), np.sin(yaw)
-    middle = np.stack([c * centre[:, 0] - s * centre[:, 1], s * centre[:, 0] + c * centre[:, 1]], axis=1)
-    return Boxes(middle, yaw, half, centre_sd, half_sd, misfit, np.sum(seen, axis=0))
+    middle = np.stack([c * center[:, 0] - s * center[:, 1], s * center[:, 0] + c * center[:, 1]], axis=1)
+    return Boxes(middle, yaw, half, center_sd, half_sd, misfit, np.sum(seen, axis=0))

@@ -1,7 +1,7 @@
 """Circles through the visible parts of surfaces, with covariance; many obstacles at once. Pure.
 
 Gauss-Newton on the distances of points from the circle, with a prior on the radius. The visible arc of a cylinder fixes
-centre and radius; a short arc leaves both uncertain along the line of sight, and the covariance says so.
+center and radius; a short arc leaves both uncertain along the line of sight, and the covariance says so.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ MODEL_SD_M = 0.0015  # of real surfaces from a circle or box, and of points that
 class Circles:
     """One a row."""
 
-    centre_w: Floats  # (b, 2)
+    center_w: Floats  # (b, 2)
     radius_m: Floats  # (b,)
     covariance: Floats  # (b, 3, 3) of x, y, radius
     misfit: Floats  # (b,) sum of squared, weighted, limited distances
@@ -30,17 +30,17 @@ class Circles:
 def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: Floats, began_w: Floats) -> Circles:
     """points (b, p, 2), weight (b, p), outward (b, p, 2), normal_weight (b, p), as of `batched`.
 
-    began_w: (b, 2) centres of earlier fits; NaN: none.
+    began_w: (b, 2) centers of earlier fits; NaN: none.
     """
     weight = softened(weight)
     share = weight / weight.sum(axis=1, keepdims=True)
-    centre = np.where(np.isnan(began_w), np.einsum("bp,bpk->bk", share, points - RADIUS_M * outward), began_w)
+    center = np.where(np.isnan(began_w), np.einsum("bp,bpk->bk", share, points - RADIUS_M * outward), began_w)
     radius = np.einsum(
-        "bp,bp->b", share, np.hypot(points[..., 0] - centre[:, None, 0], points[..., 1] - centre[:, None, 1])
+        "bp,bp->b", share, np.hypot(points[..., 0] - center[:, None, 0], points[..., 1] - center[:, None, 1])
     )
     information = np.zeros((len(points), 3, 3))
     for _ in range(STEPS):
-        offset = points - centre[:, None]
+        offset = points - center[:, None]
         distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)
         error = distance - radius[:, None]
         trusted = weight * np.minimum(1.0, OUTLIER_SD / np.maximum(np.abs(error) * np.sqrt(weight), 1e-9))
@@ -56,13 +56,13 @@ def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: 
         information[:, [0, 1], [0, 1]] += 1.0
         step = -np.linalg.solve(information, gradient[..., None])[..., 0]
         step *= np.minimum(1.0, 0.04 / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]
-        centre = centre + step[:, :2]
+        center = center + step[:, :2]
         radius = np.clip(radius + step[:, 2], SMALLEST_M, LARGEST_M)
-    offset = points - centre[:, None]
+    offset = points - center[:, None]
     error = np.hypot(offset[..., 0], offset[..., 1]) - radius[:, None]
     misfit = np.minimum(weight * error * error, OUTLIER_SD**2).sum(axis=1)
     surplus = np.maximum(misfit / np.maximum((weight > 0).sum(axis=1) - 3, 1), 1.0)
-    return Circles(centre, radius, np.linalg.inv(information) * surplus[:, None, None], misfit)
+    return Circles(center, radius, np.linalg.inv(information) * surplus[:, None, None], misfit)
 
 
 def softened(weight: Floats) -> Floats:

@@ -168,7 +168,7 @@ def _accelerations(body: Body, spins: Floats) -> Floats:
 def _motion(body: Body, spins: Floats, imu: Imu) -> tuple[Floats, Floats]:
     """Accelerations of the tail end and turning of each link, (n + 3,), and a root of their covariance.
 
-    Least squares over all accelerometers: neighbours share a joint, so that they correct one another.
+    Least squares over all accelerometers: neighbors share a joint, so that they correct one another.
     """
     model = _accelerations(body, spins)[:, imu.link].reshape(2 * len(imu.link), len(spins) + 3)
     in_links = np.reshape(imu.acceleration_m_s2, (-1, 3))

@@ -40,11 +40,11 @@ class WorldModel:
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
         origins, rotations = link_frames(pose.position_w, rotation, joints.angle_rad, self._axes, self._lengths)
         felt = [] if contacts is None else contacts.contacts
-        age_s = max(now_ns - pose.stamp_ns, 0) * 1e-9
+        age_s = max(now_ns - pose.timestamp_ns, 0) * 1e-9
         middles = origins + self._half_m[:, None] * rotations[:, :, 0]
         return World(
             tick=tick,
-            stamp_ns=joints.stamp_ns,
+            timestamp_ns=joints.timestamp_ns,
             base_position_w=pose.position_w,
             base_orientation_wxyz=pose.orientation_wxyz,
             base_confidence=math.exp(-age_s / POSE_MEMORY_S),
@@ -54,11 +54,11 @@ class WorldModel:
                 if c.link < len(origins)
             ],
             obstacles=self._obstacles_nearby(origins),
-            pose_stamp_ns=pose.stamp_ns,
+            pose_timestamp_ns=pose.timestamp_ns,
             pose_from="sensor",
-            contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
+            contacts_timestamp_ns=None if contacts is None else contacts.timestamp_ns,
             contacts_from=None if contacts is None else "sensor",
-            centre_w=tuple((self._shares @ middles).tolist()),
+            center_w=tuple((self._shares @ middles).tolist()),
         )
 
     def _touching(self, position_w: np.ndarray) -> str | None:
@@ -70,6 +70,6 @@ class WorldModel:
         return self._known[nearest].name if gaps[nearest] < 0.03 else None
 
     def _obstacles_nearby(self, origins: np.ndarray) -> list[Obstacle]:
-        x, y = (self._outlines.centre_w[:, None] - origins[:, :2]).transpose(2, 0, 1)
+        x, y = (self._outlines.center_w[:, None] - origins[:, :2]).transpose(2, 0, 1)
         gaps = np.hypot(x, y).min(axis=1) - self._outlines.reach_m
         return [self._known[i] for i in np.flatnonzero(gaps < self._reach_m)]

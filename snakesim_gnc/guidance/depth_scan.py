@@ -64,7 +64,7 @@ class DepthScanner:
         self._noise = noise
         self._step_rad = 1.0 / lens.fx_px
 
-    def scan(self, depth_m: Singles, stamp_ns: int, position_w: Floats, rotation: Floats, plane: Floats) -> Scan:
+    def scan(self, depth_m: Singles, timestamp_ns: int, position_w: Floats, rotation: Floats, plane: Floats) -> Scan:
         """depth_m: (height * width,). position_w, rotation: world_from_camera. plane: of the ground, first guess.
 
         The plane is z = a + b x + c y in the world, with x and y from the camera.
@@ -88,7 +88,7 @@ class DepthScanner:
         free = np.zeros(count)
         np.maximum.at(free, bins[floor], ranges[floor])
         return self._nearest(
-            stamp_ns, position_w[:2], yaw - fov / 2, free, bins[band], points[band], ranges[band], heights[band]
+            timestamp_ns, position_w[:2], yaw - fov / 2, free, bins[band], points[band], ranges[band], heights[band]
         )
 
     def _view(self, rotation: Floats) -> tuple[float, float]:
@@ -101,7 +101,7 @@ class DepthScanner:
 
     def _nearest(
         self,
-        stamp_ns: int,
+        timestamp_ns: int,
         origin_w: Floats,
         first_w: float,
         free: Floats,
@@ -133,7 +133,7 @@ class DepthScanner:
         top = np.full(count, -np.inf)
         np.maximum.at(top, bins[ours], heights[ours])
         return Scan(
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             origin_w=origin_w,
             azimuth_w=first_w,
             step_rad=self._step_rad,

@@ -9,7 +9,7 @@ from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
 from snakesim_hal.model.kinematics import tangents
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState, Pose, World
 
-NO_IMU = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+NO_IMU = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
 
 
 class EstimatedContacts(NamedTuple):
@@ -34,10 +34,10 @@ class ContactEstimator:
         """None while a joint's numbers are outdated. imu: counts if it is of the same instant as the joints."""
         if not all(joints.valid):
             return None
-        fresh = imu if imu is not None and imu.stamp_ns == joints.stamp_ns else NO_IMU
+        fresh = imu if imu is not None and imu.timestamp_ns == joints.timestamp_ns else NO_IMU
         felt = estimate(self._robot, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, fresh, pose)
         contacts = [self._contact(one) for one in felt]
-        message = Contacts(tick=joints.tick, stamp_ns=joints.stamp_ns, contacts=contacts)
+        message = Contacts(tick=joints.tick, timestamp_ns=joints.timestamp_ns, contacts=contacts)
         return EstimatedContacts(message, [one.confidence for one in felt])
 
     def _contact(self, felt: FeltContact) -> Contact:

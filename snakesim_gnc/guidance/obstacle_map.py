@@ -53,7 +53,7 @@ class ObstacleMap:
 
     def take_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
         """Take in a look. sd_m: of the sensor's position against the map."""
-        near = [t for t in self.tracks if math.hypot(*(t.centre_w - scan.origin_w)) < MAX_RANGE_M + 1.0]
+        near = [t for t in self.tracks if math.hypot(*(t.center_w - scan.origin_w)) < MAX_RANGE_M + 1.0]
         outlines = outlines_of(near)
         shares: dict[int, tuple[Track, list[Indices]]] = {}
         together: list[tuple[Track, Track]] = []
@@ -70,14 +70,14 @@ class ObstacleMap:
             towards = towards / np.maximum(scan.range_m[bins], 1e-6)[:, None]
             track.surface.add(scan.points_w[bins], scan.sd_m[bins], towards)
             track.believe(HIT)
-            track.last_seen_ns = scan.stamp_ns
+            track.last_seen_ns = scan.timestamp_ns
             track.top_m = max(track.top_m, float(np.nanmax(scan.top_m[bins])))
         seen = [track for track, _ in shares.values()]
         fit(seen)
         self._merge(seen, together)
         self._drop()
 
-    def take_touches(self, touches: Sequence[tuple[Floats, Floats]], stamp_ns: int) -> None:
+    def take_touches(self, touches: Sequence[tuple[Floats, Floats]], timestamp_ns: int) -> None:
         """Take in contacts: a point (2,) of a surface, and its normal (2,) into the body, of each."""
         felt: dict[int, Track] = {}
         for position_w, normal_w in touches:
@@ -85,7 +85,7 @@ class ObstacleMap:
             self._refresh(track)
             weight = 1.0 / (NORMAL_SD_RAD * track.radius_m) ** 2 if track.shape == "cylinder" else 0.0
             track.surface.add(position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([weight]))
-            track.felt, track.last_seen_ns = True, max(track.last_seen_ns, stamp_ns)
+            track.felt, track.last_seen_ns = True, max(track.last_seen_ns, timestamp_ns)
             track.believe(TOUCH)
             felt[track.number] = track
         fit(list(felt.values()))
@@ -128,7 +128,7 @@ class ObstacleMap:
 
     def forget(self, axis_w: Floats) -> None:
         """Forget what is far from the body, and the least believed when there is too much."""
-        kept = [t for t in self.tracks if np.hypot(*(axis_w - t.centre_w).T).min() < KEPT_M + _length_m(t)]
+        kept = [t for t in self.tracks if np.hypot(*(axis_w - t.center_w).T).min() < KEPT_M + _length_m(t)]
         kept.sort(key=lambda t: -t.log_odds)
         self.tracks = sorted(kept[:MAX_TRACKS], key=lambda t: t.number)
 
@@ -140,9 +140,9 @@ class ObstacleMap:
         if not near:
             return [(self._new(), cluster)] if len(cluster) >= min(MIN_POINTS, len(scan.range_m)) else []
         off = np.abs(outlines.distance_m(points))
-        gate = np.minimum(GATE_M + 2 * position_sd_m(near) + sd_m, WIDEST_GATE_M) + 2 * scan.sd_m[cluster][:, None]
+        limiter = np.minimum(GATE_M + 2 * position_sd_m(near) + sd_m, WIDEST_GATE_M) + 2 * scan.sd_m[cluster][:, None]
         nearest = off.argmin(axis=1)
-        fits = off[np.arange(len(cluster)), nearest] < gate[np.arange(len(cluster)), nearest]
+        fits = off[np.arange(len(cluster)), nearest] < limiter[np.arange(len(cluster)), nearest]
         counts = Counter(nearest[fits].tolist())
         owners = [k for k, n in counts.items() if n >= 0.2 * len(cluster) or n >= 4]
         if not owners:
@@ -152,7 +152,7 @@ class ObstacleMap:
         for k in owners:
             track = near[k]
             if track.shape == "cylinder" and track.position_sd_m < 0.01 and len(track.surface) > 6:
-                others |= (best == k) & (off[:, k] > gate[:, k] + APART_M)
+                others |= (best == k) & (off[:, k] > limiter[:, k] + APART_M)
         found = [(near[k], cluster[(best == k) & ~others]) for k in owners]
         if np.count_nonzero(others) > MIN_POINTS:
             found.append((self._new(), cluster[others]))
@@ -179,7 +179,7 @@ class ObstacleMap:
         if seen:
             outlines = outlines_of(self.tracks)
             for a in seen:
-                apart = np.hypot(*(outlines.centre_w - a.centre_w).T) - outlines.reach_m
+                apart = np.hypot(*(outlines.center_w - a.center_w).T) - outlines.reach_m
                 for k in np.flatnonzero(apart < max(a.radius_m, float(a.half_m.max())) + GATE_M):
                     b = self.tracks[k]
                     if b is not a:
@@ -220,7 +220,7 @@ class ObstacleMap:
         name = f"{'seen' if position_w is None else 'felt'}_{self._count}"
         track = Track(self._count, name, born_m2=self.here_m2, drift_m2=self._drift_m2)
         if position_w is not None and normal_w is not None:  # where the next touch of the same looks for it
-            track.centre_w, track.position_sd_m = position_w - RADIUS_M * normal_w, RADIUS_SD_M
+            track.center_w, track.position_sd_m = position_w - RADIUS_M * normal_w, RADIUS_SD_M
         self.tracks.append(track)
         return track
 

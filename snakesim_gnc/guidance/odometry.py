@@ -52,11 +52,11 @@ class Odometry:
         tilt: (3, 3) level_from_base. contacts, imu: only when they are fresh.
         """
         origins, rotations = link_frames(np.zeros(3), tilt, joints.angle_rad, self._axes, self._lengths)
-        before, self._before = self._before, (joints.stamp_ns, origins, rotations)
-        if before is None or joints.stamp_ns <= before[0]:
+        before, self._before = self._before, (joints.timestamp_ns, origins, rotations)
+        if before is None or joints.timestamp_ns <= before[0]:
             self._before = before or self._before
             return None
-        period_s = (joints.stamp_ns - before[0]) * 1e-9
+        period_s = (joints.timestamp_ns - before[0]) * 1e-9
         if period_s > LONGEST_S:
             return Step(np.zeros(3), np.diag([0.3 * period_s, 0.3 * period_s, period_s]) ** 2)
         turning = float(np.sqrt(np.mean(np.square(joints.velocity_rad_s))))

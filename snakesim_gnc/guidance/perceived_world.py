@@ -13,7 +13,7 @@ from snakesim_gnc.guidance.body_history import Base, Body
 from snakesim_gnc.guidance.contacts_w import contact_w
 from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, metres_of
 from snakesim_gnc.guidance.ground import plane_under
-from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
+from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.scan import Look, Noise, Scan, scan_of_ranges
 from snakesim_gnc.guidance.scan_match import matched
@@ -43,7 +43,7 @@ class PerceivedWorld:
     def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise) -> None:
         """start: where the robot is laid down. pose_noise: of the pose sensor."""
         self.map = ObstacleMap()
-        self.localiser = Localiser(robot, start, pose_noise)
+        self.localizer = Localizer(robot, start, pose_noise)
         self.refused: Counter[str] = Counter()  # samples that could not be used, by reason
         self._scanners: dict[tuple[Intrinsics, Noise], DepthScanner] = {}
         lengths = np.array([link.length_m for link in robot.links])
@@ -55,31 +55,31 @@ class PerceivedWorld:
         self._contacts: Contacts | None = None
         self._body: Body | None = None
         self._touched_ns = self._variance_m2 = 0
-        self.depth_stamp_ns: int | None = None  # of the newest image or ranges in the map
+        self.depth_timestamp_ns: int | None = None  # of the newest image or ranges in the map
 
     def take_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
         """The newest joint state moves the body. contacts, imu: the newest, for dead reckoning."""
-        if self._joints is not None and joints.stamp_ns <= self._joints.stamp_ns:
+        if self._joints is not None and joints.timestamp_ns <= self._joints.timestamp_ns:
             return
         self._joints = joints
-        self.localiser.move(joints, contacts, imu)
+        self.localizer.move(joints, contacts, imu)
 
     def take_pose(self, pose: Pose) -> None:
         """A sample of the pose sensor."""
-        self.localiser.take_pose(pose)
-        if self.localiser.carried_m:
-            self.map.drift(self.localiser.carried_m**2)
+        self.localizer.take_pose(pose)
+        if self.localizer.carried_m:
+            self.map.drift(self.localizer.carried_m**2)
 
     def take_contacts(self, contacts: Contacts) -> None:
         """Touches, and the body's own way: where it is, nothing else is."""
         self._contacts = contacts
-        if contacts.stamp_ns - self._touched_ns < TOUCH_EVERY_NS and self._touched_ns:
+        if contacts.timestamp_ns - self._touched_ns < TOUCH_EVERY_NS and self._touched_ns:
             return
-        body = self.localiser.history.body_at(contacts.stamp_ns)
+        body = self.localizer.history.body_at(contacts.timestamp_ns)
         if body is None:
             self.refused["contacts without a joint state of their time"] += 1
             return
-        self._touched_ns = contacts.stamp_ns
+        self._touched_ns = contacts.timestamp_ns
         touches: list[tuple[Floats, Floats]] = []
         for contact in contacts.contacts:
             if contact.link >= len(body.origins_w):
@@ -89,11 +89,11 @@ class PerceivedWorld:
             if abs(normal[2]) < UPRIGHT:
                 position = body.origins_w[contact.link] + rotation @ np.array(contact.position_l)
                 touches.append((position[:2], normal[:2] / math.hypot(*normal[:2])))
-        self.map.take_touches(touches, contacts.stamp_ns)
+        self.map.take_touches(touches, contacts.timestamp_ns)
 
     def take_look(self, look: Look, noise: Noise) -> None:
         """An image or a scan, of any camera, lidar or range finder. noise: of its distances."""
-        body = self._body_of(look.stamp_ns, "image" if isinstance(look, DepthImage) else "ranges")
+        body = self._body_of(look.timestamp_ns, "image" if isinstance(look, DepthImage) else "ranges")
         if body is None or look.link >= len(body.origins_w):
             return
         position, rotation = _mount(body, look)
@@ -104,7 +104,7 @@ class PerceivedWorld:
             scanner = self._scanners.get(kind)
             if scanner is None:
                 scanner = self._scanners[kind] = DepthScanner(*kind)
-            scan = scanner.scan(metres_of(look), look.stamp_ns, position, rotation, plane)
+            scan = scanner.scan(metres_of(look), look.timestamp_ns, position, rotation, plane)
         else:
             scan = scan_of_ranges(look, position, rotation, float(plane[0]), noise)
         self._take(scan, body)
@@ -114,7 +114,7 @@ class PerceivedWorld:
         joints = self._joints
         if joints is None:
             return None
-        here = self.localiser
+        here = self.localizer
         base = here.base
         body = self._body = here.history.lay(base, np.asarray(joints.angle_rad))
         self.map.take_body(body.axis_w(), self._radius_m, min(here.position_sd_m, 0.01))
@@ -122,42 +122,42 @@ class PerceivedWorld:
         middles = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
         contacts = self._contacts
         felt = [] if contacts is None else [c for c in contacts.contacts if c.link < len(body.origins_w)]
-        then = body if contacts is None else here.history.body_at(contacts.stamp_ns) or body
+        then = body if contacts is None else here.history.body_at(contacts.timestamp_ns) or body
         contacts_w = [
             contact_w(c, then.origins_w, then.rotations, self._rear_s, self._name_at) for c in felt[:MAX_CONTACTS]
         ]
         return World(
             tick=tick,
-            stamp_ns=joints.stamp_ns,
+            timestamp_ns=joints.timestamp_ns,
             base_position_w=tuple(base.position_w.tolist()),
             base_orientation_wxyz=quaternion_of(base.rotation),
             base_confidence=confidence_of(here.position_sd_m),
             contacts=contacts_w,
             obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
-            pose_stamp_ns=here.pose_stamp_ns,
-            contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
-            centre_w=tuple((self._shares @ middles).tolist()),
+            pose_timestamp_ns=here.pose_timestamp_ns,
+            contacts_timestamp_ns=None if contacts is None else contacts.timestamp_ns,
+            center_w=tuple((self._shares @ middles).tolist()),
             base_position_sd_m=min(here.position_sd_m, 1e3),
             base_yaw_sd_rad=min(here.yaw_sd_rad, 10.0),
-            depth_stamp_ns=self.depth_stamp_ns,
+            depth_timestamp_ns=self.depth_timestamp_ns,
             pose_from="sensor" if self._trusts_pose(now_ns) else "dead_reckoning",
             contacts_from=None if contacts is None else "sensor",
         )
 
     def _trusts_pose(self, now_ns: int) -> bool:
         """Whether the pose sensor has just told; else dead reckoning goes on alone, and the map helps."""
-        pose_ns = self.localiser.pose_stamp_ns
+        pose_ns = self.localizer.pose_timestamp_ns
         return pose_ns is not None and now_ns - pose_ns <= TRUSTED_NS
 
-    def _body_of(self, stamp_ns: int, what: str) -> Body | None:
+    def _body_of(self, timestamp_ns: int, what: str) -> Body | None:
         """The body at a sample's stamp; None when it is unknown, which is counted."""
         if self._joints is None or not all(self._joints.valid):
             self.refused[f"{what} while a joint's angle is unknown"] += 1
             return None
-        if self.depth_stamp_ns is not None and stamp_ns < self.depth_stamp_ns:
+        if self.depth_timestamp_ns is not None and timestamp_ns < self.depth_timestamp_ns:
             self.refused[f"{what} older than one before"] += 1
             return None
-        body = self.localiser.history.body_at(stamp_ns)
+        body = self.localizer.history.body_at(timestamp_ns)
         if body is None:
             self.refused[f"{what} without a joint state of its time"] += 1
         return body
@@ -165,17 +165,17 @@ class PerceivedWorld:
     def _take(self, scan: Scan, body: Body) -> None:
         offset = scan.points_w[:, None] - body.axis_w()
         scan = scan.without(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < self._radius_m + OWN_BODY_M)
-        here = self.localiser
+        here = self.localizer
         variance = 0.5 * float(np.trace(here.covariance[:2, :2]))
         self.map.drift(max(variance - self._variance_m2, 0.0))
         self.map.here_m2 = variance
-        if not self._trusts_pose(scan.stamp_ns):
-            then = here.history.base_at(scan.stamp_ns)
+        if not self._trusts_pose(scan.timestamp_ns):
+            then = here.history.base_at(scan.timestamp_ns)
             found = None if then is None else matched(scan, self.map.tracks, then.planar_w)
             if then is not None and found is not None:
                 here.correct(then, found.planar_w, found.covariance, found.map_m2)
                 scan = scan.moved(then.planar_w, found.planar_w)
-        self.depth_stamp_ns = scan.stamp_ns
+        self.depth_timestamp_ns = scan.timestamp_ns
         self.map.take_scan(scan, min(here.position_sd_m, 0.02))
         self._variance_m2 = 0.5 * float(np.trace(here.covariance[:2, :2]))
 
@@ -200,8 +200,8 @@ def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
             [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
         ]
     )
-    by_largest = four_times_products[np.argmax(np.diagonal(four_times_products))]
-    return tuple((by_largest / np.linalg.norm(by_largest)).tolist())
+    by_maximum = four_times_products[np.argmax(np.diagonal(four_times_products))]
+    return tuple((by_maximum / np.linalg.norm(by_maximum)).tolist())
 
 
 def _mount(body: Body, sensor: Look) -> tuple[Floats, Floats]:

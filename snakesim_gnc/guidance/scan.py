@@ -35,7 +35,7 @@ class Noise:
 class Scan:
     """One look, in `len(range_m)` bins of equal width in azimuth, counter-clockwise from `azimuth_w`."""
 
-    stamp_ns: int
+    timestamp_ns: int
     origin_w: Floats  # (2,) of the sensor, on the ground
     azimuth_w: float  # of the first bin's right edge
     step_rad: float
@@ -53,7 +53,7 @@ class Scan:
         return np.where(found < len(self.range_m), found, -1), np.hypot(offset[..., 0], offset[..., 1])
 
     def clear_m(self) -> Floats:
-        """How far one can see in each bin and both its neighbours: what is nearer is not there, (n,)."""
+        """How far one can see in each bin and both its neighbors: what is nearer is not there, (n,)."""
         seen = np.where(np.isnan(self.range_m), self.free_m, self.range_m)
         padded = np.pad(seen, 1, mode="edge")
         return np.minimum(np.minimum(padded[:-2], padded[2:]), seen)
@@ -93,7 +93,7 @@ def scan_of_ranges(ranges: Ranges, position_w: Floats, rotation: Floats, ground_
     hit = near & (height > BAND_M[0]) & (height < BAND_M[1])
     points = position_w[:2] + measured[:, None] * beams[:, :2]
     return Scan(
-        stamp_ns=ranges.stamp_ns,
+        timestamp_ns=ranges.timestamp_ns,
         origin_w=position_w[:2],
         azimuth_w=math.atan2(beams[0, 1], beams[0, 0]) - 0.5 * abs(step),
         step_rad=abs(step),

@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.core import WorldModel
 from snakesim_gnc.guidance.estimated_contacts import ContactEstimator, with_estimated
-from snakesim_gnc.guidance.localisation import PoseNoise
+from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.reckoned_pose import ReckonedPose
 from snakesim_gnc.guidance.scan import Look, Noise
@@ -93,7 +93,7 @@ class _Surveyed:
         if self._reckoned is not None:
             pose = self._reckoned.move(joints, contacts, estimated=estimated is not None)
         assert pose is not None
-        world = self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose)
+        world = self._model.update(clock.tick, clock.timestamp_ns, joints, contacts, pose)
         if estimated is not None:
             world = with_estimated(world, estimated)
         return world if self._reckoned is None else self._reckoned.told_in(world)
@@ -109,7 +109,7 @@ class _Perceived:
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts) if robot.sensors.contacts else None
         self._imu = client.subscribe(keys.IMU, Imu) if robot.sensors.imu else None
-        by_pose = config.mission.localisation == "pose_sensor"
+        by_pose = config.mission.localization == "pose_sensor"
         self._pose = client.subscribe(keys.POSE, Pose) if by_pose else None
         self._looks = [
             (client.subscribe(key, kind), _noise(sensor))
@@ -134,17 +134,17 @@ class _Perceived:
         pose = None if self._pose is None else read(self._pose)
         if pose is not None:
             model.take_pose(pose)
-        if contacts is not None and self._is_new(keys.CONTACTS, contacts.stamp_ns):
+        if contacts is not None and self._is_new(keys.CONTACTS, contacts.timestamp_ns):
             model.take_contacts(contacts)
         for feed, noise in self._looks:
             look: Any = read(feed)
-            if look is not None and self._is_new(feed.key, look.stamp_ns):
+            if look is not None and self._is_new(feed.key, look.timestamp_ns):
                 model.take_look(look, noise)
-        return model.world(clock.tick, clock.stamp_ns)
+        return model.world(clock.tick, clock.timestamp_ns)
 
-    def _is_new(self, key: str, stamp_ns: int) -> bool:
-        new = self._taken.get(key) != stamp_ns
-        self._taken[key] = stamp_ns
+    def _is_new(self, key: str, timestamp_ns: int) -> bool:
+        new = self._taken.get(key) != timestamp_ns
+        self._taken[key] = timestamp_ns
         return new
 
 

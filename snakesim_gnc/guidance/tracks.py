@@ -45,7 +45,7 @@ class Track:
     born_m2: float = 0.0  # variance of the robot's position when it was first seen: the map is no better than that
     drift_m2: float = 0.0  # of the robot's position, when the surface was last brought up to date
     shape: Literal["cylinder", "box"] = "cylinder"
-    centre_w: Floats = field(default_factory=lambda: np.zeros(2))
+    center_w: Floats = field(default_factory=lambda: np.zeros(2))
     yaw_rad: float = 0.0
     radius_m: float = RADIUS_M
     half_m: Floats = field(default_factory=lambda: np.zeros(2))
@@ -69,7 +69,7 @@ class Track:
     def obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
         """As a message."""
         height = max(self.top_m, UNKNOWN_HEIGHT_M)
-        x, y = self.centre_w.tolist()
+        x, y = self.center_w.tolist()
         boxy = self.shape == "box"
         return Obstacle(
             name=self.name,
@@ -92,7 +92,7 @@ def fit(tracks: Sequence[Track]) -> None:
     if not tracks:
         return
     points, weight, outward, normal = batched([track.surface for track in tracks])
-    began = np.array([track.centre_w if track.shape == "cylinder" and track.fitted else LOST for track in tracks])
+    began = np.array([track.center_w if track.shape == "cylinder" and track.fitted else LOST for track in tracks])
     circles = fit_circles(points, weight, outward, normal, began)
     cells = np.array([len(track.surface) for track in tracks])
     as_circle = circles.misfit + 3 * np.log(np.maximum(cells, 2))
@@ -109,15 +109,15 @@ def fit(tracks: Sequence[Track]) -> None:
         loyalty = LOYALTY * (track.shape == "cylinder" or -1) if track.fitted else 0.0
         if boxes is None or as_circle[i] <= as_box[i] + loyalty:
             track.shape, track.cost = "cylinder", float(as_circle[i])
-            track.centre_w, track.radius_m = circles.centre_w[i], float(circles.radius_m[i])
+            track.center_w, track.radius_m = circles.center_w[i], float(circles.radius_m[i])
             spread = circles.covariance[i]
             track.position_sd_m = math.sqrt(float(np.linalg.eigvalsh(spread[:2, :2])[-1]))
             track.size_sd_m = math.sqrt(float(spread[2, 2]))
         else:
             k = row[i]
             track.shape, track.cost = "box", float(as_box[i])
-            track.centre_w, track.half_m, track.yaw_rad = boxes.centre_w[k], boxes.half_m[k], float(boxes.yaw_rad[k])
-            track.position_sd_m = float(boxes.centre_sd_m[k].max())
+            track.center_w, track.half_m, track.yaw_rad = boxes.center_w[k], boxes.half_m[k], float(boxes.yaw_rad[k])
+            track.position_sd_m = float(boxes.center_sd_m[k].max())
             track.size_sd_m = float(boxes.half_sd_m[k].max())
 
 
@@ -127,7 +127,7 @@ def outlines_of(tracks: Sequence[Track]) -> Outlines:
     yaw = np.array([t.yaw_rad for t in tracks], dtype=np.float64)
     half = np.array([t.half_m for t in tracks], dtype=np.float64).reshape(-1, 2)
     return Outlines(
-        centre_w=np.array([t.centre_w for t in tracks], dtype=np.float64).reshape(-1, 2),
+        center_w=np.array([t.center_w for t in tracks], dtype=np.float64).reshape(-1, 2),
         turn=np.column_stack([np.cos(yaw), np.sin(yaw)]),
         half_m=np.where(boxy[:, None], half, 0.0),
         rounding_m=np.where(boxy, 0.0, [t.radius_m for t in tracks]),

@@ -138,7 +138,7 @@ class ClutterPlanner:
             speed_m_s *= -0.5
         return Trajectory(
             tick=tick,
-            stamp_ns=world.stamp_ns,
+            timestamp_ns=world.timestamp_ns,
             path_id=self._path_id_shown,
             path_w=[(float(x), float(y)) for x, y in planned.route.points_w],
             speed_m_s=speed_m_s,
@@ -162,11 +162,11 @@ class ClutterPlanner:
             self._recent.clear()  # who is to stand still is not stuck
         else:
             committed_m = COMMITTED_M + max(desired.speed_m_s, 0.0) * self._planning_s
-            moved_m = self._moved_m(body, world.stamp_ns)
+            moved_m = self._moved_m(body, world.timestamp_ns)
             if self._plan is None and (why := self._why_again(body, world, moved_m, committed_m)):
                 self._begin(why, body, world, committed_m)
         if self._plan is not None:
-            self._plan_on(world.stamp_ns)
+            self._plan_on(world.timestamp_ns)
 
     def _begin(self, why: str, body: Floats, world: World, committed_m: float) -> None:
         """Begin to plan again, from where the body is now."""
@@ -240,7 +240,7 @@ class ClutterPlanner:
 
     def _why_again(self, body: Floats, world: World, moved_m: float | None, committed_m: float) -> str:
         """Why the path is to be replanned; empty when it is not. Decides about backing out, too."""
-        planned, now_ns = self._planned, world.stamp_ns
+        planned, now_ns = self._planned, world.timestamp_ns
         assert planned is not None
         head_s = planned.route.project(body[-1])
         if self._back_from_m is not None:
@@ -302,8 +302,8 @@ class ClutterPlanner:
 def _shapes_near(head: Floats, obstacles: Sequence[Obstacle]) -> Floats:
     """Places and shapes of the obstacles around the head, one row each."""
     outlines = Outlines.of(obstacles)
-    near = np.hypot(*(outlines.centre_w - head).T) < SEEN_M
-    return np.column_stack([outlines.centre_w, outlines.half_m, outlines.rounding_m])[near]
+    near = np.hypot(*(outlines.center_w - head).T) < SEEN_M
+    return np.column_stack([outlines.center_w, outlines.half_m, outlines.rounding_m])[near]
 
 
 def _off_m(route: Route, point_w: Floats) -> float:

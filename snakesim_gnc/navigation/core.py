@@ -36,7 +36,7 @@ class KnownPath:
         finished = self._tail_s_m is not None and self._tail_s_m >= self.route.length_m
         return Trajectory(
             tick=tick,
-            stamp_ns=None if world is None else world.stamp_ns,
+            timestamp_ns=None if world is None else world.timestamp_ns,
             path_id=0,
             path_w=self._path,
             speed_m_s=0.0 if finished else desired.speed_m_s,

@@ -61,7 +61,7 @@ class Intents:
         if intent.go:
             self._heading_w_rad = intent.heading_w_rad
         self._newest_ns.pop(intent.who, None)
-        self._newest_ns[intent.who] = intent.stamp_ns
+        self._newest_ns[intent.who] = intent.timestamp_ns
         while len(self._newest_ns) > SENDERS_KEPT:
             del self._newest_ns[next(iter(self._newest_ns))]
 
@@ -70,7 +70,7 @@ class Intents:
 
         Whoever has asked for a stop must not be set in motion by what they asked for earlier, and a network held back.
         """
-        if intent.go and intent.stamp_ns < self._newest_ns.get(intent.who, intent.stamp_ns):
+        if intent.go and intent.timestamp_ns < self._newest_ns.get(intent.who, intent.timestamp_ns):
             return f"the intent of {intent.who} is older than another one that came before it"
         return ""
 
@@ -80,7 +80,7 @@ class Intents:
 
 def _against(intent: Intent, now_ns: int) -> str:
     """Why an intent is rejected; empty when it is valid."""
-    age_ns, valid_ns = now_ns - intent.stamp_ns, min(intent.valid_for_ns, LONGEST_NS)
+    age_ns, valid_ns = now_ns - intent.timestamp_ns, min(intent.valid_for_ns, LONGEST_NS)
     if age_ns < -AHEAD_NS:
         return f"the intent of {intent.who} is stamped {-age_ns * 1e-9:.3g} s ahead of the robot's clock"
     if age_ns > valid_ns:

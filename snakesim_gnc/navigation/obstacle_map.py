@@ -13,7 +13,7 @@ from snakesim_hal.wire.messages import Obstacle
 Ints = NDArray[np.intp]
 
 CELL_M = 0.01
-ROUGH_M = CELL_M * 0.5**0.5  # from a cell's centre to its corner
+ROUGH_M = CELL_M * 0.5**0.5  # from a cell's center to its corner
 REACH_M = 0.30  # beyond this distance from every surface a point counts as free
 NONE = -1
 STEP_OBSTACLES = 20
@@ -52,19 +52,19 @@ class ObstacleMap:
         reach = outlines.reach_m + REACH_M
         if not len(outlines):
             self._low, self._shape = np.zeros(2), (1, 1)
-            self._nearest, self._least_m = np.full(1, NONE, dtype=np.intp), np.full(1, REACH_M)
+            self._nearest, self._min_m = np.full(1, NONE, dtype=np.intp), np.full(1, REACH_M)
             return
-        self._low = (outlines.centre_w - reach[:, None]).min(axis=0)
-        high = (outlines.centre_w + reach[:, None]).max(axis=0)
+        self._low = (outlines.center_w - reach[:, None]).min(axis=0)
+        high = (outlines.center_w + reach[:, None]).max(axis=0)
         nx, ny = (np.ceil((high - self._low) / CELL_M).astype(int) + 1).tolist()
         self._shape = (nx, ny)
         nearest = np.full((nx, ny), NONE, dtype=np.intp)
         least = np.full((nx, ny), REACH_M)
-        for i, (centre, around) in enumerate(zip(outlines.centre_w, reach, strict=True)):
+        for i, (center, around) in enumerate(zip(outlines.center_w, reach, strict=True)):
             if i % STEP_OBSTACLES == 0:
                 yield OBSTACLE_NODES * min(STEP_OBSTACLES, len(outlines) - i)
-            first = np.maximum(((centre - around - self._low) / CELL_M).astype(int), 0)
-            last = np.minimum(((centre + around - self._low) / CELL_M).astype(int) + 2, (nx, ny))
+            first = np.maximum(((center - around - self._low) / CELL_M).astype(int), 0)
+            last = np.minimum(((center + around - self._low) / CELL_M).astype(int) + 2, (nx, ny))
             x = self._low[0] + CELL_M * np.arange(first[0], last[0])
             y = self._low[1] + CELL_M * np.arange(first[1], last[1])
             window = (slice(first[0], last[0]), slice(first[1], last[1]))
@@ -73,12 +73,12 @@ class ObstacleMap:
             nearer = distance < least[window]
             least[window][nearer] = distance[nearer]
             nearest[window][nearer] = i
-        self._nearest, self._least_m = nearest.ravel(), least.ravel()
+        self._nearest, self._min_m = nearest.ravel(), least.ravel()
 
     def roughly_m(self, x: Floats, y: Floats) -> Floats:
         """Distance to the nearest surface at most ROUGH_M too great or small; REACH_M and more are free."""
         inside, cell = self._cell(x, y)
-        return np.where(inside, self._least_m[cell], REACH_M)
+        return np.where(inside, self._min_m[cell], REACH_M)
 
     def near(self, x: Floats, y: Floats) -> NearestObstacles:
         """The nearest obstacle to points; x and y of one shape."""

@@ -47,7 +47,7 @@ class Navigation(Service):
         known = surveyed(config)
         climbs = config.mission.map == "known" and any(joint.axis == "pitch" for joint in robot.joints)
         platforms = surveyed(config, walkable=True) if climbs else []
-        self._rises = Rises([one for one in platforms if one.height_m <= config.mission.largest_climb_m])
+        self._rises = Rises([one for one in platforms if one.height_m <= config.mission.max_climb_m])
         self._along = _along_route(config, known) if config.mission.goal is None else None
         search = Search(
             body_length_m=self._body.length_m,
@@ -60,15 +60,15 @@ class Navigation(Service):
             config.mission.goal or HeadingGoal(),
             known if config.mission.map == "known" else None,
             search=search,
-            turn_s=min(turn.every_ticks, turn.lag_ticks) / config.rate_hz,
+            turn_s=min(turn.decimation, turn.latency_ticks) / config.rate_hz,
         )
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """The trajectory at this tick. An operator's intent is used as soon as it arrives."""
         world, joints = self._client.read(self._world), self._client.read(self._joints)
-        desired = self._intents.desired(self._intent.newest(), clock.stamp_ns)
+        desired = self._intents.desired(self._intent.newest(), clock.timestamp_ns)
         if joints is not None:
-            self._recent.put(joints.stamp_ns, joints.angle_rad)
+            self._recent.put(joints.timestamp_ns, joints.angle_rad)
         if self._along is not None and desired.heading_w_rad is None:
             trajectory = self._along.update(clock.tick, world, desired)
             self._planner.follow(self._along.route, trajectory.push_points)
@@ -77,7 +77,7 @@ class Navigation(Service):
             return None
         nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
         trajectory = self._planner.update(clock.tick, world, nodes.T, desired)
-        if not self._planner.ready and clock.pace == "lockstep" and clock.arming == 0:
+        if not self._planner.ready and clock.clock_mode == "lockstep" and clock.arm_session == 0:
             return None  # time stands until the robot is armed, and nobody arms it before there is a path
         return [(keys.TRAJECTORY, self._with_rises(trajectory))]
 

@@ -18,7 +18,7 @@ class Fit:
     segment_m: float
     push_gap_m: float = 0.004  # to what it pushes off: controllers close it; a path that presses moves a body by itself
     brake_gap_m: float = 0.012
-    least_gap_m: float = 0.004
+    min_gap_m: float = 0.004
     touch_m: float = 0.005  # a gap that is smaller is a touch
     reach_m: float = 0.02  # a gap that is wider is left as it is
     smooth_m: float = 0.03  # bends are smoothed over this length
@@ -55,7 +55,7 @@ def _wanted(
     gap = near.distance_m - fit.radius_m - 0.7 * cut
     push = near.normal_w @ goal
     beside = (near.obstacle != NONE) & (np.abs(across) > 0.9)
-    target = np.where(push > 0.1, fit.push_gap_m, np.where(push < -0.1, fit.brake_gap_m, fit.least_gap_m))
+    target = np.where(push > 0.1, fit.push_gap_m, np.where(push < -0.1, fit.brake_gap_m, fit.min_gap_m))
     pulls = beside & (push > 0.1) & (gap < fit.reach_m) & _least_of_obstacle(near.obstacle, gap)
     moves = pulls | ((near.obstacle != NONE) & (gap < target))
     shift = np.where(moves, (target - gap) * np.sign(across), 0.0)
@@ -63,7 +63,7 @@ def _wanted(
 
 
 def _least_of_obstacle(obstacle: NDArray[np.intp], gap: Floats) -> NDArray[np.bool_]:
-    """Where a run of points beside one obstacle is nearest to it, and its neighbours."""
+    """Where a run of points beside one obstacle is nearest to it, and its neighbors."""
     least = np.zeros(len(gap), dtype=bool)
     edges = np.flatnonzero(np.diff(obstacle)) + 1
     for first, last in zip([0, *edges], [*edges, len(gap)], strict=True):

@@ -16,7 +16,7 @@ from snakesim_hal.network.session import Question, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, Description, LifecycleState
 
-HOW_TO_ALLOW = "something real moves here; to allow it set `faults_allowed = true` in the scenario"
+HOW_TO_ALLOW = "something real moves here; to allow it set `allow_fault_injection = true` in the scenario"
 
 
 class Faults(Protocol):
@@ -32,7 +32,7 @@ class Faults(Protocol):
         """Each begin and end, with its tick."""
         ...
 
-    def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState, /) -> Sequence[str]:
+    def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
         """At a tick: begin and end due faults, answer requests, and hang if requested. Returns planned ones refused."""
         ...
 
@@ -58,7 +58,7 @@ class NoFaults:
         self._lifecycle: LifecycleState = "disarmed"
         session.on_question(keys.fault(part), self._refuse)
 
-    def turn(self, _stamp_ns: int, _arming: int, lifecycle: LifecycleState, /) -> Sequence[str]:
+    def turn(self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
         """None is planned."""
         self._lifecycle = lifecycle
         return ()
@@ -96,4 +96,4 @@ def faults_of_service(
 
 
 def _allowed(config: RunConfig, robot: Description) -> bool:
-    return robot.emulated or config.faults_allowed
+    return robot.emulated or config.allow_fault_injection

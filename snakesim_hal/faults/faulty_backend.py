@@ -43,9 +43,9 @@ class FaultyBackend:
         """As the backend does."""
         return self._description
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """The backend's samples, with the active faults applied."""
-        samples = self._inner.sample(tick, stamp_ns)
+        samples = self._inner.sample(tick, timestamp_ns)
         if self._on:
             samples = replace(samples, joints=self._disturbed(samples.joints))
         self._last = samples.joints
@@ -86,7 +86,7 @@ class FaultyBackend:
             if last is not None and ("mute" in kinds or "freeze" in kinds):
                 angle[joint], velocity[joint] = last.angle_rad[joint], last.velocity_rad_s[joint]
                 torque[joint], valid[joint] = last.torque_nm[joint], last.valid[joint]
-                age[joint] = last.age_ns[joint] + joints.stamp_ns - last.stamp_ns
+                age[joint] = last.age_ns[joint] + joints.timestamp_ns - last.timestamp_ns
             elif "wrong" in kinds:
                 angle[joint] += kinds["wrong"].amount or 0.0
             if "mute" in kinds:

@@ -21,10 +21,10 @@ class HostFaults(Injector):
         self._period_ns, self._tick = config.period_ns, 0
         super().__init__(HAL, config, session, carry_out=self.backend.inject)
 
-    def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> Sequence[str]:
+    def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """As of any part, at a tick to be noted."""
-        self._tick = stamp_ns // self._period_ns
-        return super().turn(stamp_ns, arming, lifecycle)
+        self._tick = timestamp_ns // self._period_ns
+        return super().turn(timestamp_ns, arm_session, lifecycle)
 
     def _note(self, text: str, now_s: float) -> None:
         del now_s

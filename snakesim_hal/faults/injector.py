@@ -77,11 +77,11 @@ class Injector:
         """Active injected faults."""
         return [str(injection) for injection in self._on.values()]
 
-    def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> Sequence[str]:
+    def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """At a tick: begin and end due faults, answer requests, and hang if requested. Returns planned ones refused."""
-        now_s = stamp_ns / 1e9
+        now_s = timestamp_ns / 1e9
         self._lifecycle = lifecycle
-        if arming and self._first_armed_s is None:
+        if arm_session and self._first_armed_s is None:
             self._first_armed_s = now_s
             if not self._seen:
                 self._planned = Plan()
@@ -108,7 +108,7 @@ class Injector:
 
     def _newest_s(self, otherwise_s: float) -> float:
         clock = None if self._newest is None else self._newest()
-        return otherwise_s if clock is None else clock.stamp_ns / 1e9
+        return otherwise_s if clock is None else clock.timestamp_ns / 1e9
 
     def _since_arming_s(self, now_s: float) -> float:
         return 0.0 if self._first_armed_s is None else now_s - self._first_armed_s

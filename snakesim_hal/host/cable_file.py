@@ -53,7 +53,7 @@ class CableFile:
         for i, joint in enumerate(joints):
             if (turns := joint.limits.cable_turns) is None:
                 if _goes_round(joint):
-                    unknown[joint.name] = NO_STOPS.format(joint.limits.least_rad, joint.limits.most_rad)
+                    unknown[joint.name] = NO_STOPS.format(joint.limits.lower_rad, joint.limits.upper_rad)
                 continue
             described = robot.joints[i]
             wanted.append(CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, turns))
@@ -111,7 +111,7 @@ def kept_at(folder: Path, joints: Sequence[Joint], robot: Description) -> CableF
 
 
 def _goes_round(joint: Joint) -> bool:
-    return joint.limits.most_rad - joint.limits.least_rad > TURN_RAD - END_STOP_RAD
+    return joint.limits.upper_rad - joint.limits.lower_rad > TURN_RAD - END_STOP_RAD
 
 
 def _seen(kept: Mapping[str, KeptCable] | str, joint: Joint, owner: str, now_s: float) -> float | str:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
+from snakesim_hal.backend import Backend, Injectable, Samples, Setpoints
 from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.base.step_limit import StepTooLongError, place_of
 from snakesim_hal.model.fault_kinds import Injection
@@ -56,9 +56,9 @@ class GuardedBackend:
         return self._inner.describe()
 
     @_guarded
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """As the backend does, with the bytes of every message beside the joints."""
-        samples = self._inner.sample(tick, stamp_ns)
+        samples = self._inner.sample(tick, timestamp_ns)
         key, encoded = keys.JOINTS, dict[str, bytes]()
         try:
             packed(samples.joints)  # whether their values are plausible is judged joint by joint
@@ -72,9 +72,9 @@ class GuardedBackend:
         return replace(samples, encoded=encoded)
 
     @_guarded
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
         """As the backend does."""
-        self._inner.enact(set_points, lifecycle)
+        self._inner.enact(setpoints, lifecycle)
 
     @_guarded
     def advance(self) -> None:

@@ -1,7 +1,8 @@
 """The HAL host: runs any backend, tick by tick, and is the only process that touches it.
 
 A tick: sample the sensors, publish them, publish the clock, judge the samples, wait for the command that answers them,
-let the authority decide, hand the set-points to the backend, let a period pass. The pace decides how long it waits:
+let the authority decide, hand the setpoints to the backend, let a period pass. The clock mode decides how long it
+waits:
 
 realtime  until the tick's deadline on the monotonic clock; an old command stays active until its lease ends
 lockstep  until every participant whose output is due has delivered; stays at tick 0 until the first arming
@@ -43,13 +44,13 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
+    ClockMode,
     Description,
     EstopRequest,
     Fault,
     JointCommand,
     LeaseRequest,
     LifecycleRequest,
-    Pace,
     Power,
     SimulatorRequest,
     Status,
@@ -77,7 +78,7 @@ class Host:
         *,
         max_ticks: int | None = None,
         end_after_fault_s: float | None = None,
-        pace_after_fault: Pace = "realtime",
+        pace_after_fault: ClockMode = "realtime",
         stay: bool = False,
         latch: EstopLatch | None = None,
         starter: HostEnd | None = None,
@@ -105,7 +106,7 @@ class Host:
         self.authority = Authority(
             self.description,
             first_epoch=time.time_ns() // 1_000_000,
-            awaits_reports=config.pace == "realtime",
+            awaits_reports=config.clock_mode == "realtime",
             unchecked=unchecked,
             cables=None if cables is None else cables.cables,
         )
@@ -118,20 +119,20 @@ class Host:
         self._backend = backend
         self._max_ticks = max_ticks
         self._end_after_fault_s = end_after_fault_s
-        self._pace_after_fault: Pace = pace_after_fault
+        self._pace_after_fault: ClockMode = pace_after_fault
         self._stay = stay
         self._latch = latch or EstopLatch(None)
         self._cables = cables
         self._starter = starter or HostEnd(None)
         self._realtime_warnings = list(realtime_warnings)
-        self._pace: Pace = config.pace
+        self._clock_mode: ClockMode = config.clock_mode
         self._period_ns = config.period_ns
         self._tick = 0
-        self._time = SimulatedTime(self.description, config.pace, time.monotonic_ns)
+        self._time = SimulatedTime(self.description, config.clock_mode, time.monotonic_ns)
         self._time_requests: list[tuple[SimulatorRequest, Callable[[Answer], None]]] = []  # until the next tick begins
         self._deadlines = Deadlines(config.period_ns)
         self._published = PublishTimes()
-        self._published_arming = 0
+        self._published_arm_session = 0
         self._tick_began_ns: int | None = None  # unless time stood since
         self._waiting_since_ns: int | None = None  # for the services' answers that end this tick
         self._newest: dict[str, int] = {}
@@ -150,7 +151,7 @@ class Host:
         self._status_shown: Any = None
         if (found := self._latch.found) is not None:
             self.authority.on_estop(EstopRequest(who=f"{found.who[:40]}, before this host"), max(found.tick, 0))
-        self._outbox = Outbox(session, self.description, written(config), lockstep=config.pace == "lockstep")
+        self._outbox = Outbox(session, self.description, written(config), lockstep=config.clock_mode == "lockstep")
         self._entry = own_entry(HOST, config)
         show_process(session, self._entry)
         self._processes = ProcessEntries(session)
@@ -206,7 +207,7 @@ class Host:
                     self._let_services_begin()
                     self._judge(last)
                 yield
-                if self._pace == "lockstep" and self.authority.arming == 0:
+                if self._clock_mode == "lockstep" and self.authority.arm_session == 0:
                     self._inbox.take_until(time.monotonic_ns() + STANDBY_PERIOD_NS)
                     self._show_status()
                     continue
@@ -217,7 +218,7 @@ class Host:
             self._ended_ns = time.monotonic_ns()
             self.authority.on_lifecycle(LifecycleRequest(action="finish", who="the host"), self._safety_now())
             with contextlib.suppress(BackendError):
-                self._backend.enact(self.authority.decide().set_points, self.authority.state)
+                self._backend.enact(self.authority.decide().setpoints, self.authority.state)
             self._show_status(force=True)
             self.faults.close()
             self._latch.close()
@@ -255,7 +256,7 @@ class Host:
 
     def _let_services_begin(self) -> None:
         """In real time: leave the interpreter to the threads that send, unless a service in this process wants it."""
-        if self._pace == "realtime" and not self._config.beside:
+        if self._clock_mode == "realtime" and not self._config.beside:
             self._inbox.wait(min(BEGIN_S, TAKEN_SHARE * self._period_ns * 1e-9))
 
     def _judge(self, samples: Samples) -> None:
@@ -270,12 +271,12 @@ class Host:
 
     def _inject(self) -> None:
         """Faults on request, where they are allowed."""
-        for why in self.faults.turn(self._tick * self._period_ns, self.authority.arming, self.authority.state):
+        for why in self.faults.turn(self._tick * self._period_ns, self.authority.arm_session, self.authority.state):
             self.authority.note(Fault(tick=self._tick, what="injection_refused", cause=why))
 
     def _is_held(self) -> bool:
         """Whether the next tick has to wait. In lockstep tick 0 is shown until it is armed, also in a pause."""
-        return self._time.stands and not (self._pace == "lockstep" and self.authority.arming == 0)
+        return self._time.stands and not (self._clock_mode == "lockstep" and self.authority.arm_session == 0)
 
     def _wait_held(self) -> None:
         """Paused: show that the host is there, and take in what comes; physics and robot time stand."""
@@ -315,18 +316,18 @@ class Host:
         for name, participant in self.participants.items():
             self._newest[name] = participant.service.used_output_tick(tick)
         clock = self._clock(tick)
-        self._published_arming = self.authority.arming
+        self._published_arm_session = self.authority.arm_session
         self._published.put(tick, self._safety_now(), time.monotonic_ns())
         self._outbox.put(*outgoing, (keys.CLOCK, clock, None))
 
     def _clock(self, tick: int, *, paused: bool = False) -> Clock:
         return Clock(
             tick=tick,
-            stamp_ns=tick * self._period_ns,
+            timestamp_ns=tick * self._period_ns,
             period_ns=self._period_ns,
-            pace=self._pace,
+            clock_mode=self._clock_mode,
             lifecycle=self.authority.state,
-            arming=self.authority.arming,
+            arm_session=self.authority.arm_session,
             lease_epoch=self.authority.lease.epoch if self.authority.lease.holder else 0,
             newest=self._newest,
             paused=paused,
@@ -336,7 +337,7 @@ class Host:
         self.authority.expire(self._safety_now(), self._tick)
         counting = self._used_command_tick()
         decision = self.authority.decide(counting)
-        if self.authority.arming:
+        if self.authority.arm_session:
             self._armed_at_ns = self._armed_at_ns or time.monotonic_ns()
         if self._recorded():
             self.black_box.record(self._tick, self._tick * self._period_ns, samples, decision)
@@ -346,7 +347,7 @@ class Host:
             self.statistics.answered_ticks += self._answered >= (self._tick if counting is None else counting)
         started = time.monotonic_ns()
         try:
-            self._backend.enact(decision.set_points, self.authority.state)
+            self._backend.enact(decision.setpoints, self.authority.state)
             self._outbox.put((keys.APPLIED, applied_message(self.description, self._tick, decision), None))
             self._backend.advance()
             for fault in self._backend.faults():
@@ -366,7 +367,7 @@ class Host:
     def _wait_for_deadline(self) -> None:
         """Of the next tick, in real time; and count how this one kept time."""
         armed, late_ns = self.authority.state == "armed", None
-        if self._pace == "realtime":
+        if self._clock_mode == "realtime":
             due_ns = self._deadlines.of(self._tick)
             if self._deadlines.missed(self._tick):
                 self.statistics.overruns += armed
@@ -383,12 +384,12 @@ class Host:
     def _recorded(self) -> bool:
         """Whether to record this tick: a host that stays must not fill memory while it waits."""
         waited_ns = (self._tick - self._last_armed_tick) * self._period_ns
-        return self.authority.arming > 0 and not (self._stay and waited_ns > RECORDED_AFTER_NS)
+        return self.authority.arm_session > 0 and not (self._stay and waited_ns > RECORDED_AFTER_NS)
 
     def _wait_for_answers(self, samples: Samples) -> None:
-        if self._pace == "lockstep":
+        if self._clock_mode == "lockstep":
             self._wait_for_participants(samples)
-        elif self._pace == "realtime":
+        elif self._clock_mode == "realtime":
             give_up_ns = self._deadlines.of(self._tick + 1) - 1.5 * self._backend_time.write_ns - 50_000
             if self._time.speed > 1.0 and self.authority.state == "armed":  # as much time as at speed 1, if need be
                 give_up_ns = max(give_up_ns, self._published.of(self._tick)[1] + self._period_ns)
@@ -396,14 +397,14 @@ class Host:
                 left_ns = give_up_ns - time.monotonic_ns()
                 if left_ns <= 0 or not self._inbox.take(left_ns * 1e-9):
                     break
-        self._inbox.take_all(inf if self._pace == "lockstep" else TAKEN_SHARE * self._period_ns)
+        self._inbox.take_all(inf if self._clock_mode == "lockstep" else TAKEN_SHARE * self._period_ns)
 
     def _wait_for_participants(self, samples: Samples) -> None:
         self._waiting_since_ns = time.monotonic_ns()
         give_up_ns = self._waiting_since_ns + round(self._config.stall_limit_s * 1e9)
         while (behind := self.participants.behind(self._tick)) and not self._stopping:
             left_ns = give_up_ns - time.monotonic_ns()
-            if self._published_arming != self.authority.arming:  # armed in this tick: publish it
+            if self._published_arm_session != self.authority.arm_session:  # armed in this tick: publish it
                 self._publish(samples)
             if left_ns > 0:
                 self._inbox.take(min(left_ns * 1e-9, 0.5))
@@ -420,7 +421,7 @@ class Host:
 
     def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
         """A command, and its time of arrival."""
-        if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arming(command):
+        if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arm_session(command):
             self.take_done(self.authority.lease.holder, command.tick)
         safety_ns, published_ns = self._published.of(command.tick)
         now_ns = self._safety_now(monotonic_ns)
@@ -501,7 +502,7 @@ class Host:
     def _used_command_tick(self) -> int | None:
         """In lockstep: the newest tick whose command is used at the end of this one."""
         holder = self._holder()
-        if self._pace != "lockstep" or holder is None:
+        if self._clock_mode != "lockstep" or holder is None:
             return None
         return holder.service.used_output_tick(self._tick + 1)
 
@@ -512,7 +513,7 @@ class Host:
             return
         if not self.participants.went(service):
             return
-        if self.authority.arming and not self._stopping:
+        if self.authority.arm_session and not self._stopping:
             cause = f"{service} is gone: its process ended or its connection broke"
             commands = self.authority.state == "armed" and self.authority.lease.holder == service
             self.authority.note(Fault(tick=self._tick, what="service_lost", cause=cause), precedes_stop=commands)
@@ -528,7 +529,7 @@ class Host:
     def _watch_network(self) -> None:
         """Note problems of the network, once when each begins."""
         # In lockstep a lease counts in simulated time: a slow computer is not a blocked network.
-        held_up = self._pace != "lockstep" and self._outbox.held_up_s() * 1e9 > self._config.lease_ns
+        held_up = self._clock_mode != "lockstep" and self._outbox.held_up_s() * 1e9 > self._config.lease_ns
         if not (held_up or self._other_hosts or self._network_faults):
             return
         wrong = {f"another HAL host has this robot's name: {host}": "second_host" for host in set(self._other_hosts)}
@@ -545,7 +546,7 @@ class Host:
         authority, robot = self.authority, self.description
         against = authority.against_arming(self._time.safety_ns(self._tick))
         missing, differing = self._missing(), self._differing()
-        slow_backend = self._backend_time.too_slow() if self._pace == "realtime" else []
+        slow_backend = self._backend_time.too_slow() if self._clock_mode == "realtime" else []
         why = authority.why
         if authority.state == "disarmed" and (against or missing or differing):
             lacks = self._processes.waits()
@@ -553,10 +554,10 @@ class Host:
             why = "; ".join([why, *slow_backend, *differing, *waits, *against])[:500]
         return Status(
             tick=self._tick,
-            stamp_ns=self._tick * robot.period_ns,
+            timestamp_ns=self._tick * robot.period_ns,
             robot=robot.robot,
             backend=robot.backend,
-            pace=self._pace,
+            clock_mode=self._clock_mode,
             rate_hz=1e9 / robot.period_ns,
             lifecycle=authority.state,
             why=why,
@@ -614,7 +615,7 @@ class Host:
 
     def _missing(self) -> list[str]:
         """Participants that are not connected, or in lockstep have not answered tick 0 yet."""
-        return self.participants.missing(must_have_answered=self._config.pace == "lockstep")
+        return self.participants.missing(must_have_answered=self._config.clock_mode == "lockstep")
 
     def _differing(self) -> list[str]:
         """How processes of the services that it waits for differ from this host, or that they have not said yet."""
@@ -629,12 +630,12 @@ class Host:
         """After a fault the host stops waiting for services, goes on in real time, and may end the run."""
         if self.authority.state not in ("fault", "estop"):
             if self._faulted_at is not None:
-                self._pace = self._config.pace
+                self._clock_mode = self._config.clock_mode
             self._faulted_at = None
         elif self._faulted_at is None:
             self._faulted_at = self._tick
-            if self._pace != "realtime":
-                self._pace = self._pace_after_fault
+            if self._clock_mode != "realtime":
+                self._clock_mode = self._pace_after_fault
                 self._deadlines.begin(self._tick)
 
     def _over(self) -> bool:

@@ -61,7 +61,7 @@ class TickTimes:
     cycle: Durations = field(default_factory=Durations)  # from the begin of a tick to that of the next
     late: Durations = field(default_factory=_coarse)  # begin of a tick after its deadline
     read: Durations = field(default_factory=_coarse)  # the backend's sample
-    write: Durations = field(default_factory=_coarse)  # the backend takes set-points, and lets the tick pass
+    write: Durations = field(default_factory=_coarse)  # the backend takes setpoints, and lets the tick pass
 
     def timings(self) -> dict[str, Timing]:
         """Of each that was counted."""

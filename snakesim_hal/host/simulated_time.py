@@ -8,7 +8,7 @@ nothing expires because somebody has paused, and what held before holds in robot
 from collections.abc import Callable
 from typing import NamedTuple
 
-from snakesim_hal.wire.messages import Description, Pace, SimulatorRequest
+from snakesim_hal.wire.messages import ClockMode, Description, SimulatorRequest
 
 MEASURED_OVER_NS = 1_000_000_000  # of the real-time factor
 KEEPS_UP = 0.95  # share of the wanted speed
@@ -24,9 +24,9 @@ class Refusal(NamedTuple):
 class SimulatedTime:
     """Of one host. A robot whose time is not simulated refuses every request, and never stands still."""
 
-    def __init__(self, description: Description, pace: Pace, clock: Callable[[], int]) -> None:
-        """pace: of the run; clock: the monotonic one, in ns."""
-        self._description, self._pace, self._clock = description, pace, clock
+    def __init__(self, description: Description, clock_mode: ClockMode, clock: Callable[[], int]) -> None:
+        """clock_mode: of the run; clock: the monotonic one, in ns."""
+        self._description, self._clock_mode, self._clock = description, clock_mode, clock
         self.speed = 1.0  # of robot time, as wanted; in real time
         self.paused_by: str | None = None
         self.factor: float | None = None  # robot time per wall time, measured while it passes
@@ -42,7 +42,7 @@ class SimulatedTime:
     def safety_ns(self, tick: int, monotonic_ns: int | None = None) -> int:
         """Safety time at a tick, at an instant; None: now."""
         period_ns = self._description.period_ns
-        if self._pace == "lockstep":
+        if self._clock_mode == "lockstep":
             return tick * period_ns
         since_ns, since_monotonic_ns, since_tick = self._base
         if self.stands:
@@ -79,9 +79,9 @@ class SimulatedTime:
             return Refusal("not_simulated", f"backend {robot.backend!r} cannot {request.action}: {what}")
         if request.action == "resume" and self.paused_by is None:
             return Refusal("wrong_state", "nothing to resume: it is not paused")
-        if request.action == "speed" and self._pace != "realtime":
-            fast = "goes as fast as it can; for a speed start the run with --pace realtime"
-            return Refusal("wrong_pace", f"the pace is {self._pace}, which {fast}")
+        if request.action == "speed" and self._clock_mode != "realtime":
+            fast = "goes as fast as it can; for a speed start the run with --clock-mode realtime"
+            return Refusal("wrong_pace", f"the clock mode is {self._clock_mode}, which {fast}")
         return None
 
     def tick_done(self, tick: int) -> None:

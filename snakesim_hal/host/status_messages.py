@@ -6,16 +6,16 @@ from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description
 
-WITHOUT = {keys.POSE: "mission.localisation=dead_reckoning does without, and so does a robot without [sensors.pose]"}
+WITHOUT = {keys.POSE: "mission.localization=dead_reckoning does without, and so does a robot without [sensors.pose]"}
 """How a run can do without a message."""
 
 
 def applied_message(description: Description, tick: int, decision: Decision) -> AppliedCommand:
-    """The applied set-points of a tick."""
-    points = decision.set_points
+    """The applied setpoints of a tick."""
+    points = decision.setpoints
     return AppliedCommand(
         tick=tick,
-        stamp_ns=tick * description.period_ns,
+        timestamp_ns=tick * description.period_ns,
         sequence=decision.sequence,
         mode=points.mode,
         target=points.target,

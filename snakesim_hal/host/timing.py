@@ -52,7 +52,7 @@ class BackendTime:
         return took_ns
 
     def written(self, since_ns: int) -> int:
-        """It has taken the set-points, and done what it does between two ticks, since then. Returns as `read` does."""
+        """It has taken the setpoints, and done what it does between two ticks, since then. Returns as `read` does."""
         took_ns = time.monotonic_ns() - since_ns
         self.write_ns += SMOOTHING * (took_ns - self.write_ns)
         return took_ns

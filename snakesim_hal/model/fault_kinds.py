@@ -1,4 +1,4 @@
-"""What can be made to go wrong on request: the one registry of kinds, and the words for files, commands and twins.
+"""What can be made to go wrong on request: the one registry of kinds, and the words for files, commands and emulators.
 
     kill:control@2            at 2 s of robot time after the first arming
     drop:actuator/joints@2-4=0.3    from 2 s to 4 s, three of ten
@@ -133,7 +133,7 @@ class Injection:
 
     kind: str
     target: str
-    start_s: float = 0.0  # of robot time since the first arming; for twins, since they were started
+    start_s: float = 0.0  # of robot time since the first arming; for emulators, since they were started
     end_s: float = inf
     amount: float | None = None
 

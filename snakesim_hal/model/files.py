@@ -68,7 +68,7 @@ class Table:
         return "default"
 
     def file_of(self, dotted: str) -> str:
-        """The file that contains a field, or its nearest neighbours if it is missing."""
+        """The file that contains a field, or its nearest neighbors if it is missing."""
         place = dotted
         while place:
             for key, origin in self.origin.items():

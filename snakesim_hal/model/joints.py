@@ -35,7 +35,7 @@ Backlash = Annotated[float, from_zero(0.5, "rad")]
 
 
 class Limits(FileStruct, frozen=True, kw_only=True):
-    """Limits of a joint; enforced by the gate and by the motor."""
+    """Limits of a joint; enforced by the limiter and by the motor."""
 
     angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]  # to either side
     angle_min_rad: Side | None = None  # of a side that differs
@@ -49,7 +49,7 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
     derate_from_c: Celsius = 80.0  # of the winding: above it torque is derated
     stop_at_c: Celsius = 105.0  # a fifth of the torque is left, and the robot stops
-    least_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
+    min_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
 
     def __post_init__(self) -> None:
         """Derating must begin before the robot stops, and a joint must turn. Raises ValueError, for the file reader."""
@@ -58,25 +58,25 @@ class Limits(FileStruct, frozen=True, kw_only=True):
                 f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
                 f"so that torque is derated before the robot stops"
             )
-        if self.least_rad >= self.most_rad:
+        if self.lower_rad >= self.upper_rad:
             raise ValueError(
-                f"it may turn from {self.least_rad:g} to {self.most_rad:g} rad, which leaves no travel: "
+                f"it may turn from {self.lower_rad:g} to {self.upper_rad:g} rad, which leaves no travel: "
                 f"`angle_min_rad` (or minus `angle_rad`) must be below `angle_max_rad` (or `angle_rad`)"
             )
 
-        if self.cable_turns is not None and self.cable_turns < max(-self.least_rad, self.most_rad) / (2 * math.pi):
+        if self.cable_turns is not None and self.cable_turns < max(-self.lower_rad, self.upper_rad) / (2 * math.pi):
             raise ValueError(
-                f"`cable_turns` = {self.cable_turns:g} turns is less than its limits of {self.least_rad:g} to "
-                f"{self.most_rad:g} rad: narrow the limits"
+                f"`cable_turns` = {self.cable_turns:g} turns is less than its limits of {self.lower_rad:g} to "
+                f"{self.upper_rad:g} rad: narrow the limits"
             )
 
     @property
-    def least_rad(self) -> float:
+    def lower_rad(self) -> float:
         """The joint's lowest angle."""
         return -self.angle_rad if self.angle_min_rad is None else self.angle_min_rad
 
     @property
-    def most_rad(self) -> float:
+    def upper_rad(self) -> float:
         """The joint's highest angle."""
         return self.angle_rad if self.angle_max_rad is None else self.angle_max_rad
 
@@ -104,7 +104,7 @@ Measures = Annotated[list[Measurement], Meta(max_length=3)]
 class Drive(FileStruct, frozen=True, kw_only=True):
     """How a joint's drive is connected and mounted: drive angle = zero_rad + sign * gear * joint angle."""
 
-    family: Text = ""  # of its protocol, such as dynamixel; empty: the backend's only one
+    driver: Text = ""  # of its protocol, such as dynamixel; empty: the backend's only one
     port: Text = ""  # bus or serial port, such as can0; empty: as the backend's settings say
     sign: Sign = 1  # -1: mounted the other way round, so that the drive turns against the joint
     zero_rad: Zero = 0.0  # what the drive measures at the joint's zero
@@ -131,7 +131,7 @@ class Heat(FileStruct, frozen=True, kw_only=True):
     # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm.
     loss_at_rated_w: Annotated[float, from_zero(1e5, "W")] = 48.0
     # Of the winding's rise, in the electronics beside it; a guess.
-    board_share: Annotated[float, from_zero(1, "1")] = 0.3
+    board_fraction: Annotated[float, from_zero(1, "1")] = 0.3
 
 
 class Supply(FileStruct, frozen=True, kw_only=True):
@@ -242,10 +242,10 @@ def _check(joint: Joint) -> None:
             f"turns, and the joint's cannot be counted; use an encoder at the joint (`gear` = 1), or end stops and no "
             f"`cable_turns`"
         )
-    if joint.supply.voltage_v <= limits.least_voltage_v:
+    if joint.supply.voltage_v <= limits.min_voltage_v:
         raise ValueError(
-            f"`supply.voltage_v` = {joint.supply.voltage_v:g} V is not above `limits.least_voltage_v` = "
-            f"{limits.least_voltage_v:g} V, where the robot stops: it could never be armed"
+            f"`supply.voltage_v` = {joint.supply.voltage_v:g} V is not above `limits.min_voltage_v` = "
+            f"{limits.min_voltage_v:g} V, where the robot stops: it could never be armed"
         )
 
 
@@ -256,9 +256,11 @@ def _check_all(joints: Sequence[Joint]) -> None:
             f"{joints[lags.index(False)].name}: `response_time_s` = 0 s, and other joints have more; give all of them "
             f"some, or none"
         )
-    at = [(joint.drive.family, joint.drive.port, joint.id) for joint in joints]
-    for (family, port, number), count in Counter(at).items():
+    at = [(joint.drive.driver, joint.drive.port, joint.id) for joint in joints]
+    for (driver_type, port, number), count in Counter(at).items():
         if count > 1:
-            same = ", ".join(joint.name for joint, one in zip(joints, at, strict=True) if one == (family, port, number))
+            same = ", ".join(
+                joint.name for joint, one in zip(joints, at, strict=True) if one == (driver_type, port, number)
+            )
             where = f"port {port!r}" if port else "one bus"
             raise ValueError(f"{same}: all have the id {number} on {where}; without an `id` a joint has its number")

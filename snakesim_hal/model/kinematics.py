@@ -42,8 +42,8 @@ def quaternions_from_rotations(rotations: Floats) -> Floats:
     a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]  # 4 w x, 4 w y, 4 w z
     d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]  # 4 x y, 4 x z, 4 y z
     products = [(4 * w * w, a, b, c), (a, 4 * x * x, d, e), (b, d, 4 * y * y, f), (c, e, f, 4 * z * z)]
-    by_largest = np.stack([np.stack(row, axis=1) for row in products], axis=1)  # row i: 4 q_i q
-    found = by_largest[np.arange(len(r)), np.argmax(signed, axis=1)]
+    by_maximum = np.stack([np.stack(row, axis=1) for row in products], axis=1)  # row i: 4 q_i q
+    found = by_maximum[np.arange(len(r)), np.argmax(signed, axis=1)]
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 

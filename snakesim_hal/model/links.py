@@ -20,7 +20,7 @@ class Link(FileStruct, frozen=True, kw_only=True):
 
     length_m: Annotated[float, above(2, "m")]
     mass_kg: Annotated[float, above(100, "kg")]
-    center_m: tuple[Offset, Offset, Offset] | None = None  # centre of mass, in the link's frame; none: the middle
+    center_m: tuple[Offset, Offset, Offset] | None = None  # center of mass, in the link's frame; none: the middle
     inertia_kg_m2: Inertia | None = None  # ixx, iyy, izz, ixy, ixz, iyz about it; none: a solid capsule's
 
     def __post_init__(self) -> None:
@@ -45,7 +45,7 @@ class Link(FileStruct, frozen=True, kw_only=True):
         return (self.length_m / 2, 0.0, 0.0) if self.center_m is None else self.center_m
 
     def inertia(self, radius_m: float) -> tuple[float, ...]:
-        """About the centre of mass, along the link's axes: ixx, iyy, izz, ixy, ixz, iyz in kg·m². radius_m: of it."""
+        """About the center of mass, along the link's axes: ixx, iyy, izz, ixy, ixz, iyz in kg·m². radius_m: of it."""
         if self.inertia_kg_m2 is not None:
             return self.inertia_kg_m2
         return capsule_inertia(self.length_m, radius_m, self.mass_kg)
@@ -63,7 +63,7 @@ def capsule_inertia(length_m: float, radius_m: float, mass_kg: float) -> tuple[f
     tube, ball = length_m, 4 * radius_m / 3  # in volumes of a cross-section
     tube_kg, ball_kg = mass_kg * tube / (tube + ball), mass_kg * ball / (tube + ball)
     about = (tube_kg / 2 + ball_kg * 2 / 5) * radius_m**2
-    # A hemisphere's centre is 3/8 of the radius from its flat side.
+    # A hemisphere's center is 3/8 of the radius from its flat side.
     across = tube_kg * (radius_m**2 / 4 + length_m**2 / 12)
     across += ball_kg * (2 * radius_m**2 / 5 + length_m**2 / 4 + 3 * length_m * radius_m / 8)
     return about, across, across, 0.0, 0.0, 0.0

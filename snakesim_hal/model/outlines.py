@@ -1,6 +1,6 @@
 """Obstacles and links as seen from above: their outlines, and distances to them. Pure geometry.
 
-Every outline is a rounded box: points within `rounding_m` of a rectangle. A cylinder's rectangle is its centre. Spheres
+Every outline is a rounded box: points within `rounding_m` of a rectangle. A cylinder's rectangle is its center. Spheres
 count with their radius.
 """
 
@@ -33,7 +33,7 @@ Point = tuple[Coordinate, Coordinate]
 class Outlines:
     """The outlines of many obstacles, for distances by the batch."""
 
-    centre_w: Floats  # (m, 2)
+    center_w: Floats  # (m, 2)
     turn: Floats  # (m, 2): cosine and sine of the rectangle's yaw
     half_m: Floats  # (m, 2): half its length and width
     rounding_m: Floats  # (m,)
@@ -45,7 +45,7 @@ class Outlines:
         yaw = np.array([o.yaw_rad for o in obstacles], dtype=np.float64)
         half = np.array([o.half_size_m[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2)
         return cls(
-            centre_w=np.array([o.position_w[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2),
+            center_w=np.array([o.position_w[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2),
             turn=np.column_stack([np.cos(yaw), np.sin(yaw)]),
             half_m=np.where(boxes[:, None], half, 0.0),
             rounding_m=np.where(boxes, 0.0, [o.radius_m for o in obstacles]),
@@ -61,11 +61,11 @@ class Outlines:
         return cls(0.5 * (from_w + to_w), ahead, half, np.full(len(run), rounding_m))
 
     def __len__(self) -> int:
-        return len(self.centre_w)
+        return len(self.center_w)
 
     @property
     def reach_m(self) -> Floats:
-        """(m,): the farthest that an outline gets from its centre."""
+        """(m,): the farthest that an outline gets from its center."""
         return np.hypot(*self.half_m.T) + self.rounding_m
 
     @property
@@ -74,7 +74,7 @@ class Outlines:
         local = CORNERS * self.half_m[:, None, :]
         c, s = self.turn[:, None, 0], self.turn[:, None, 1]
         x, y = local[..., 0], local[..., 1]
-        return self.centre_w[:, None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+        return self.center_w[:, None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
 
     def distance_m(self, points_w: Floats) -> Floats:
         """Distances from points (..., 2) to every outline, (..., m); negative inside."""
@@ -86,7 +86,7 @@ class Outlines:
     def towards(self, points_w: Floats, which: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Distances (...) of points (..., 2) from the outline `which` (...) of each, and normals (..., 2) out of it."""
         c, s = self.turn[which, 0], self.turn[which, 1]
-        dx, dy = points_w[..., 0] - self.centre_w[which, 0], points_w[..., 1] - self.centre_w[which, 1]
+        dx, dy = points_w[..., 0] - self.center_w[which, 0], points_w[..., 1] - self.center_w[which, 1]
         local_x, local_y = c * dx + s * dy, c * dy - s * dx
         over_x, over_y = np.abs(local_x) - self.half_m[which, 0], np.abs(local_y) - self.half_m[which, 1]
         out_x, out_y = np.maximum(over_x, 0.0), np.maximum(over_y, 0.0)
@@ -99,8 +99,8 @@ class Outlines:
         return distance, np.stack([c * nx - s * ny, s * nx + c * ny], axis=-1)
 
     def _local(self, points_w: Floats) -> tuple[Floats, Floats]:
-        offset_x = points_w[..., None, 0] - self.centre_w[:, 0]
-        offset_y = points_w[..., None, 1] - self.centre_w[:, 1]
+        offset_x = points_w[..., None, 0] - self.center_w[:, 0]
+        offset_y = points_w[..., None, 1] - self.center_w[:, 1]
         c, s = self.turn[:, 0], self.turn[:, 1]
         return c * offset_x + s * offset_y, c * offset_y - s * offset_x
 

@@ -23,11 +23,11 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
-    low_m: Point  # corners of the area in which their centres are
-    high_m: Point
+    min_corner_m: Point  # corners of the area in which their centers are
+    max_corner_m: Point
     density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
     radius_m: tuple[Size, Size]  # of a peg, smallest and largest
-    box_share: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of all obstacles, on average; the others are pegs
+    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of all obstacles, on average; the others are pegs
     box_size_m: tuple[Size, Size] = (0.06, 0.18)  # length and width of a block, smallest and largest
     clearance_m: Clearance  # least gap between the surfaces of any two
     route_clearance_m: Clearance | None = None  # least gap between the route and a surface
@@ -38,7 +38,7 @@ class RandomField(Solid, frozen=True, kw_only=True):
     @property
     def wanted(self) -> int:
         """Number of obstacles."""
-        return round(self.density_per_m2 * math.prod(np.subtract(self.high_m, self.low_m).tolist()))
+        return round(self.density_per_m2 * math.prod(np.subtract(self.max_corner_m, self.min_corner_m).tolist()))
 
 
 def solids_of(field: RandomField, index: int, count: int) -> list[Upright]:
@@ -92,8 +92,11 @@ def _snake(links: Sequence[Capsule], clearance_m: float) -> Outlines:
 
 
 def _check(field: RandomField, where: str, route: Route | None) -> None:
-    if not np.all(np.array(field.high_m) > np.array(field.low_m)):
-        raise ConfigError(f"{where}: `high_m` = {field.high_m} must exceed `low_m` = {field.low_m} in x and y")
+    if not np.all(np.array(field.max_corner_m) > np.array(field.min_corner_m)):
+        raise ConfigError(
+            f"{where}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
+            f"{field.min_corner_m} in x and y"
+        )
     for name in ("radius_m", "box_size_m"):
         sizes = getattr(field, name)
         if sizes[1] < sizes[0]:
@@ -108,9 +111,9 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
 
 
 def _draw(field: RandomField, random: Generator, name: str) -> Obstacle:
-    x, y = random.uniform(field.low_m, field.high_m).tolist()
+    x, y = random.uniform(field.min_corner_m, field.max_corner_m).tolist()
     radius_m = float(random.uniform(*field.radius_m))
-    if field.box_share == 0 or random.uniform() >= field.box_share:
+    if field.box_fraction == 0 or random.uniform() >= field.box_fraction:
         return peg(name, (x, y), radius_m, field.height_m)
     length_m, width_m = random.uniform(*field.box_size_m, size=2).tolist()
     return block(name, (x, y), (length_m, width_m, field.height_m), float(random.uniform(0.0, math.pi)))

@@ -27,8 +27,8 @@ from snakesim_hal.wire.messages import (
     LinkDescription,
     Measurement,
     Mode,
-    SafeAction,
     SensorDescription,
+    StopMode,
 )
 from snakesim_hal.wire.own_sample import schema_of
 from snakesim_hal.wire.quantities import MAX_JOINTS, above
@@ -52,9 +52,9 @@ class Module(FileStruct, frozen=True, kw_only=True):
 class Safety(FileStruct, frozen=True, kw_only=True):
     """Behaviour of the joints in a fault, and limits of commands."""
 
-    action: SafeAction = "damp"
+    action: StopMode = "damp"
     max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # of a position target from the measured
-    may_lose_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # isolated, before the robot stops
+    max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # isolated, before the robot stops
 
 
 class RobotFile(FileStruct, frozen=True, kw_only=True):
@@ -143,8 +143,8 @@ def described(robot: RobotFile) -> list[JointDescription]:
         JointDescription(
             name=joint.name,
             axis=joint.axis,
-            angle_min_rad=joint.limits.least_rad,
-            angle_max_rad=joint.limits.most_rad,
+            angle_min_rad=joint.limits.lower_rad,
+            angle_max_rad=joint.limits.upper_rad,
             speed_limit_rad_s=joint.limits.speed_rad_s,
             acceleration_limit_rad_s2=joint.limits.acceleration_rad_s2,
             torque_limit_nm=joint.limits.torque_nm,
@@ -155,7 +155,7 @@ def described(robot: RobotFile) -> list[JointDescription]:
             rotor_kg_m2=joint.motor.armature_kg_m2,
             derate_from_c=joint.limits.derate_from_c,
             stop_at_c=joint.limits.stop_at_c,
-            least_voltage_v=joint.limits.least_voltage_v,
+            min_voltage_v=joint.limits.min_voltage_v,
             modes=[Mode.PASSIVE, *(mode for mode in Mode if mode.name.lower() in joint.drive.modes)],
             measures=[one for one in get_args(Measurement) if one in joint.drive.measures],
         )
@@ -207,8 +207,8 @@ def describe(
         period_ns=period_ns,
         lease_ns=lease_ns,
         max_step_rad=robot.safety.max_step_rad,
-        safe_action=robot.safety.action,
-        may_lose_joints=robot.safety.may_lose_joints,
+        stop_mode=robot.safety.action,
+        max_isolated_joints=robot.safety.max_isolated_joints,
         emulated=emulated,
         simulated_time=simulated_time,
         joints=joints,

@@ -12,7 +12,7 @@ from snakesim_hal.base.arrays import Floats
 
 
 def is_line(points_w: Floats) -> bool:
-    """Whether (n, 2) points make a line: two at least, and no two neighbours coincide."""
+    """Whether (n, 2) points make a line: two at least, and no two neighbors coincide."""
     return len(points_w) >= 2 and bool((points_w[1:] != points_w[:-1]).any(axis=1).all())
 
 
@@ -25,7 +25,7 @@ class Route:
     def __init__(self, points_w: Floats | Sequence[tuple[float, float]]) -> None:
         self.points_w = np.ascontiguousarray(points_w, dtype=np.float64)
         if not is_line(self.points_w):
-            raise ValueError("a route needs at least two points, and no two neighbours may coincide")
+            raise ValueError("a route needs at least two points, and no two neighbors may coincide")
         steps = np.diff(self.points_w, axis=0)
         lengths = np.hypot(steps[:, 0], steps[:, 1])
         self._s = np.concatenate(([0.0], np.cumsum(lengths)))

@@ -1,7 +1,7 @@
 """The scenario file, and the effective configuration of a run that is made from it.
 
-A scenario names a robot, a scene, a controller, a pace and the services. `load` reads all three files, applies flags,
-and checks everything at once; every process of the run gets the result, and it is enough to repeat the run.
+A scenario names a robot, a scene, a controller, a clock mode and the services. `load` reads all three files, applies
+flags, and checks everything at once; every process of the run gets the result, and it is enough to repeat the run.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Obstacle, Pace
+from snakesim_hal.wire.messages import ClockMode, Description, Obstacle
 from snakesim_hal.wire.quantities import above
 
 SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
@@ -72,9 +72,9 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     # Of obstacles, as navigation reckons with it where it plans, and the controller where it pushes.
     peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
     # Of a known map: a robot whose joints turn up and down, too, climbs a `step` of the scene up to this height.
-    largest_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1
+    max_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1
     # By the pose sensor where there is one; or by joints, IMU, contacts and the map alone.
-    localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
+    localization: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
 
     def __post_init__(self) -> None:
         """Only a map that is known has errors of a survey; only a goal can be reached."""
@@ -85,15 +85,15 @@ class Mission(FileStruct, frozen=True, kw_only=True):
 
 
 class Service(FileStruct, frozen=True, kw_only=True):
-    """A process of the run that acts every `every_ticks`.
+    """A process of the run that acts every `decimation`.
 
-    In lockstep its output for tick t is used from tick t + lag_ticks on, whenever it really arrived, so that a slow
+    In lockstep its output for tick t is used from tick t + latency_ticks on, whenever it really arrived, so that a slow
     service does not break determinism, and runs in parallel to the simulator. For control, a lag of 1 is a
     command that acts in the period after its state; 2 adds a period of latency, in which control and physics overlap.
     """
 
-    every_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
-    lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 1
+    latency_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
     external: bool = False  # a process that the run waits for, but does not start
     place: Literal["process", "host"] = "process"  # `host`: beside the driver, in a thread of the host's process
@@ -101,8 +101,8 @@ class Service(FileStruct, frozen=True, kw_only=True):
 
     def used_output_tick(self, tick: int) -> int:
         """The newest tick whose output is used at `tick`. That of tick 0 is used from the start."""
-        due = max(tick - self.lag_ticks, 0)
-        return due - due % self.every_ticks
+        due = max(tick - self.latency_ticks, 0)
+        return due - due % self.decimation
 
 
 Seconds = Annotated[float, above(60, "s")]
@@ -132,12 +132,12 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     scene: SceneFile
     backend: str = "sim"
     controller: str
-    pace: Pace = "lockstep"
+    clock_mode: ClockMode = "lockstep"
     rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
     duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
     faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.model.fault_kinds
-    faults_allowed: bool = False  # also where something real moves
+    allow_fault_injection: bool = False  # also where something real moves
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
     start_limit_s: Annotated[float, Meta(gt=0, le=3600, extra_json_schema={"unit": "s"})] = 60.0
     start: Start = Start()
@@ -194,7 +194,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         """Whether guidance reckons the pose: it was told to, or neither the robot nor a service tells it."""
         described = any(sensor.key == keys.POSE for sensor in robot.sensors)
         told = described or self.robot.sensors.pose is not None or SENSOR in self.services
-        return self.mission.localisation == "dead_reckoning" or not told
+        return self.mission.localization == "dead_reckoning" or not told
 
     @property
     def period_ns(self) -> int:
@@ -281,7 +281,7 @@ def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
         if key == "controller":
             _split_policy(table, override.value, override.flag)
     scene = table.values.get("scene")
-    if isinstance(scene, dict) and "made_for" in scene:
+    if isinstance(scene, dict) and "reference_robot" in scene:
         _fit(table, {override.flag for override in overrides if override not in picks})
     return table
 
@@ -311,17 +311,17 @@ def check(config: RunConfig) -> None:
         )
     angles = start_of(config).angles_rad
     for joint, angle_rad in zip(config.robot.joint_table, angles.tolist(), strict=True):
-        if joint.limits.least_rad <= angle_rad <= joint.limits.most_rad:
+        if joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad:
             continue
         if not start.on_route:
             raise ConfigError(
-                f"robot {config.robot.name!r}: {joint.name} may turn from {joint.limits.least_rad:g} to "
-                f"{joint.limits.most_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
+                f"robot {config.robot.name!r}: {joint.name} may turn from {joint.limits.lower_rad:g} to "
+                f"{joint.limits.upper_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
                 f"start it on a route that suits them"
             )
         raise ConfigError(
             f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
-            f"{config.robot.name!r} allows {joint.limits.least_rad:g} to {joint.limits.most_rad:g} rad. Choose a "
+            f"{config.robot.name!r} allows {joint.limits.lower_rad:g} to {joint.limits.upper_rad:g} rad. Choose a "
             f"smoother route"
         )
     place_all(config)

@@ -22,7 +22,7 @@ from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name, above
 
 
-class Uneven(FileStruct, frozen=True, kw_only=True):
+class Heightfield(FileStruct, frozen=True, kw_only=True):
     """Smooth random hills."""
 
     height_m: Annotated[float, above(1, "m")]  # from lowest to highest point
@@ -35,7 +35,7 @@ class Ground(FileStruct, frozen=True, kw_only=True):
     """The ground, and its friction."""
 
     friction: Friction
-    uneven: Uneven | None = None
+    heightfield: Heightfield | None = None
 
 
 class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="kind"):
@@ -75,7 +75,7 @@ class Sphere(Solid, frozen=True, kw_only=True):
 
     position_m: Point
     radius_m: Size
-    centre_height_m: Coordinate = 0.0
+    center_height_m: Coordinate = 0.0
     name: Name | None = None
 
 
@@ -122,7 +122,7 @@ MAX_OBSTACLES = 4096  # bound of the message World
 class Body(FileStruct, frozen=True, kw_only=True):
     """The body that a scene was laid out for: another robot gets the scene in proportion, see fitting.py."""
 
-    spacing_m: Size  # between neighbouring yaw joints
+    spacing_m: Size  # between neighboring yaw joints
     radius_m: Size
 
 
@@ -132,7 +132,7 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     about: str = ""
     ground: Ground
-    made_for: Body | None = None
+    reference_robot: Body | None = None
     route: SineRoute | WaypointRoute | None = None
     cylinder: list[Cylinder] = []
     box: list[Box] = []
@@ -183,7 +183,7 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
         ball = Obstacle(
             name=s.name or f"sphere_{i}",
             shape="sphere",
-            position_w=(*s.position_m, s.centre_height_m),
+            position_w=(*s.position_m, s.center_height_m),
             radius_m=s.radius_m,
             height_m=2 * s.radius_m,
         )
@@ -242,9 +242,9 @@ def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route 
         tangent = route.tangent_w(s)
         left = np.array([-tangent[1], tangent[0]])
         push = left if left @ forward > 0 else -left  # from the peg into the body
-        centre = route.position_w(s) - push * (row.corridor_m + row.radius_m)
+        center = route.position_w(s) - push * (row.corridor_m + row.radius_m)
         name = f"peg_{index}_{row.first + k}"
-        pegs.append(_placed(peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m), row))
+        pegs.append(_placed(peg(name, (float(center[0]), float(center[1])), row.radius_m, row.height_m), row))
     return pegs
 
 
@@ -255,7 +255,7 @@ def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) ->
     obstacles = Outlines.of(solid)
     rear, front = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
     along = rear[:, None] + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (front - rear)[:, None]  # (links, SAMPLES, 2)
-    to_middles = Outlines.of_segments(rear, front).distance_m(obstacles.centre_w).T - obstacles.rounding_m
+    to_middles = Outlines.of_segments(rear, front).distance_m(obstacles.center_w).T - obstacles.rounding_m
     gaps = np.minimum(obstacles.distance_m(along).min(axis=1), to_middles)  # (links, obstacles), from the links' axes
     overlaps = np.array([link.radius_m for link in snake])[:, None] - gaps
     for k, i in np.argwhere(overlaps.T > OVERLAP_M)[:1]:

@@ -98,11 +98,11 @@ class DepthCamera(Looking, frozen=True, kw_only=True):
 
     width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160
     height: Annotated[int, Meta(ge=1, le=MAX_IMAGE_HEIGHT)] = 120
-    view_rad: Annotated[float, above(3, "rad")] = 1.5708  # from the left edge to the right one
+    fov_rad: Annotated[float, above(3, "rad")] = 1.5708  # from the left edge to the right one
     range_min_m: Annotated[float, from_zero(60, "m")] = 0.1
     range_max_m: Annotated[float, above(60, "m")] = 5.0
     noise_m_per_m2: Annotated[float, from_zero(1, "m/m²")] = 0.0  # more noise, times the square of the distance
-    colour: bool = False  # also a colour image, which the simulator renders by OpenGL
+    color: bool = False  # also a color image, which the simulator renders by OpenGL
 
     def __post_init__(self) -> None:
         """Raises ValueError, which the file reader explains."""
@@ -111,23 +111,23 @@ class DepthCamera(Looking, frozen=True, kw_only=True):
     @property
     def focal_px(self) -> float:
         """Focal length, of both axes."""
-        return self.width / 2 / math.tan(self.view_rad / 2)
+        return self.width / 2 / math.tan(self.fov_rad / 2)
 
 
 class RangeSensor(Looking, frozen=True, kw_only=True):
     """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
-    view_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0  # from the first beam, on the right, to the last one
+    fov_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0  # from the first beam, on the right, to the last one
     range_min_m: Annotated[float, from_zero(1000, "m")] = 0.02
     range_max_m: Annotated[float, above(1000, "m")] = 5.0
 
     def __post_init__(self) -> None:
         """Raises ValueError, which the file reader explains."""
         _check_range(self.range_min_m, self.range_max_m)
-        if (self.beams > 1) != (self.view_rad > 0):
+        if (self.beams > 1) != (self.fov_rad > 0):
             raise ValueError(
-                f"{self.beams} beams over {self.view_rad:g} rad: one beam has `view_rad` = 0, several have more"
+                f"{self.beams} beams over {self.fov_rad:g} rad: one beam has `fov_rad` = 0, several have more"
             )
 
 
@@ -179,17 +179,17 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
         yield from self.mounted()
 
     def mounted(self) -> Iterator[tuple[str, AnyMounted]]:
-        """The sensors at places on links, with their keys. A camera with colour is there twice."""
+        """The sensors at places on links, with their keys. A camera with color is there twice."""
         for camera in self.depth:
             yield keys.depth(camera.name), camera
-            if camera.colour:
-                yield keys.colour(camera.name), camera
+            if camera.color:
+                yield keys.color(camera.name), camera
         for sensor in self.range:
             yield keys.ranges(sensor.name), sensor
         for sensor in self.own:
             yield keys.own(sensor.name), sensor
 
     @property
-    def largest_image_bytes(self) -> int:
+    def max_image_bytes(self) -> int:
         """Of the pixels of the largest image; 0 without cameras."""
-        return max((camera.width * camera.height * (3 if camera.colour else 2) for camera in self.depth), default=0)
+        return max((camera.width * camera.height * (3 if camera.color else 2) for camera in self.depth), default=0)

@@ -17,11 +17,11 @@ HASH_DIGITS = 12
 
 def shared_settings(config: RunConfig) -> dict[str, str]:
     """Field -> its value, or a hash of a section."""
-    schedules = {name: (service.every_ticks, service.lag_ticks) for name, service in config.services.items()}
+    schedules = {name: (service.decimation, service.latency_ticks) for name, service in config.services.items()}
     return {
         "robot": f"{config.robot.name[:40]} {_hash(config.robot)}",
         "scene": f"{config.scene.name[:40]} {_hash(config.scene)}",
-        "pace": config.pace,
+        "clock_mode": config.clock_mode,
         "rate_hz": f"{config.rate_hz:g}",
         "seed": str(config.seed),
         "start": _hash(config.start),

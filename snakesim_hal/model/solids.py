@@ -49,8 +49,8 @@ def made_of(solid: Solid) -> dict[str, Any]:
 
 def peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
     """An upright cylinder on the ground, in m."""
-    centre = (float(position[0]), float(position[1]), height / 2)
-    return Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius, height_m=height)
+    center = (float(position[0]), float(position[1]), height / 2)
+    return Obstacle(name=name, shape="cylinder", position_w=center, radius_m=radius, height_m=height)
 
 
 def block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from queue import Empty
 from typing import Any, Generic
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import mismatch
@@ -21,6 +21,7 @@ from snakesim_hal.wire.codec import Decoder, MessageT
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
+    ClockMode,
     Description,
     Done,
     JointCommand,
@@ -28,7 +29,6 @@ from snakesim_hal.wire.messages import (
     LeaseRequest,
     Message,
     Mode,
-    Pace,
 )
 from snakesim_hal.wire.outgoing import checked
 from snakesim_hal.wire.own_sample import own_kind_at
@@ -105,14 +105,16 @@ class RobotFilter:
 class Client:
     """A service's connection to one robot's HAL."""
 
-    def __init__(self, session: Session, service: str, *, every_ticks: int = 1, pace: Pace = "lockstep") -> None:
-        """every_ticks: the service acts on ticks that are multiples of this, and ignores the others.
+    def __init__(
+        self, session: Session, service: str, *, decimation: int = 1, clock_mode: ClockMode = "lockstep"
+    ) -> None:
+        """decimation: the service acts on ticks that are multiples of this, and ignores the others.
 
-        pace: of the run. Clocks of another pace are rejected: a service would wait for a lockstep clock.
+        clock mode: of the run. Clocks of another clock mode are rejected: a service would wait for a lockstep clock.
         """
         self.service = service
         self.session = session
-        self._every_ticks, self._pace = every_ticks, pace
+        self._decimation, self._clock_mode = decimation, clock_mode
         self._clocks: Mailbox[Clock] = Mailbox()
         self._heard_at = time.monotonic()
         self.newest_clock: Clock | None = None  # the newest clock, due or not
@@ -170,7 +172,7 @@ class Client:
             self._clock, self.commanded_tick = clock, -1
             self.lacks.clear()
             for feed in self._feeds.values():
-                feed.take_in(newest_only=clock.pace != "lockstep")
+                feed.take_in(newest_only=clock.clock_mode != "lockstep")
             yield clock
 
     def _next_clock(self, timeout_s: float | None) -> Clock:
@@ -179,7 +181,7 @@ class Client:
         self._ahead = None
         while not self._clocks.empty():
             following = self._clocks.get()
-            another = clock.pace == "lockstep" and following.tick != clock.tick
+            another = clock.clock_mode == "lockstep" and following.tick != clock.tick
             if another or following.paused != clock.paused:
                 self._ahead = following
                 break
@@ -224,11 +226,11 @@ class Client:
         except WireError as error:
             self.session.rejected[error.reason] += 1
             return
-        if clock.pace == "lockstep" != self._pace:
+        if clock.clock_mode == "lockstep" != self._clock_mode:
             self.session.rejected["other_pace"] += 1
             return
         self.newest_clock = clock
-        if clock.paused or clock.tick % self._every_ticks == 0:
+        if clock.paused or clock.tick % self._decimation == 0:
             self._clocks.put(clock)
 
     def read(self, feed: Feed[MessageT]) -> MessageT | None:
@@ -248,9 +250,9 @@ class Client:
         wanted = clock.newest.get(feed.key)
         if wanted is None:
             wanted = clock.newest.get(feed.key.partition("/")[0])
-        if clock.pace == "lockstep" and wanted is None and feed.key.startswith("sensor/"):
+        if clock.clock_mode == "lockstep" and wanted is None and feed.key.startswith("sensor/"):
             return None  # a delayed sensor has no sample yet at this tick, but the host may be at a later one already
-        if clock.pace != "lockstep" or wanted is None:
+        if clock.clock_mode != "lockstep" or wanted is None:
             return feed.newest()
         found = feed.at(wanted)
         if found is not None or clock.lifecycle != "armed":
@@ -285,7 +287,7 @@ class Client:
     def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)
         if publisher is None:
-            lossless = self._clock is not None and self._clock.pace == "lockstep"
+            lossless = self._clock is not None and self._clock.clock_mode == "lockstep"
             publisher = self._publishers[key] = self.session.publisher(key, message, lossless=lossless)
         return publisher
 
@@ -319,25 +321,25 @@ class Commander:
         self._epoch = answer.epoch if answer.ok else 0
         return answer.ok
 
-    def send(self, clock: Clock, joints: JointState, set_points: SetPoints) -> None:
-        """Publish set-points that answer a joint state; they are valid for one lease term after its publishing."""
+    def send(self, clock: Clock, joints: JointState, setpoints: Setpoints) -> None:
+        """Publish setpoints that answer a joint state; they are valid for one lease term after its publishing."""
         self._sequence += 1
         command = JointCommand(
             tick=joints.tick,
-            arming=clock.arming,
+            arm_session=clock.arm_session,
             sequence=self._sequence,
             lease_epoch=self._epoch,
             layout=self._description.layout,
             valid_for_ns=self._description.lease_ns,
-            mode=set_points.mode,
-            target=set_points.target,
-            torque_limit_nm=set_points.torque_limit_nm,
+            mode=setpoints.mode,
+            target=setpoints.target,
+            torque_limit_nm=setpoints.torque_limit_nm,
         )
         self._client.put(keys.JOINT_COMMAND, command)
         self._client.commanded_tick = joints.tick
 
-    def stay(self, joints: JointState) -> SetPoints:
-        """Set-points that hold every joint at its angle: sent while the robot is not armed."""
+    def stay(self, joints: JointState) -> Setpoints:
+        """Setpoints that hold every joint at its angle: sent while the robot is not armed."""
         count = len(self._description.joints)
         limits = [joint.torque_limit_nm for joint in self._description.joints]
-        return SetPoints([Mode.POSITION] * count, list(joints.angle_rad), limits)
+        return Setpoints([Mode.POSITION] * count, list(joints.angle_rad), limits)

@@ -1,20 +1,20 @@
 """The right to command one robot from this process, as its service `control`: a lease, and a command for each tick.
 
-It is a client like any other. The host's gate limits each command; without commands the lease ends within 50 to 100 ms,
-and an armed robot goes into its safe action.
+It is a client like any other. The host's limiter limits each command; without commands the lease ends within 50 to 100
+ms, and an armed robot goes into its stop mode.
 """
 
 import time
 from collections.abc import Callable
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import RefusedError, StalledError
 from snakesim_hal.base.process import tune_garbage_collector
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, Message, Pace, Pose
+from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, Description, JointState, Message, Pose
 
 SILENCE_S = 2.0
 LEASE_S = 10.0
@@ -24,19 +24,19 @@ READ = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 class Commanding:
     """Takes the place of the run's control service, from construction to the end of the session."""
 
-    def __init__(self, session: Session, robot: Description, pace: Pace) -> None:
+    def __init__(self, session: Session, robot: Description, clock_mode: ClockMode) -> None:
         """Takes the lease. Raises RefusedError when somebody else commands the robot."""
         if session.present(keys.alive(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
                 "--set services.control.external=true"
             )
-        self._client = Client(session, CONTROL, pace=pace)
+        self._client = Client(session, CONTROL, clock_mode=clock_mode)
         self._feeds: dict[str, Feed] = {key: self._client.subscribe(key, message) for key, message in READ.items()}
         self._client.description()
         self._ticks = self._client.ticks(SILENCE_S)
         self._commander = Commander(self._client, robot)
-        self._last: SetPoints | None = None
+        self._last: Setpoints | None = None
         self.clock: Clock | None = None
         self._mine = False
         tune_garbage_collector()  # looking through all objects of a notebook may take longer than a lease
@@ -66,7 +66,7 @@ class Commanding:
         """Whether the lease is ours at this tick."""
         return self._mine
 
-    def send(self, points: SetPoints) -> None:
+    def send(self, points: Setpoints) -> None:
         """Command these in this tick. Raises RefusedError without the lease."""
         joints = self.read(keys.JOINTS)
         if not isinstance(joints, JointState) or self.clock is None:

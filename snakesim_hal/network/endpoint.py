@@ -63,8 +63,8 @@ def check_loopback(endpoint: str) -> None:
     if parts is None or is_exposed(endpoint):
         return
     host = parts["host"].strip("[]")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+    driver_type = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(driver_type, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((host, int(parts["port"])))  # sends nothing
         except OSError as error:

@@ -144,8 +144,8 @@ class ForeignNetwork:
 
 
 @contextmanager
-def open_foreign_network(endpoint: str, *, largest_bytes: int) -> Iterator[ForeignNetwork]:
-    """Connect to a router. largest_bytes: of a payload from there. Raises NotConnectedError."""
-    session = open_zenoh(Link(endpoint, largest_bytes=largest_bytes), CONNECT_TIMEOUT_S)
+def open_foreign_network(endpoint: str, *, max_bytes: int) -> Iterator[ForeignNetwork]:
+    """Connect to a router. max_bytes: of a payload from there. Raises NotConnectedError."""
+    session = open_zenoh(Link(endpoint, max_bytes=max_bytes), CONNECT_TIMEOUT_S)
     with closing(ForeignNetwork(session)) as network:
         yield network

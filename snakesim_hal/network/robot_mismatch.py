@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.model.route import is_line
 from snakesim_hal.wire.messages import (
-    ColourImage,
+    ColorImage,
     Contacts,
     DepthImage,
     Description,
@@ -46,7 +46,7 @@ def mismatch(message: Message, robot: Description) -> WireError | None:
             return wrong or _beyond("Imu.link", max(message.link, default=0), last_link)
         case Contacts():
             return _touching(message, last_link)
-        case DepthImage() | ColourImage():
+        case DepthImage() | ColorImage():
             pixels = message.width * message.height
             if isinstance(message, DepthImage):
                 wrong = _lengths(message, ("depth",), 2 * pixels, "two bytes a pixel")
@@ -63,7 +63,7 @@ def mismatch(message: Message, robot: Description) -> WireError | None:
         case Trajectory():
             if _is_path(np.array(message.path_w)):
                 return None
-            allowed = f"no two neighbours alike, no longer than {MAX_PATH_M:g} m, and no point further off"
+            allowed = f"no two neighbors alike, no longer than {MAX_PATH_M:g} m, and no point further off"
             return WireError("no_path", f"Trajectory.path_w of {len(message.path_w)} points is no path: {allowed}")
         case _:
             return None

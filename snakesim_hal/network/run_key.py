@@ -1,4 +1,4 @@
-"""The run key: a secret that a run's processes inherit, by which they recognise their own host's description.
+"""The run key: a secret that a run's processes inherit, by which they recognize their own host's description.
 
 Any client on the network can publish a description. The one of a run's own host carries a proof that needs
 the run's key, so the services of a run reject any other.

@@ -75,7 +75,7 @@ class Link:
     namespace: str | None = None  # None: the whole network, for tools that search for robots
     listen: bool = False  # True: listen on the endpoint; False: connect to it
     insecure: bool = False  # True: listen even where other machines can connect
-    largest_bytes: int = MAX_PAYLOAD_BYTES  # of a payload; longer ones cost neither memory nor time
+    max_bytes: int = MAX_PAYLOAD_BYTES  # of a payload; longer ones cost neither memory nor time
     session: SessionFile | None = None  # how to connect; `endpoint` is then the first one in it
 
     @staticmethod
@@ -478,7 +478,7 @@ def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:
         settings["namespace"] = link.namespace
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
-    largest = {"transport/link/rx/max_message_size": link.largest_bytes + ENVELOPE_BYTES}
+    largest = {"transport/link/rx/max_message_size": link.max_bytes + ENVELOPE_BYTES}
     set_unless_given(config, UNLESS_GIVEN | largest)
     return config
 

@@ -50,8 +50,8 @@ def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
 
 def open_stop_port(host: str, port: int) -> socket.socket:
     """Bind the port. port 0: any. Raises NotConnectedError when it is in use."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    opened = socket.socket(family, socket.SOCK_DGRAM)
+    address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    opened = socket.socket(address_family, socket.SOCK_DGRAM)
     try:
         opened.bind((host, port))
         _accept_requests_only(opened)
@@ -158,8 +158,8 @@ def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | N
 
 
 def _open_for(address: Address) -> socket.socket:
-    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-    return socket.socket(family, socket.SOCK_DGRAM)
+    address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    return socket.socket(address_family, socket.SOCK_DGRAM)
 
 
 def _ask(asking: socket.socket, address: Address, who: str, timeout_s: float) -> Stopped | None:

@@ -1,4 +1,4 @@
-"""A plant whose drives reach some of its links through gears with backlash, for emulated drives.
+"""A physics model whose drives reach some of its links through gears with backlash, for emulated drives.
 
 An encoder on the motor's side of such a gear turns through the backlash at each reversal, while the link stays where it
 is. The rotor of such a joint therefore has an angle of its own:
@@ -16,7 +16,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.plant import LinkLoad, Plant
+from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
 
 TOOTH_STIFFNESS_NM_PER_RAD = 300.0  # softer than most gears; an explicit step of 1 ms integrates it on a light link
@@ -25,7 +25,7 @@ LINK_SIDE_INERTIA_RATIO = 0.1  # of the rotor's inertia: the gear's output stage
 
 
 def without_rotors(config: RunConfig, joints: Sequence[Joint], backlash_rad: Mapping[str, float]) -> RunConfig:
-    """Return the configuration of the plant below: rotor inertia and friction are on the motor's side of the gear."""
+    """Return the configuration of the physics model: rotor inertia and friction are on the motor's side of the gear."""
     exceptions = dict(config.robot.joints)
     for joint in joints:
         if joint.name not in backlash_rad:
@@ -40,19 +40,21 @@ def without_rotors(config: RunConfig, joints: Sequence[Joint], backlash_rad: Map
 
 
 class BacklashPlant:
-    """A `Plant` that wraps another one, and whose joint angles are those that encoders on the rotors measure."""
+    """A `PhysicsModel` that wraps another one, and whose joint angles are those that encoders on the rotors measure."""
 
-    def __init__(self, plant: Plant, joints: Sequence[Joint], backlash_rad: Mapping[str, float], seed: int) -> None:
+    def __init__(
+        self, physics_model: PhysicsModel, joints: Sequence[Joint], backlash_rad: Mapping[str, float], seed: int
+    ) -> None:
         """Place every rotor somewhere within its backlash, at rest.
 
         Args:
-            plant: made from the configuration that `without_rotors` returns.
+            physics model: made from the configuration that `without_rotors` returns.
             joints: every joint as it is in truth, tail to head.
             backlash_rad: the whole play of a joint, from one tooth flank to the other, by the joint's name.
             seed: decides where within its backlash each rotor starts.
         """
-        self._plant = plant
-        self.step_s = plant.step_s
+        self._physics_model = physics_model
+        self.step_s = physics_model.step_s
         loose = [i for i, joint in enumerate(joints) if joint.name in backlash_rad]
         motors = [joints[i].motor for i in loose]
         self._loose = np.array(loose, dtype=np.intp)
@@ -61,7 +63,7 @@ class BacklashPlant:
         self._friction_nm: Floats = np.array([motor.friction_nm for motor in motors])
         self._viscous_nm_s: Floats = np.array([motor.viscous_nm_s_per_rad for motor in motors])
         offset = np.random.default_rng(seed).uniform(-1.0, 1.0, len(loose)) * self._half_rad
-        self._rotor_rad: Floats = plant.angle_rad[self._loose] + offset
+        self._rotor_rad: Floats = physics_model.angle_rad[self._loose] + offset
         self._rotor_rad_s: Floats = np.zeros(len(loose))
         self._tooth_nm: Floats = np.zeros(len(loose))
 
@@ -70,11 +72,14 @@ class BacklashPlant:
         self._turn_rotors(torque_nm[self._loose])
         passed_on = torque_nm.copy()
         passed_on[self._loose] = self._tooth_nm
-        self._plant.advance(passed_on)
+        self._physics_model.advance(passed_on)
 
     def _turn_rotors(self, motor_nm: Floats) -> None:
         """Advance the rotors, implicitly in the spring and the damper; the links keep their velocity for the step."""
-        link_rad, link_rad_s = self._plant.angle_rad[self._loose], self._plant.velocity_rad_s[self._loose]
+        link_rad, link_rad_s = (
+            self._physics_model.angle_rad[self._loose],
+            self._physics_model.velocity_rad_s[self._loose],
+        )
         apart_rad = self._rotor_rad - link_rad
         pressed_rad = apart_rad - np.clip(apart_rad, -self._half_rad, self._half_rad)
         touching = pressed_rad != 0.0
@@ -97,31 +102,31 @@ class BacklashPlant:
     @property
     def angle_rad(self) -> Floats:
         """Joint angles as the encoders on the rotors measure them, (n_joints,)."""
-        angle_rad = self._plant.angle_rad.copy()
+        angle_rad = self._physics_model.angle_rad.copy()
         angle_rad[self._loose] = self._rotor_rad
         return angle_rad
 
     @property
     def velocity_rad_s(self) -> Floats:
         """Joint velocities as the encoders on the rotors measure them, (n_joints,)."""
-        velocity_rad_s = self._plant.velocity_rad_s.copy()
+        velocity_rad_s = self._physics_model.velocity_rad_s.copy()
         velocity_rad_s[self._loose] = self._rotor_rad_s
         return velocity_rad_s
 
     def shaft_torque_nm(self) -> Floats:
         """Torque through each joint's shaft; behind a gear with backlash, that of its teeth."""
-        torque_nm = self._plant.shaft_torque_nm()
+        torque_nm = self._physics_model.shaft_torque_nm()
         torque_nm[self._loose] = self._tooth_nm
         return torque_nm
 
     def loads(self) -> list[LinkLoad]:
         """Loads of the links in contact."""
-        return self._plant.loads()
+        return self._physics_model.loads()
 
     def imu(self) -> Imu | None:
         """Angular velocity and specific force of the links."""
-        return self._plant.imu()
+        return self._physics_model.imu()
 
     def pose(self) -> Pose | None:
         """Pose of the base."""
-        return self._plant.pose()
+        return self._physics_model.pose()

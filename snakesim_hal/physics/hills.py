@@ -3,14 +3,14 @@
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.scene import Uneven
+from snakesim_hal.model.scene import Heightfield
 
 SAMPLES_PER_WAVE = 12
 MAX_SAMPLES = 500  # along an edge
 WAVES = 40
 
 
-def hills(uneven: Uneven) -> Floats:
+def hills(uneven: Heightfield) -> Floats:
     """Heights over the square area, (n, n) float64 in metres, row by row along y; from -height/2 to +height/2.
 
     A sum of plane waves of about one wavelength, in random directions: smooth, and the same for a seed.

@@ -1,4 +1,4 @@
-"""The motor model of a joint, as shared by simulator, module twins and the checks before a run.
+"""The motor model of a joint, as shared by simulator, emulated joint modules and the checks before a run.
 
 A joint's torque follows its demand as a first-order lag, is clipped to a limit, and falls to 0 at the speed limit.
 """

@@ -1,11 +1,11 @@
 """All motors of a chain as vectors, by the law of the simulator's motors, so that the two agree.
 
-At every step of the plant
+At every step of the physics model
 
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
     demand is limited by the line that falls from a multiple of full torque at rest to 0 at the speed limit
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
-    torque is clipped to the smallest of the set-point's limit, the parameter's, and the derated full torque
+    torque is clipped to the smallest of the setpoint's limit, the parameter's, and the derated full torque
 
 The torque is the motor's state, and a change of mode or limit changes only the demand, so torque never jumps. Torque is
 updated before the joint moves under it, which keeps explicit steps stable far beyond 1 ms.
@@ -63,9 +63,9 @@ class Motors:
         self._asked_limit[i] = min(limit_nm, self.full_nm[i])
         self._limit[i] = min(self._asked_limit[i], self._own_limit[i])
 
-    def derate(self, share_left: Floats) -> None:
+    def derate(self, remaining_fraction: Floats) -> None:
         """Limit torque to this share of full torque, (n_joints,), from 0 to 1; lower demands are not reduced."""
-        np.multiply(self.full_nm, share_left, out=self._own_limit)
+        np.multiply(self.full_nm, remaining_fraction, out=self._own_limit)
         np.minimum(self._asked_limit, self._own_limit, out=self._limit)
 
     def derated(self) -> NDArray[np.bool_]:
@@ -73,7 +73,7 @@ class Motors:
         return np.minimum(np.abs(self._demand), self._asked_limit) > self._limit
 
     def step(self, angle_rad: Floats, speed_rad_s: Floats) -> Floats:
-        """Torques for the next step of the plant, (n_joints,); always the same array."""
+        """Torques for the next step of the physics model, (n_joints,); always the same array."""
         demand, cap, spare, torque = self._demand, self._cap, self._spare, self.torque_nm
         np.subtract(self._position, angle_rad, out=demand)
         demand *= self._kp

@@ -31,7 +31,7 @@ class HeatLimits:
     derate_from_c: float
     stop_at_c: float
 
-    def share_left(self, winding_c: float) -> float:
+    def remaining_fraction(self, winding_c: float) -> float:
         """Share of the rated torque at a temperature: 1 up to `derate_from_c`, a fifth from `stop_at_c` on."""
         over = (winding_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
         return 1.0 - (1.0 - MIN_SHARE) * min(max(over, 0.0), 1.0)
@@ -52,7 +52,7 @@ class Thermal:
         self._rise = np.array([joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints])
         self._minus_time_s = np.array([-joint.heat.time_constant_s for joint in joints])
         self._loss_w = np.array([joint.heat.loss_at_rated_w for joint in joints])
-        self._board_share = np.array([joint.heat.board_share for joint in joints])
+        self._board_fraction = np.array([joint.heat.board_fraction for joint in joints])
 
     def pass_time(self, seconds: float, torque_squared: Floats) -> None:
         """Heat and cool, under a mean square of torque, N²·m², (n_joints,). Exact for a constant torque."""
@@ -66,17 +66,19 @@ class Thermal:
             self.winding_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
         self._held[motor] = hold
 
-    def share_left(self) -> Floats | None:
+    def remaining_fraction(self) -> Floats | None:
         """Share of its torque that each motor may use, (n_joints,); None while all are cool."""
         derated, self._derates = self._derates, bool((self.winding_c > self._derate_from_c).any())
         if not (self._derates or derated):
             return None
-        shares = [of.share_left(celsius) for of, celsius in zip(self.limits, self.winding_c.tolist(), strict=True)]
+        shares = [
+            of.remaining_fraction(celsius) for of, celsius in zip(self.limits, self.winding_c.tolist(), strict=True)
+        ]
         return np.array(shares)
 
     def board_c(self) -> Floats:
         """Temperatures of the electronics beside the windings, (n_joints,)."""
-        return self._ambient_c + self._board_share * (self.winding_c - self._ambient_c)
+        return self._ambient_c + self._board_fraction * (self.winding_c - self._ambient_c)
 
     def power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
         """What the motors take, (n_joints,): mechanical power and copper losses; `Supply.idle_a` comes on top."""

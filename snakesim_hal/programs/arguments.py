@@ -44,7 +44,7 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--backend", help="sim or can")
     parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
-    parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
+    parser.add_argument("--clock-mode", choices=["realtime", "lockstep", "free"])
     parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
     parser.add_argument("--seed", type=int)
     parser.add_argument(
@@ -70,7 +70,7 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
     flags = {
         "backend": arguments.backend,
         "controller": arguments.controller,
-        "pace": arguments.pace,
+        "clock_mode": arguments.clock_mode,
         "duration_s": arguments.duration,
         "seed": arguments.seed,
     }
@@ -190,14 +190,14 @@ def link_of(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool =
 
     check_network(arguments)
     session = session_given(arguments)
-    largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)
+    max_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.max_image_bytes)
     if session is not None:
         namespace = session.namespace_for(arguments.namespace) or config.robot.name
-        return Link(session.endpoints[0], namespace, largest_bytes=largest_bytes, session=session)
+        return Link(session.endpoints[0], namespace, max_bytes=max_bytes, session=session)
     return Link(
         endpoint=arguments.router or arguments.endpoint or DEFAULT_ENDPOINT,
         namespace=arguments.namespace or config.robot.name,
         listen=hosts and arguments.router is None,
         insecure=getattr(arguments, "insecure", False),
-        largest_bytes=largest_bytes,
+        max_bytes=max_bytes,
     )

@@ -81,7 +81,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         opened.callback(stop_port.close)
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
-        realtime_warnings = enter_realtime(HOST_PRIORITY) if config.pace == "realtime" else []
+        realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
         session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
         refuse_second_host(session, given.link)
         described = backend.describe()

@@ -1,7 +1,7 @@
 """A service beside the driver: in a thread of the host's process, over the host's own connection to the network.
 
-It speaks as it would from a process of its own: the same client, messages, lease and gate, published for everybody. A
-command then comes back without a process, a socket or another scheduler in between.
+It speaks as it would from a process of its own: the same client, messages, lease and limiter, published for everybody.
+A command then comes back without a process, a socket or another scheduler in between.
 
 What it costs: service and host share one interpreter. A service that raises, hangs or computes without end in Python
 loses its lease, as anywhere. One that holds the interpreter (compiled code without end) stops the host too, and with it
@@ -52,7 +52,7 @@ class Beside:
             thread.join(max(until - time.monotonic(), 0.0))
 
     def _serve(self, name: str) -> None:
-        if self._config.pace == "realtime":
+        if self._config.clock_mode == "realtime":
             set_realtime_priority(SERVICE_PRIORITY)
         while not self._closing.is_set():
             self._serve_once(name)

@@ -21,8 +21,8 @@ SERVICE_HAS = ("name", "urgent", "too_slow", "configure", "outputs", "silence", 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
     """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
 
-    Returns the configuration, with a pace that the backend can keep: a scenario is written for any backend.
-    run_files: False runs no code of a `./file.py:Class`, so that its settings and its pace are not checked.
+    Returns the configuration, with a clock mode that the backend can keep: a scenario is written for any backend.
+    run_files: False runs no code of a `./file.py:Class`, so that its settings and its clock mode are not checked.
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
@@ -96,7 +96,7 @@ def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
     """Where nobody tells the pose, a controller of joints runs alone; for any other guidance reckons it."""
     alone = GUIDANCE in config.own_services and config.own_services.keys() <= {*BY_POSE, CONTROL}
     # Nobody has asked for it.
-    reckons = config.dead_reckons(description_of(config)) and config.mission.localisation == "pose_sensor"
+    reckons = config.dead_reckons(description_of(config)) and config.mission.localization == "pose_sensor"
     if not (reckons and alone and getattr(controller, "NEEDS", "world") == "joints"):
         return config
     left = {name: service for name, service in config.services.items() if name not in BY_POSE}
@@ -125,9 +125,11 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     settings = backend_settings(config, backend, table)
     config = on_backend(config, backend)
     paces = backend.check(config, settings)
-    if config.pace in paces:
+    if config.clock_mode in paces:
         return config
-    asked_by = table.origin_of("pace") if table is not None else f"scenario {config.name!r}"
+    asked_by = table.origin_of("clock_mode") if table is not None else f"scenario {config.name!r}"
     if asked_by.startswith("--"):
-        raise ConfigError(f"{asked_by}: backend {config.backend!r} cannot keep this pace, only {' or '.join(paces)}")
-    return msgspec.structs.replace(config, pace=paces[0])
+        raise ConfigError(
+            f"{asked_by}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(paces)}"
+        )
+    return msgspec.structs.replace(config, clock_mode=paces[0])

@@ -80,7 +80,7 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
     config, name = given.config, service_type.name
     accept_interrupts()
     threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
-    if service_type.urgent and config.pace == "realtime":
+    if service_type.urgent and config.clock_mode == "realtime":
         enter_realtime(SERVICE_PRIORITY)
         drop_priority_after(config.lease_ns * 1e-9)
     with joined(given.link, name) as session:

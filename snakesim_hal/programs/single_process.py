@@ -43,8 +43,10 @@ WHO = "run in one process"
 def check(config: RunConfig) -> None:
     """Whether a run needs neither processes of its own nor a network. Raises ConfigError."""
     where = f"scenario {config.name!r} in one process"
-    if config.pace != "lockstep":
-        raise ConfigError(f"{where}: pace is {config.pace!r}, must be 'lockstep'; add --pace lockstep")
+    if config.clock_mode != "lockstep":
+        raise ConfigError(
+            f"{where}: clock mode is {config.clock_mode!r}, must be 'lockstep'; add --clock-mode lockstep"
+        )
     if not config.has_own_control:
         raise ConfigError(f"{where}: nobody commands the robot; it needs a control service that is not external")
     for name, service in config.services.items():
@@ -148,7 +150,7 @@ class InProcessRun:
                 if before_services:
                     yield
                 self._let_act()
-                if not self.host.authority.arming and not self.failed:
+                if not self.host.authority.arm_session and not self.failed:
                     status = self.host.status()
                     if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
                         raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.why}")

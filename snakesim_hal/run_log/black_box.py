@@ -6,7 +6,7 @@ full or hangs, the newest rows are kept.
 On disk it is one flat file: a line of JSON that names the columns, then the rows. `read_black_box` reads it, also with
 an incomplete last row, as after a SIGKILL.
 
-`command_digest` is a hash over every applied set-point, so runs with equal digests drove the motors equally.
+`command_digest` is a hash over every applied setpoint, so runs with equal digests drove the motors equally.
 """
 
 import hashlib
@@ -108,12 +108,12 @@ class BlackBox:
         self._memory = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)  # touched: no page faults
         self._rows = 0
         self._digest = hashlib.sha256()
-        self._pack_set_points = struct.Struct(f"<q{joints}b{2 * joints}d").pack
+        self._pack_setpoints = struct.Struct(f"<q{joints}b{2 * joints}d").pack
         self._pose = [np.nan] * 7
         self._contact_peak_n = 0.0
         self._contact_count = 0
 
-    def record(self, tick: int, stamp_ns: int, samples: Samples, decision: Decision) -> None:
+    def record(self, tick: int, timestamp_ns: int, samples: Samples, decision: Decision) -> None:
         """Record one tick."""
         pose = samples.others.get(keys.POSE)
         if isinstance(pose, Pose):
@@ -121,12 +121,12 @@ class BlackBox:
         contacts = samples.others.get(keys.CONTACTS)
         if isinstance(contacts, Contacts):
             self._contact_peak_n, self._contact_count = touching(contacts)
-        joints, points = samples.joints, decision.set_points
+        joints, points = samples.joints, decision.setpoints
         self._pack_into(
             self._memory,
             self._rows % self._capacity * self.layout.row_bytes,
             tick,
-            stamp_ns * 1e-9,
+            timestamp_ns * 1e-9,
             *joints.angle_rad,
             *joints.velocity_rad_s,
             *joints.torque_nm,
@@ -137,7 +137,7 @@ class BlackBox:
             self._contact_count,
             *points.mode,
         )
-        self._digest.update(self._pack_set_points(tick, *points.mode, *points.target, *points.torque_limit_nm))
+        self._digest.update(self._pack_setpoints(tick, *points.mode, *points.target, *points.torque_limit_nm))
         self._rows += 1  # last: another thread reads the counted rows
 
     @property
@@ -147,7 +147,7 @@ class BlackBox:
 
     @property
     def command_digest(self) -> str:
-        """Hash of every set-point applied so far."""
+        """Hash of every setpoint applied so far."""
         return self._digest.hexdigest()
 
     def rows_from(self, row: int) -> tuple[int, bytes]:
@@ -169,11 +169,11 @@ class BlackBox:
 def touching(contacts: Contacts) -> tuple[float, int]:
     """The force of the strongest contact in N, and how many obstacles are touched.
 
-    The force is a mean over 50 ms, see `felt_force`; of a sensor that does not tell it, that of the instant.
+    The force is a mean over 50 ms, see `measured_force`; of a sensor that does not tell it, that of the instant.
     """
     touched = len({contact.obstacle for contact in contacts.contacts})
-    if contacts.felt_n is not None:
-        return contacts.felt_n, touched
+    if contacts.measured_force_n is not None:
+        return contacts.measured_force_n, touched
     squares = [f[0] * f[0] + f[1] * f[1] + f[2] * f[2] for f in (contact.force_l for contact in contacts.contacts)]
     return max(squares, default=0.0) ** 0.5, touched
 

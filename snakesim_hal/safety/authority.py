@@ -1,6 +1,6 @@
-"""Who may move the robot, and the set-points of the motors: lifecycle, lease and gate in one place, without any I/O.
+"""Who may move the robot, and the setpoints of the motors: lifecycle, lease and limiter in one place, without any I/O.
 
-The host passes in commands, requests, states and the time, and gets set-points. `now_ns` is safety time: the
+The host passes in commands, requests, states and the time, and gets setpoints. `now_ns` is safety time: the
 monotonic clock, or simulated time in lockstep.
 """
 
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from snakesim_hal.backend import SetPoints
-from snakesim_hal.safety import gate, lifecycle
+from snakesim_hal.backend import Setpoints
+from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import Derating
 from snakesim_hal.safety.fault_log import FaultLog
-from snakesim_hal.safety.gate import Applied, JointLimits
 from snakesim_hal.safety.isolation import Isolation, Mask
 from snakesim_hal.safety.lease import Lease, freed, renewed, rule
+from snakesim_hal.safety.limiter import Applied, JointLimits
 from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityCheck, readable
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import (
@@ -39,15 +39,15 @@ COMMANDS_KEPT = 1024
 
 @dataclass(frozen=True)
 class Decision:
-    """The set-points of one tick."""
+    """The setpoints of one tick."""
 
-    set_points: SetPoints
-    sequence: int | None  # of the command; None: the host's own safe action
+    setpoints: Setpoints
+    sequence: int | None  # of the command; None: the host's own stop mode
     limited: dict[int, str]  # joint index -> which limit changed its target
 
 
 class Authority:
-    """Lifecycle, lease and gate of one robot."""
+    """Lifecycle, lease and limiter of one robot."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Authority:
         self.limits = JointLimits.of(description)
         self.state: LifecycleState = "disarmed"
         self.why = "not armed yet"
-        self.arming = 0
+        self.arm_session = 0
         self.lease = Lease(epoch=first_epoch)
         self.since_clear = FaultLog()
         self.since_start = FaultLog()
@@ -94,7 +94,7 @@ class Authority:
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
         self._halt: StopRamp | None = None  # set if the robot was armed when the present fault came
-        self._stop_sent = True  # whether the motors have received set-points since the robot stopped being armed
+        self._stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
 
     # --- inputs --------------------------------------------------------------------------------------------
 
@@ -104,7 +104,7 @@ class Authority:
         now_ns: safety time; None: that of the state's stamp.
         """
         applied = self._applied if self.state == "armed" else None
-        now_ns = joints.stamp_ns if now_ns is None else now_ns
+        now_ns = joints.timestamp_ns if now_ns is None else now_ns
         self._state_tick = joints.tick
         self._implausible = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
         self._measured = self._watch.measured
@@ -134,7 +134,7 @@ class Authority:
 
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
         """Take a command, or return why it is rejected. `age_ns`: age of the state that it answers."""
-        refusal = gate.refuse(
+        refusal = limiter.refuse(
             command,
             lease=self.lease,
             now_ns=now_ns,
@@ -146,7 +146,7 @@ class Authority:
         if refusal is not None:
             self.rejected[refusal] += 1
             return refusal
-        if not self.answers_arming(command):  # nor does it renew the lease, which takes commands of this arming
+        if not self.answers_arm_session(command):  # nor does it renew the lease, which takes commands of this arming
             if command.tick <= self._armed_tick:  # sent before the robot was armed: not an error
                 self.standby += 1
             else:
@@ -162,9 +162,9 @@ class Authority:
             self.standby += 1
         return None
 
-    def answers_arming(self, command: JointCommand) -> bool:
+    def answers_arm_session(self, command: JointCommand) -> bool:
         """Whether a command names the present arming, if the robot is armed."""
-        return self.state != "armed" or command.arming == self.arming
+        return self.state != "armed" or command.arm_session == self.arm_session
 
     def reject(self, reason: str) -> None:
         """Count a sample that could not be decoded."""
@@ -194,7 +194,7 @@ class Authority:
                     return self._answer("; ".join(why for _, why in against), min(words, key=lifecycle.ORDER.index))
                 as_it_is = ", unchecked" if self.unchecked else ""
                 self._go("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
-                self.arming += 1
+                self.arm_session += 1
                 self._armed_tick = self._state_tick
                 self._command = self._counting = None
                 self._recent.clear()
@@ -222,7 +222,7 @@ class Authority:
         return self._answer(None)
 
     def fault(self, fault: Fault, joints: Mask | None = None) -> None:
-        """Latch a fault: the joints take the safe action until a clear. One that reaches nothing is only noted.
+        """Latch a fault: the joints take the stop mode until a clear. One that reaches nothing is only noted.
 
         A fault that concerns only some joints isolates them instead, if the robot file allows that. joints: which;
         None: the one that the fault names.
@@ -284,7 +284,7 @@ class Authority:
             self._drop_lease()
 
     def decide(self, up_to: int | None = None) -> Decision:
-        """The set-points for the next period. Call `expire` first.
+        """The setpoints for the next period. Call `expire` first.
 
         up_to: in lockstep, the newest tick whose command is used; None: the newest command.
         """
@@ -300,14 +300,14 @@ class Authority:
             applied = self._uniform(Mode.POSITION, self.limits.inside(self._hold_at))
         else:
             measured, share = self._measured, self._derating.share
-            applied = gate.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
+            applied = limiter.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
             sequence, self._counting = command.sequence, command
             if applied.target.tolist() != command.target or min(share.tolist()) < 1.0:
-                limited = gate.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
+                limited = limiter.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
             limited |= self._isolation.overruled(command)
             self.limited.update(limited.values())
         self._applied = applied = self._isolation.without(applied)
-        return Decision(gate.as_set_points(applied, self._isolation.indices), sequence, limited)
+        return Decision(limiter.as_setpoints(applied, self._isolation.indices), sequence, limited)
 
     # --- inside --------------------------------------------------------------------------------------------
 
@@ -324,7 +324,7 @@ class Authority:
         wrong = [fault for fault in self._derating.wrong if not self._is_aside(fault)]
         against += [fault.cause for fault in wrong if fault.what != "undervoltage"]
         against += self._derating.against_arming(now_ns)
-        if self.arming and not self._stop_sent:
+        if self.arm_session and not self._stop_sent:
             against.append("the motors have not received the stop yet; ask again in a period")
         if not self.lease.live(now_ns):
             against.append("nothing commands the robot: the lease is free")
@@ -368,13 +368,13 @@ class Authority:
 
     def _safe(self) -> Applied:
         zeros = np.zeros_like(self._measured.angle_rad)
-        if self.state != "fault" or self._halt is None or self.description.safe_action == "passive":
+        if self.state != "fault" or self._halt is None or self.description.stop_mode == "passive":
             return self._uniform(Mode.PASSIVE, zeros)
         damps = self.limits.damps
-        if self.description.safe_action == "damp" and damps.all():
+        if self.description.stop_mode == "damp" and damps.all():
             return self._uniform(Mode.VELOCITY, zeros)
         self._halt = self._halt.after_a_period(self.limits)
-        if self.description.safe_action == "damp":
+        if self.description.stop_mode == "damp":
             return self._damped(self._halt)
         return self._uniform(Mode.POSITION, self._halt.target_rad)
 
@@ -385,7 +385,7 @@ class Authority:
         target = np.where(modes == int(Mode.POSITION), halt.target_rad, 0.0)
         return Applied(modes.astype(np.int64), target, self.limits.torque_nm * self._derating.share)
 
-    def _uniform(self, mode: Mode, target: gate.Floats) -> Applied:
+    def _uniform(self, mode: Mode, target: limiter.Floats) -> Applied:
         limit_nm = self.limits.torque_nm * self._derating.share
         return Applied(np.full(len(target), int(mode), dtype=np.int64), target, limit_nm)
 

@@ -20,8 +20,8 @@ class CableJoint:
 
     name: str
     index: int  # tail to head
-    least_rad: float  # limits of its drive angle, which the gate enforces
-    most_rad: float
+    lower_rad: float  # limits of its drive angle, which the limiter enforces
+    upper_rad: float
     cable_turns: float  # that it bears to either side of zero
 
 
@@ -66,7 +66,7 @@ class Cables:
 
 def _wound(joint: CableJoint, drive_rad: float, angle_rad: float) -> str:
     turns = round((angle_rad - drive_rad) / TURN_RAD)
-    most = max(abs(joint.least_rad / TURN_RAD + turns), abs(joint.most_rad / TURN_RAD + turns))
+    most = max(abs(joint.lower_rad / TURN_RAD + turns), abs(joint.upper_rad / TURN_RAD + turns))
     if most <= joint.cable_turns:
         return ""
     back = f"{abs(turns)} turn{'s' if abs(turns) > 1 else ''} to {'lower' if turns > 0 else 'higher'} angles"

@@ -1,7 +1,7 @@
 """Heat, supply and leaks: torque is derated before the robot is stopped. Pure; time is passed in.
 
 From `derate_from_c` on the torque limit falls linearly, to a fifth at `stop_at_c`: by `thermal.HeatLimits`, which
-the motors apply themselves as well. At `stop_at_c`, with water inside, or with a supply below `least_voltage_v` for
+the motors apply themselves as well. At `stop_at_c`, with water inside, or with a supply below `min_voltage_v` for
 50 ms, the robot is stopped, and cannot be armed before the winding has cooled below `derate_from_c`. Heat concerns
 only its joint; a leak or a weak supply concerns the whole robot. It is not armed with a weak supply, however short it
 has been weak, nor in real time before every module has reported its supply. Values that a module has not reported for
@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.physics.thermal import HeatLimits
-from snakesim_hal.safety.gate import Floats
+from snakesim_hal.safety.limiter import Floats
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointDescription, Power
 
 LOW_FOR_NS = 50_000_000
 KNOWN_FOR_NS = 3_000_000_000
 LONGEST_CAUSE = 400
-FIELD = "`least_voltage_v` under [limits] in the robot file"
+FIELD = "`min_voltage_v` under [limits] in the robot file"
 
 
 class Derating:
@@ -78,7 +78,7 @@ class Derating:
             weakest = min(low, key=lambda health: health.voltage_v)
             against.append(
                 f"the supply is at {weakest.voltage_v:.1f} V at {weakest.joint.name}, which needs "
-                f"{weakest.joint.least_voltage_v:g} V{_and_others(len(low) - 1)}: check the supply, or set {FIELD} "
+                f"{weakest.joint.min_voltage_v:g} V{_and_others(len(low) - 1)}: check the supply, or set {FIELD} "
                 f"of {self._robot!r}"
             )
         if self._awaits_reports and self._expected:
@@ -128,7 +128,7 @@ class _Health:
         if "temperature" not in self.joint.measures:
             self.winding_c = winding_c = -math.inf
         self.hot = winding_c >= (self.joint.derate_from_c if self.hot else self.joint.stop_at_c)
-        low = "voltage" in self.joint.measures and voltage_v < self.joint.least_voltage_v
+        low = "voltage" in self.joint.measures and voltage_v < self.joint.min_voltage_v
         self.low_since_ns = (now_ns if self.low_since_ns is None else self.low_since_ns) if low else None
 
     def known(self, now_ns: int) -> bool:
@@ -150,7 +150,7 @@ class _Health:
         """The share of the torque limit that is left after derating."""
         if not self.known(now_ns):
             return 1.0
-        return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).share_left(self.winding_c)
+        return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).remaining_fraction(self.winding_c)
 
     def failures(self, now_ns: int) -> list[tuple[str, str]]:
         """Reasons to stop the robot: a word, and the full cause."""
@@ -163,7 +163,7 @@ class _Health:
         if self.leak:
             found.append(("leak", f"{joint.name} reports water inside"))
         if self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS:
-            needs = f"it needs {joint.least_voltage_v:g} V: {FIELD}"
+            needs = f"it needs {joint.min_voltage_v:g} V: {FIELD}"
             cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, {needs}"
             found.append(("undervoltage", cause))
         return found

@@ -1,6 +1,6 @@
 """Isolated joints: a failed joint is passive from then on, and the others go on, if the robot file allows it. Pure.
 
-Only a joint that fails while the robot is armed is isolated, and only as long as `may_lose_joints` is not exceeded;
+Only a joint that fails while the robot is armed is isolated, and only as long as `max_isolated_joints` is not exceeded;
 one more is a fault of the whole robot. A clear ends all isolations.
 """
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.safety.gate import Applied
+from snakesim_hal.safety.limiter import Applied
 from snakesim_hal.wire.messages import Description, JointCommand, Mode
 
 Mask = NDArray[np.bool_]
@@ -20,7 +20,7 @@ class Isolation:
 
     def __init__(self, description: Description) -> None:
         self._names = [joint.name for joint in description.joints]
-        self._most = description.may_lose_joints
+        self._most = description.max_isolated_joints
         self.joints: Mask = np.zeros(len(self._names), dtype=np.bool_)
         self.indices = frozenset[int]()  # the same, by their index in every vector
 
@@ -54,7 +54,7 @@ class Isolation:
         self._now(np.zeros_like(self.joints))
 
     def without(self, applied: Applied) -> Applied:
-        """The set-points, with isolated joints passive and without torque."""
+        """The setpoints, with isolated joints passive and without torque."""
         if not self.indices:
             return applied
         return replace(

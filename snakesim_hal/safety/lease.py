@@ -20,7 +20,7 @@ class Lease:
 
 
 @dataclass(frozen=True)
-class Ruling:
+class LeaseDecision:
     """The result of a request: the lease after it, and why it was refused (None: granted)."""
 
     lease: Lease
@@ -29,33 +29,33 @@ class Ruling:
     word: str | None = None  # the refusal as one word
 
 
-def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Ruling:
+def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> LeaseDecision:
     """Decide a request. A live lease is granted only to its holder, or to a higher priority."""
     mine = lease.live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
     match request.action:
         case "acquire":
             if lease.live(now_ns) and request.priority <= lease.priority:
                 left_ms = (lease.expires_ns - now_ns) / 1e6
-                return Ruling(
+                return LeaseDecision(
                     lease,
                     f"held by {lease.holder} (epoch {lease.epoch}, priority {lease.priority}) for another "
                     f"{left_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
                     word="lease_held",
                 )
             taken = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
-            return Ruling(taken, changed_hands=True)
+            return LeaseDecision(taken, changed_hands=True)
         case "renew":
             if not mine:
                 return _not_holder(lease, request, "acquire the lease first")
-            return Ruling(renewed(lease, now_ns, term_ns))
+            return LeaseDecision(renewed(lease, now_ns, term_ns))
         case _:  # release
             if not mine:
                 return _not_holder(lease, request, "nothing to release")
-            return Ruling(freed(lease), changed_hands=True)
+            return LeaseDecision(freed(lease), changed_hands=True)
 
 
-def _not_holder(lease: Lease, request: LeaseRequest, then: str) -> Ruling:
-    return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; {then}", word="not_holder")
+def _not_holder(lease: Lease, request: LeaseRequest, then: str) -> LeaseDecision:
+    return LeaseDecision(lease, f"{request.holder} does not hold epoch {request.epoch}; {then}", word="not_holder")
 
 
 def renewed(lease: Lease, now_ns: int, term_ns: int) -> Lease:

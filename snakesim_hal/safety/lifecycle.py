@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.safety.gate import Floats
+from snakesim_hal.safety.limiter import Floats
 from snakesim_hal.wire.messages import Description, JointCommand, LifecycleRequest, LifecycleState, Mode
 
 Event = Literal["arm", "disarm", "fault", "estop", "clear"]
@@ -90,9 +90,11 @@ def far_targets(
         if passive:
             continue
         if mode not in (Mode.POSITION, Mode.PASSIVE):
-            far.append(f"{joint.name} is commanded in mode {mode.name.lower()}; it must hold its position at arming")
+            far.append(
+                f"{joint.name} is commanded in mode {mode.name.lower()}; it must hold its position at arm_session"
+            )
         if mode is Mode.POSITION and abs(target - angle) > most:
             far.append(
-                f"{joint.name} has a target {target - angle:+.2f} rad from its angle; at most {most} rad at arming"
+                f"{joint.name} has a target {target - angle:+.2f} rad from its angle; at most {most} rad at arm_session"
             )
     return far

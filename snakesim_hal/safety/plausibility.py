@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.safety.gate import Applied, Floats, JointLimits, Measured
+from snakesim_hal.safety.limiter import Applied, Floats, JointLimits, Measured
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 
 Mask = NDArray[np.bool_]
@@ -62,7 +62,7 @@ class PlausibilityCheck:
         """Take a joint state; returns what is implausible, or None.
 
         now_ns: safety time. After a delay of the host, more time has passed than its ticks show.
-        applied: the last set-points of an armed robot; None: the robot is not armed.
+        applied: the last setpoints of an armed robot; None: the robot is not armed.
         aside: isolated joints.
         """
         count = len(self._known)
@@ -149,7 +149,7 @@ class PlausibilityCheck:
 def _taken_s(joints: JointState, now_ns: int) -> Floats:
     """When each joint's state was taken, by stamp and by safety time, (2, n_joints)."""
     ages_ns = np.array(joints.age_ns, dtype=np.float64)
-    return (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
+    return (np.array([[joints.timestamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
 
 
 def readable(joints: JointState, good: Measured) -> JointState:

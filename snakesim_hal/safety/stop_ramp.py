@@ -1,4 +1,4 @@
-"""The safe action `hold`: the joints are brought to rest, and held there. Pure.
+"""The stop mode `hold`: the joints are brought to rest, and held there. Pure.
 
 Also how `damp` brings a joint to rest that has no velocity mode; it is let go then.
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.safety.gate import Applied, Floats, JointLimits, Measured, bumpless_target
+from snakesim_hal.safety.limiter import Applied, Floats, JointLimits, Measured, bumpless_target
 from snakesim_hal.wire.messages import Mode
 
 
@@ -25,7 +25,7 @@ class StopRamp:
 
     @staticmethod
     def begin(measured: Measured, last: Applied, limits: JointLimits) -> "StopRamp":
-        """From the measured state, and the last set-points."""
+        """From the measured state, and the last setpoints."""
         angle, velocity = measured.angle_rad, measured.velocity_rad_s
         states = zip(limits.joints, angle.tolist(), velocity.tolist(), measured.torque_nm.tolist(), strict=True)
         bumpless = [bumpless_target(joint, Mode.POSITION, *now) for joint, *now in states]

@@ -8,14 +8,14 @@ from typing import Generic, TypeVar
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.messages import VERSIONS, ColourImage, DepthImage, Message, OwnSample
+from snakesim_hal.wire.messages import VERSIONS, ColorImage, DepthImage, Message, OwnSample
 
 MessageT = TypeVar("MessageT", bound=Message)
 
 ENCODING_PREFIX = "application/msgpack;snakesim."
 MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; longer ones are dropped unread, unless images
-MAX_IMAGE_BYTES = 4 * 1024 * 1024  # a colour image of the most pixels fits
-IMAGES: tuple[type[Message], ...] = (DepthImage, ColourImage)
+MAX_IMAGE_BYTES = 4 * 1024 * 1024  # a color image of the most pixels fits
+IMAGES: tuple[type[Message], ...] = (DepthImage, ColorImage)
 MAX_WHY = 300  # characters of the reason why a payload is malformed
 # Everything that a msgspec decoder raises for untrusted bytes: a payload may be nested too deeply, or not be UTF-8.
 UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError, ValueError)
@@ -36,15 +36,15 @@ class Decoder(Generic[MessageT]):
     def __init__(self, message: type[MessageT]) -> None:
         self.message = message
         self.encoding = encoding_of(message)
-        self._most_bytes = MAX_IMAGE_BYTES if message in IMAGES else MAX_PAYLOAD_BYTES
+        self._max_bytes = MAX_IMAGE_BYTES if message in IMAGES else MAX_PAYLOAD_BYTES
         self._decoder = msgspec.msgpack.Decoder(message)
 
     def decode(self, payload: bytes, encoding: str) -> MessageT:
         """Payload and encoding of a sample -> message. Raises WireError with a reason to count by."""
         if encoding != self.encoding:
             raise WireError(_why_foreign(encoding, self.encoding), f"got {encoding[:80]!r}, want {self.encoding!r}")
-        if len(payload) > self._most_bytes:
-            raise WireError("malformed", f"{len(payload)} bytes, at most {self._most_bytes}")
+        if len(payload) > self._max_bytes:
+            raise WireError("malformed", f"{len(payload)} bytes, at most {self._max_bytes}")
         try:
             return self._decoder.decode(payload)
         except UNDECODABLE as error:

@@ -10,11 +10,11 @@ IMU = "sensor/imu"
 POSE = "sensor/pose"
 POWER = "sensor/power"
 DEPTH_ALL = "sensor/depth/*"
-COLOUR_ALL = "sensor/colour/*"
+COLOUR_ALL = "sensor/color/*"
 RANGE_ALL = "sensor/range/*"
 OWN_ALL = "sensor/own/*"
 PREVIEW_DEPTH_ALL = "preview/depth/*"
-PREVIEW_COLOUR_ALL = "preview/colour/*"
+PREVIEW_COLOUR_ALL = "preview/color/*"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
 CONFIG = "hal/config"
@@ -53,7 +53,7 @@ class Row:
 _TICK = "every tick"
 _SENSOR = "at its `rate_hz` in `Description.sensors`"
 _ASKED = "on request"
-_TURN = "every `every_ticks` of its service"
+_TURN = "every `decimation` of its service"
 _LIVES = "while connected"
 _LOOKED_AT = "2 Hz, if there is a subscriber"
 
@@ -64,19 +64,19 @@ SPACE: tuple[Row, ...] = (
     Row(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose from motion capture"),
     Row(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
     Row(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
-    Row(COLOUR_ALL, m.ColourImage, "HAL", "stream", _SENSOR, "what a camera sees, in colour"),
+    Row(COLOUR_ALL, m.ColorImage, "HAL", "stream", _SENSOR, "what a camera sees, in color"),
     Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
     Row(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "what a sensor with a message of its own says"),
     Row(
         PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
     ),
-    Row(PREVIEW_COLOUR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a colour image"),
-    Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
+    Row(PREVIEW_COLOUR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a color image"),
+    Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and setpoint of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
     Row(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
     Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
     Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
-    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "set-points that the motors got, and limits applied"),
+    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "setpoints that the motors got, and limits applied"),
     Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
     Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
     Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
@@ -102,9 +102,9 @@ def depth(camera: str) -> str:
     return f"sensor/depth/{camera}"
 
 
-def colour(camera: str) -> str:
-    """Key of the colour images of a camera."""
-    return f"sensor/colour/{camera}"
+def color(camera: str) -> str:
+    """Key of the color images of a camera."""
+    return f"sensor/color/{camera}"
 
 
 def ranges(sensor: str) -> str:

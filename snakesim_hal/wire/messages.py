@@ -16,10 +16,10 @@ from msgspec import Meta
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.quantities import about
 
-Pace = Literal["realtime", "lockstep", "free"]
+ClockMode = Literal["realtime", "lockstep", "free"]
 LifecycleState = Literal["disarmed", "armed", "fault", "estop"]
 LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
-SafeAction = Literal["passive", "damp", "hold"]
+StopMode = Literal["passive", "damp", "hold"]
 Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 Measurement = Literal["torque", "temperature", "voltage"]
@@ -61,7 +61,7 @@ class JointState(Message, frozen=True, kw_only=True):
     """`sensor/joints`: every joint at one instant."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     angle_rad: Annotated[q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")]
     velocity_rad_s: Annotated[q.AngularVelocities, about(A_JOINT)]
     torque_nm: Annotated[
@@ -69,7 +69,7 @@ class JointState(Message, frozen=True, kw_only=True):
         about("of the motor; positive turns towards positive angles; 0 of a joint that does not measure it"),
     ]
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
-    age_ns: Annotated[q.Ages, about("how long before `stamp_ns` each joint was measured")]
+    age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]
 
     def is_of(self, joints: int) -> bool:
         """Whether it has this many joints, in every list."""
@@ -99,9 +99,9 @@ class Contacts(Message, frozen=True, kw_only=True):
     """`sensor/contacts`: all contacts at one instant; an empty list means no contact."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     contacts: Annotated[list[Contact], Meta(max_length=q.MAX_CONTACTS)]
-    felt_n: Annotated[
+    measured_force_n: Annotated[
         q.Force | None,
         about(
             "largest force of one obstacle on one link, as a mean over the last 50 ms; null: the sensor does not tell"
@@ -113,7 +113,7 @@ class Imu(Message, frozen=True, kw_only=True):
     """`sensor/imu`: one entry a link that carries an IMU, at its middle, in the link's frame."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     link: Annotated[list[q.LinkIndex], Meta(max_length=q.MAX_JOINTS + 1), about("their numbers, from 0 at the tail")]
     angular_velocity_rad_s: Annotated[list[q.AngularVelocityVector], Meta(max_length=q.MAX_JOINTS + 1)]
     acceleration_m_s2: Annotated[
@@ -125,7 +125,7 @@ class Pose(Message, frozen=True, kw_only=True):
     """`sensor/pose`: pose of the base (tail end of link 0) from motion capture."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     position_w: q.Vector
     orientation_wxyz: q.Quaternion
     velocity_w: q.VelocityVector
@@ -136,7 +136,7 @@ class Power(Message, frozen=True, kw_only=True):
     """`sensor/power`: supply and health of the joint modules, one entry a joint."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     voltage_v: Annotated[list[q.Voltage], Meta(max_length=q.MAX_JOINTS)]
     current_a: Annotated[list[q.Current], Meta(max_length=q.MAX_JOINTS)]
     motor_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the winding")]
@@ -149,7 +149,7 @@ class MountedSample(Message, frozen=True, kw_only=True):
     """What every sensor says that sits at a place of its own on a link."""
 
     tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
+    timestamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
     link: Annotated[q.LinkIndex, about("that carries the sensor, from 0 at the tail")]
     position_l: Annotated[q.Vector, about("of the sensor")]
     orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
@@ -195,8 +195,8 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
         return _beyond_range(self.range_min_m, self.range_max_m, [count * self.scale_m for count in counts])
 
 
-class ColourImage(CameraImage, frozen=True, kw_only=True):
-    """`sensor/colour/<name>`: what a camera sees, in colour. Frame and pixels are as in DepthImage."""
+class ColorImage(CameraImage, frozen=True, kw_only=True):
+    """`sensor/color/<name>`: what a camera sees, in color. Frame and pixels are as in DepthImage."""
 
     rgb: Annotated[
         bytes, Meta(max_length=3 * q.MAX_PIXELS), about("red, green and blue of each pixel, row by row from the top")
@@ -226,12 +226,12 @@ class Ranges(MountedSample, frozen=True, kw_only=True):
         return _beyond_range(self.range_min_m, self.range_max_m, found_m)
 
 
-def _beyond_range(least_m: float, most_m: float, found_m: list[float]) -> str:
-    slack_m = RANGE_SHARE * most_m
-    if least_m < most_m and all(least_m - slack_m <= distance_m <= most_m + slack_m for distance_m in found_m):
+def _beyond_range(min_m: float, max_m: float, found_m: list[float]) -> str:
+    slack_m = RANGE_SHARE * max_m
+    if min_m < max_m and all(min_m - slack_m <= distance_m <= max_m + slack_m for distance_m in found_m):
         return ""
     found = f"{min(found_m)} to {max(found_m)} m" if found_m else "nothing"
-    return f"{found} was measured, and its range is {least_m} to {most_m} m"
+    return f"{found} was measured, and its range is {min_m} to {max_m} m"
 
 
 class OwnSample(MountedSample, frozen=True, kw_only=True):
@@ -239,16 +239,16 @@ class OwnSample(MountedSample, frozen=True, kw_only=True):
 
 
 class Preview(Message, frozen=True, kw_only=True):
-    """`preview/depth/<camera>` or `preview/colour/<camera>`: a small, compressed copy of an image."""
+    """`preview/depth/<camera>` or `preview/color/<camera>`: a small, compressed copy of an image."""
 
     tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
+    timestamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
     width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
     height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
-    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in colour, png of 16 bits for depth")]
+    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in color, png of 16 bits for depth")]
     scale_m: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
-        about("metres of one count of depth, which is 0 for nothing within range; null: it is in colour"),
+        about("metres of one count of depth, which is 0 for nothing within range; null: it is in color"),
     ] = None
     data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
 
@@ -257,7 +257,7 @@ class Preview(Message, frozen=True, kw_only=True):
 
 
 class JointCommand(Message, frozen=True, kw_only=True):
-    """`actuator/joints`: set-points for every joint from the lease holder. The checks are in protocol.md."""
+    """`actuator/joints`: setpoints for every joint from the lease holder. The checks are in protocol.md."""
 
     tick: Annotated[q.Tick, about("of the joint state that the command answers: its age is the command's age")]
     sequence: Annotated[q.Count, about("greater than that of any command accepted under this lease; gaps are allowed")]
@@ -272,18 +272,18 @@ class JointCommand(Message, frozen=True, kw_only=True):
     torque_limit_nm: Annotated[
         q.TorqueLimits | None, about("limit of each motor, if lower than the robot's own; null: the robot's own")
     ] = None
-    arming: Annotated[
+    arm_session: Annotated[
         q.Count,
-        about("`Clock.arming`; 0: before any arming. An armed robot rejects any number but its own, including 0"),
+        about("`Clock.arm_session`; 0: before any arming. An armed robot rejects any number but its own, including 0"),
     ] = 0
 
 
 class AppliedCommand(Message, frozen=True, kw_only=True):
-    """`hal/applied`: the set-points that the motors got in a tick, and where they differ from the command."""
+    """`hal/applied`: the setpoints that the motors got in a tick, and where they differ from the command."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
-    sequence: Annotated[q.Count | None, about("of the command; null: the host's own safe action")]
+    timestamp_ns: q.Stamp
+    sequence: Annotated[q.Count | None, about("of the command; null: the host's own stop mode")]
     mode: Modes
     target: q.Targets
     torque_limit_nm: q.TorqueLimits
@@ -307,11 +307,11 @@ class Clock(Message, frozen=True, kw_only=True):
     """
 
     tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("robot time: `tick` x `period_ns`")]
+    timestamp_ns: Annotated[q.Stamp, about("robot time: `tick` x `period_ns`")]
     period_ns: q.Nanoseconds
-    pace: Annotated[Pace, PACE]
+    clock_mode: Annotated[ClockMode, PACE]
     lifecycle: Annotated[LifecycleState, LIFECYCLE]
-    arming: Annotated[
+    arm_session: Annotated[
         q.Count, about("how often the robot has been armed since its host started; a new number: reset the controller")
     ]
     lease_epoch: Annotated[q.Count, about("of the live lease; 0: there is none")]
@@ -346,7 +346,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
     ] = 0.0
     derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
     stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
-    least_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
+    min_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
     modes: Annotated[
         list[Mode], Meta(min_length=1, max_length=4), about("in which it may be commanded; passive it always can be")
     ] = msgspec.field(default_factory=lambda: list(Mode))
@@ -390,8 +390,8 @@ class Description(Message, frozen=True, kw_only=True):
     period_ns: Annotated[q.Nanoseconds, about("from tick to tick")]
     lease_ns: Annotated[q.Nanoseconds, about("a lease term: how long one accepted command keeps the robot armed")]
     max_step_rad: Annotated[float, Meta(gt=0, le=10), about("a position target further from the measured is limited")]
-    safe_action: Annotated[SafeAction, about("in fault: passive, brake (damp), or decelerate and then hold")]
-    may_lose_joints: Annotated[
+    stop_mode: Annotated[StopMode, about("in fault: passive, brake (damp), or decelerate and then hold")]
+    max_isolated_joints: Annotated[
         int, Meta(ge=0, le=q.MAX_JOINTS), about("how many may fail while armed before the robot stops")
     ] = 0
     emulated: Annotated[
@@ -462,7 +462,7 @@ TICK_TIMES = {  # of `Status.tick_times`
     "cycle": "from tick to tick",
     "late": "begin of a tick after its deadline",
     "read": "the backend reads its sensors",
-    "write": "the backend takes set-points",
+    "write": "the backend takes setpoints",
 }
 
 
@@ -470,13 +470,13 @@ class Status(Message, frozen=True, kw_only=True):
     """`hal/status`, latched: the state of the robot, and its reason."""
 
     tick: q.Tick
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     robot: q.Name
     backend: q.Name
-    pace: Annotated[Pace, PACE]
+    clock_mode: Annotated[ClockMode, PACE]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     lifecycle: Annotated[LifecycleState, LIFECYCLE]
-    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arming")]
+    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arm_session")]
     lease_holder: Annotated[q.Name | None, about("null: the lease is free")]
     lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")]
     commands_accepted: Annotated[q.Count, about("while armed")]
@@ -651,7 +651,7 @@ class Obstacle(Message, frozen=True, kw_only=True):
 
     name: q.Name
     shape: Literal["cylinder", "box", "sphere"]
-    position_w: Annotated[q.Vector, about("centre of the shape")]
+    position_w: Annotated[q.Vector, about("center of the shape")]
     yaw_rad: q.Angle = 0.0
     radius_m: Annotated[q.Length, about("of a cylinder or sphere")] = 0.0
     half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
@@ -682,37 +682,41 @@ class World(Message, frozen=True, kw_only=True):
     """`guidance/world`: pose of the body, contacts, obstacles nearby. Each part has its own stamp."""
 
     tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
-    stamp_ns: Annotated[q.Stamp, about("of the joint state that it was computed from")]
+    timestamp_ns: Annotated[q.Stamp, about("of the joint state that it was computed from")]
     base_position_w: q.Vector
     base_orientation_wxyz: q.Quaternion
     base_confidence: q.Fraction
     contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS)]
     obstacles: Annotated[list[Obstacle], Meta(max_length=4096)]
-    pose_stamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
-    contacts_stamp_ns: Annotated[
+    pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
+    contacts_timestamp_ns: Annotated[
         q.Stamp | None, about("of the contacts in it; null: no sample yet, and no estimate")
     ] = None
-    centre_w: Annotated[q.Vector | None, about("centre of mass of the body; null: unknown")] = None
+    center_w: Annotated[q.Vector | None, about("center of mass of the body; null: unknown")] = None
     base_position_sd_m: Annotated[
         q.Distance | None,
         about(
             "standard deviation of `base_position_w`, horizontally; null: not estimated. If it is, the base's pose is "
-            "of `stamp_ns`, by dead reckoning since `pose_stamp_ns`"
+            "of `timestamp_ns`, by dead reckoning since `pose_timestamp_ns`"
         ),
     ] = None
     base_yaw_sd_rad: Annotated[
         q.Angle | None, about("standard deviation of the base's heading; null: not estimated")
     ] = None
-    depth_stamp_ns: Annotated[
+    depth_timestamp_ns: Annotated[
         q.Stamp | None, about("of the newest image or ranges in `obstacles`; null: none, or a map that is known")
     ] = None
     pose_from: Annotated[
         Literal["sensor", "dead_reckoning"] | None,
-        about("what the base's pose is of now; its age is that of `pose_stamp_ns` or of `stamp_ns`; null: not told"),
+        about(
+            "what the base's pose is of now; its age is that of `pose_timestamp_ns` or `timestamp_ns`; null: not told"
+        ),
     ] = None
     contacts_from: Annotated[
         Literal["sensor", "joint_torques"] | None,
-        about("what `contacts` are of: measured, or estimated; their age is that of `contacts_stamp_ns`; null: none"),
+        about(
+            "what `contacts` are of: measured, or estimated; their age is that of `contacts_timestamp_ns`; null: none"
+        ),
     ] = None
 
 
@@ -728,7 +732,7 @@ class Trajectory(Message, frozen=True, kw_only=True):
     """`navigation/trajectory`: path, speed, and the push-points expected along it."""
 
     tick: Annotated[q.Tick, about("of the clock that navigation acted on")]
-    stamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from; null: without one")]
+    timestamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from; null: without one")]
     path_id: Annotated[q.Count, about("changes when `path_w` does")]
     path_w: Annotated[list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")]
     speed_m_s: Annotated[q.Velocity, about("along the path; 0: stand still")]
@@ -761,7 +765,7 @@ class ControlState(Message, frozen=True, kw_only=True):
     """
 
     tick: Annotated[q.Tick, about("of the clock that control acted on")]
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     controller: q.Name
     state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: not armed, or told to stand still")]
     reason: q.Reason
@@ -769,8 +773,8 @@ class ControlState(Message, frozen=True, kw_only=True):
     propulsion_joint: Annotated[q.Name | None, about("the joint that pushes; null: none does")] = None
     propulsion_n: Annotated[q.Force | None, about("commanded force along the path; null: none")] = None
     push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")] = []
-    solved_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
-    felt_force_n: Annotated[
+    desired_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
+    measured_force_n: Annotated[
         list[q.Force | None],
         Meta(max_length=64),
         about(
@@ -805,7 +809,7 @@ class ControlSettings(Message, frozen=True, kw_only=True):
     """`control/settings_in_force`, latched: what the controller runs with, and what it could."""
 
     tick: Annotated[q.Tick, about("since when")]
-    stamp_ns: q.Stamp
+    timestamp_ns: q.Stamp
     controller: q.Name
     settings: Annotated[str, Meta(max_length=q.MAX_SETTINGS), about("all of them, as a JSON object")]
     schema: Annotated[str, Meta(max_length=q.MAX_SCHEMA), about("JSON Schema of `settings`, with bounds and units")]
@@ -820,11 +824,13 @@ class Intent(Message, frozen=True, kw_only=True):
     mission.
     """
 
-    stamp_ns: Annotated[q.Stamp, about("robot time of the request, from hal/clock")]
+    timestamp_ns: Annotated[q.Stamp, about("robot time of the request, from hal/clock")]
     who: q.Name
     speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
     go: Annotated[bool, about("false: stop")] = True
-    valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `stamp_ns`, at most 5 s")] = 1_000_000_000
+    valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `timestamp_ns`, at most 5 s")] = (
+        1_000_000_000
+    )
     heading_w_rad: Annotated[
         q.Angle | None, about("direction of travel in the world, from its x axis; null: the mission's own goal")
     ] = None
@@ -838,7 +844,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         Pose,
         Power,
         DepthImage,
-        ColourImage,
+        ColorImage,
         Ranges,
         OwnSample,
         Preview,

@@ -1,7 +1,7 @@
 """Numbers with a unit and bounds, as types. A decoder rejects NaN, infinity and absurd values.
 
 The bounds here are sanity bounds of the wire, far beyond any snake robot; a robot's own limits are in its robot
-file and are enforced by the gate.
+file and are enforced by the limiter.
 """
 
 from typing import Annotated
@@ -17,7 +17,7 @@ MAX_BEAMS = 4096
 MAX_SETTINGS, MAX_SCHEMA = 8192, 65536  # characters
 MAX_OWN_SENSORS, MAX_OWN_SCHEMA = 16, 8192  # of sensors with a message of their own; characters
 MAX_PREVIEW_BYTES = 128 * 1024
-MAX_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
+MAX_TARGET = 1e5  # of a setpoint or a torque limit, in the unit of its mode
 
 
 def bounded(low: float, high: float, unit: str) -> Meta:

@@ -54,7 +54,7 @@ def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tup
     found: list[tuple[Link, Session]] = []
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
+            whole = replace(link, max_bytes=MAX_IMAGE_BYTES)
             found.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
     if not found:
         raise NotConnectedError(

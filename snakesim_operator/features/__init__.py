@@ -2,7 +2,7 @@
 
 `commissioning`   calibration and system identification: `snakesim joints`, `snakesim identify`
 `console`         the robot in a web browser: `snakesim console`
-`evaluate`        many runs: `snakesim evaluate`, `sweep`, `optimise`
+`evaluate`        many runs: `snakesim evaluate`, `sweep`, `optimize`
 `figures`         figures for papers: `snakesim plot`
 `lab`             routers, certificates and units of a lab: `snakesim deploy`
 `robots`          URDF import and export: `snakesim robot`

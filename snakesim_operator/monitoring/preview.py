@@ -20,7 +20,7 @@ from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Publisher, Reader, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, Preview
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, Preview
 from snakesim_hal.wire.quantities import MAX_PREVIEW_BYTES
 from snakesim_operator.base import extras
 from snakesim_operator.base.targets import RobotSelection, only_robot
@@ -40,7 +40,7 @@ def preview(where: RobotSelection, hz: float, width: int) -> int:
     if not NARROWEST <= width <= WIDEST:
         raise ConfigError(f"--width {width}: give from {NARROWEST} to {WIDEST} pixels")
     link = only_robot(where, "preview")
-    with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
+    with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
         if robot is None:
             raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIBED_S:g} s")
@@ -58,9 +58,7 @@ def preview(where: RobotSelection, hz: float, width: int) -> int:
 def cameras_of(session: Session, robot: Description, width: int) -> list["Camera"]:
     """One for each stream of images."""
     kinds = {sensor.key: keys.message_at(sensor.key) for sensor in robot.sensors}
-    return [
-        Camera(session, robot, key, kind, width) for key, kind in kinds.items() if kind in (DepthImage, ColourImage)
-    ]
+    return [Camera(session, robot, key, kind, width) for key, kind in kinds.items() if kind in (DepthImage, ColorImage)]
 
 
 class Camera:
@@ -91,7 +89,7 @@ class Camera:
         return None
 
 
-def preview_of(image: DepthImage | ColourImage, width: int) -> Preview:
+def preview_of(image: DepthImage | ColorImage, width: int) -> Preview:
     """A copy of at most this width. Depth: every n-th pixel as it is, since a mean of near and far is neither."""
     import PIL.Image
 
@@ -107,7 +105,7 @@ def preview_of(image: DepthImage | ColourImage, width: int) -> Preview:
         small.save(file, "JPEG", quality=JPEG_QUALITY)
     return Preview(
         tick=image.tick,
-        stamp_ns=image.stamp_ns,
+        timestamp_ns=image.timestamp_ns,
         width=small.width,
         height=small.height,
         format="png" if isinstance(image, DepthImage) else "jpeg",

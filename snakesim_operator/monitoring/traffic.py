@@ -94,7 +94,7 @@ class Traffic:
             newest = dict(self._newest)
             times = {key: [t for t in stamps if now_ns - t <= WINDOW_NS] for key, stamps in self._times.items()}
         content = {key: _decoded(self._split(key)[1], arrival) for key, arrival in newest.items()}
-        robot_ns = {self._split(key)[0]: said.stamp_ns for key, said in content.items() if isinstance(said, Clock)}
+        robot_ns = {self._split(key)[0]: said.timestamp_ns for key, said in content.items() if isinstance(said, Clock)}
         holders = {self._split(key)[0]: said.lease_holder for key, said in content.items() if isinstance(said, Status)}
         found: list[KeyTraffic] = []
         for key, arrival in newest.items():
@@ -105,7 +105,7 @@ class Traffic:
                 writer = keys.service_of(relative)
             if relative == keys.JOINT_COMMAND and holders.get(robot):
                 writer = f"{holders[robot]} (lease)"
-            stamp_ns, clock_ns = getattr(said, "stamp_ns", None), robot_ns.get(robot)
+            timestamp_ns, clock_ns = getattr(said, "timestamp_ns", None), robot_ns.get(robot)
             found.append(
                 KeyTraffic(
                     robot=robot,
@@ -115,7 +115,7 @@ class Traffic:
                     **_rhythm(times[key]),
                     bytes=len(arrival.payload),
                     heard_ago_s=max(now_ns - arrival.monotonic_ns, 0) * 1e-9,
-                    age_ms=None if stamp_ns is None or clock_ns is None else max(clock_ns - stamp_ns, 0) * 1e-6,
+                    age_ms=None if timestamp_ns is None or clock_ns is None else max(clock_ns - timestamp_ns, 0) * 1e-6,
                 )
             )
         return sorted(found, key=lambda line: (line.robot, line.writer is None, line.key))
@@ -133,9 +133,9 @@ class Traffic:
             heard_ms = [(at - states[said.tick][1]) * 1e-6 for said, at in answers]
             acted: dict[int, int] = {}  # sequence -> robot time
             for said, _ in _read(timed.get((prefix, AppliedCommand), []), AppliedCommand):
-                acted.setdefault(said.sequence, said.stamp_ns)
+                acted.setdefault(said.sequence, said.timestamp_ns)
             motors_ms = [
-                (acted[said.sequence] - states[said.tick][0].stamp_ns) * 1e-6
+                (acted[said.sequence] - states[said.tick][0].timestamp_ns) * 1e-6
                 for said, _ in answers
                 if said.sequence in acted
             ]

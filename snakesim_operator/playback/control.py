@@ -88,7 +88,7 @@ class Comparison:
 
 def same(a: JointCommand, b: JointCommand) -> bool:
     """Whether two commands drive the motors alike, to the bit. How often a service was asked at tick 0 is no matter."""
-    return (a.arming, a.mode, a.target, a.torque_limit_nm) == (b.arming, b.mode, b.target, b.torque_limit_nm)
+    return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (b.arm_session, b.mode, b.target, b.torque_limit_nm)
 
 
 def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
@@ -137,7 +137,7 @@ class Replay:
         if contents.description is None:
             raise ConfigError(f"{path}: holds no hal/description")
         self.robot: Description = contents.description
-        self.pace = self.config.pace
+        self.clock_mode = self.config.clock_mode
         self.stopped = ""  # why it could not go on to the end of a recording that lacks something
         self.comparison = Comparison()
         self._path, self._network = path, LocalNetwork()
@@ -241,7 +241,7 @@ class Replay:
         self._asked.append((recorded, self._session.put_question(keys.SETTINGS, request)))
 
     def _as_applied(self, recorded: RecordedMessage) -> bytes:
-        """As in the recording where the command is the same; else the replayed command, without the gate's limits."""
+        """As in the recording where the command is the same; else the replayed command, without limits."""
         applied = self._applied.decode(recorded.payload, recorded.encoding)
         before = self._by_sequence.get(applied.sequence or -1)
         now = self.comparison.replayed.get(before.tick) if before is not None else None
@@ -292,6 +292,6 @@ def replay_control(
     if (largest := found.largest()) is not None:
         tick, joint, size = largest
         say(f"largest difference of a target: {size:.4g} at {replay.robot.joints[joint].name}, tick {tick}")
-    if replay.pace != "lockstep":
-        say(f"the run was {replay.pace}: there a service acts on what has arrived, which only lockstep repeats")
+    if replay.clock_mode != "lockstep":
+        say(f"the run was {replay.clock_mode}: there a service acts on what has arrived, which only lockstep repeats")
     return exit_code(path, replay.lacks, 0 if replay.changed or replay.lacks else 1)

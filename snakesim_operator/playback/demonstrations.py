@@ -74,7 +74,7 @@ class _Keyboard:
 
 def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
     """Until q, or the end of the input. Exit code 1 when the disk took no more. Raises SnakesimError."""
-    link = replace(only_robot(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
+    link = replace(only_robot(where, "record"), max_bytes=MAX_IMAGE_BYTES)
     folder.mkdir(parents=True, exist_ok=True)
     keyboard = _Keyboard(lines)
     on_stop_signal(keyboard.interrupt)

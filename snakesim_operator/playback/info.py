@@ -69,7 +69,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     scenario: str | None
     controller: str | None
     seed: int | None
-    pace: str | None
+    clock_mode: str | None
     duration_s: float
     ticks: int
     command_digest: str | None
@@ -121,7 +121,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         scenario=config.get("name"),
         controller=config.get("controller"),
         seed=config.get("seed"),
-        pace=None if status is None else status.pace,
+        clock_mode=None if status is None else status.clock_mode,
         duration_s=duration_s,
         ticks=0 if host is None else host.ticks,
         command_digest=None if host is None or not host.ticks else host.command_digest,
@@ -136,7 +136,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
 def _changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
     return [
         SettingsChange(
-            time_s=now.stamp_ns * 1e-9,
+            time_s=now.timestamp_ns * 1e-9,
             who=now.who,
             changed={PREFIX + one.name: (was.value, one.value) for was, one in differing(before, now)},
         )
@@ -168,7 +168,7 @@ def show(given: Path, say: Say, *, as_json: bool = False) -> int:
         say(msgspec.json.encode(info).decode())
         return exit_code(given, info.lacks)
     say(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
-    say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.pace or 'unknown pace'}")
+    say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}")
     say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     say(f"  ended     {info.lifecycle or 'unknown'}")
     digest = digest_text(info.command_digest, info.own_arithmetic) if info.command_digest else "none"

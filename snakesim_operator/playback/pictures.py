@@ -1,4 +1,4 @@
-"""What a recording's cameras saw, as pictures for a data set: colour as it is, depth as grey."""
+"""What a recording's cameras saw, as pictures for a data set: color as it is, depth as grey."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import ColourImage, DepthImage
+from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_operator.base.png import png
 from snakesim_operator.recording.reader import RecordingReader
 
-_KINDS = {"depth": Decoder(DepthImage), "colour": Decoder(ColourImage)}
+_KINDS = {"depth": Decoder(DepthImage), "color": Decoder(ColorImage)}
 Rgb = NDArray[np.uint8]
 
 
@@ -34,7 +34,7 @@ class Pictures:
         """One picture, (height, width, 3)."""
         share = rgb.reshape(-1, 3) / 255.0
         self.ticks.append(tick)
-        self.png.append(png(self.width, self.height, rgb.tobytes(), bits=8, colour=True))
+        self.png.append(png(self.width, self.height, rgb.tobytes(), bits=8, color=True))
         self.channel_means.append(share.mean(axis=0))
         self.channel_squares.append(np.square(share).mean(axis=0))
         self.least, self.most = np.minimum(self.least, share.min(axis=0)), np.maximum(self.most, share.max(axis=0))
@@ -49,7 +49,7 @@ def read_pictures(path: Path) -> dict[str, Pictures]:
             seen = _KINDS[kind].decode(recorded.payload, recorded.encoding)
         except WireError:
             continue
-        camera = name if kind == "colour" else f"{name}_depth"
+        camera = name if kind == "color" else f"{name}_depth"
         pictures = found.setdefault(camera, Pictures(seen.width, seen.height))
         data, pixel_bytes = (seen.depth, 2) if isinstance(seen, DepthImage) else (seen.rgb, 3)
         alike = (seen.width, seen.height) == (pictures.width, pictures.height)

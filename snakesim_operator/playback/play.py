@@ -31,7 +31,7 @@ def play(
     """
     robot = read_recording(path, (keys.DESCRIPTION,)).description
     namespace = namespace or (robot.robot if robot is not None else "recording")
-    link = Link(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, largest_bytes=MAX_IMAGE_BYTES)
+    link = Link(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES)
     reader = RecordingReader(path)
     messages = in_robot_order(reader)
     with open_session(link) as session:

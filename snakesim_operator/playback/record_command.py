@@ -30,7 +30,7 @@ def record_robot(
     foxglove_port: serve viewers there meanwhile; foxglove_origins: of web pages that may be such viewers;
     raw_only: the file is without topics for viewers.
     """
-    link = replace(only_robot(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
+    link = replace(only_robot(where, "record"), max_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
     path.parent.mkdir(parents=True, exist_ok=True)
     stopped: list[bool] = []

@@ -65,18 +65,18 @@ def film(
         say(sentence)
     camera: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
     with contextlib.closing(camera), exported(out) as partial, _written(partial, size, fps, record.lacks) as write:
-        middle = _centre(record, record.row_at(times[0]))
+        middle = _center(record, record.row_at(times[0]))
         for i, time_s in enumerate(times):
             row = record.row_at(time_s)
             pose = record.position_w[row], record.orientation_wxyz[row], record.angle_rad[row]
-            middle = middle + (_centre(record, row) - middle) * min(speed / fps / FOLLOW_S, 1.0)
+            middle = middle + (_center(record, row) - middle) * min(speed / fps / FOLLOW_S, 1.0)
             write(camera.picture(*pose, middle, _forces(record, time_s)))
             if (i + 1) % max(round(TOLD_SHARE * len(times)), 1) == 0:
                 say(f"{100 * (i + 1) // len(times)} %: {i + 1} of {len(times)} pictures")
     say(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
 
 
-def _centre(record: RunRecord, row: int) -> Floats:
+def _center(record: RunRecord, row: int) -> Floats:
     nodes = record.nodes_w(row)
     assert nodes is not None
     return nodes.mean(axis=0)
@@ -114,7 +114,7 @@ def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> 
 
 def _forces(record: RunRecord, time_s: float) -> list[Floats]:
     """Arrows of the contact forces then."""
-    recent = [world for world in record.worlds if 0 <= time_s - world.stamp_ns * 1e-9 < WORLD_LIMIT_S]
+    recent = [world for world in record.worlds if 0 <= time_s - world.timestamp_ns * 1e-9 < WORLD_LIMIT_S]
     if not recent:
         return []
     found: list[Floats] = []

@@ -30,7 +30,7 @@ from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import (
-    ColourImage,
+    ColorImage,
     Configuration,
     Contacts,
     DepthImage,
@@ -146,7 +146,7 @@ class FoxgloveChannels:
             return self._contact_forces(payload)
         if key == keys.CLOCK:
             return self._at_clock(time_ns) if self._is_due("moving", time_ns, MOVING_NS) else []
-        if key.startswith(("sensor/depth/", "sensor/colour/")):
+        if key.startswith(("sensor/depth/", "sensor/color/")):
             return list(self._image(key, payload, time_ns)) if self._is_due(key, time_ns, IMAGES_NS) else []
         if key in self._own:
             return list(self._own_sample(key, payload, time_ns))
@@ -241,11 +241,11 @@ class FoxgloveChannels:
 
     def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
         robot = self._robot
-        image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColourImage, payload)
+        image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColorImage, payload)
         if robot is None or image is None or mismatch(image, robot) is not None:
             return
         _, kind, camera = key.split("/", 2)
-        kind, camera = {"colour": "color"}.get(kind, kind), _ros_name(camera)
+        kind, camera = {"color": "color"}.get(kind, kind), _ros_name(camera)
         frame_id = f"{camera}_{kind}_optical_frame"
         turned = shapes.optical(image.orientation_l_wxyz)
         mount = shapes.frame(time_ns, robot.links[image.link].name, frame_id, image.position_l, turned)

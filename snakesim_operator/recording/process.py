@@ -145,7 +145,7 @@ def _turn(tap: Tap, recorder: Recorder) -> int:
         recorder.take(arrival)
     clock = recorder.recording.time.clock
     if clock is not None and not tap.dropped:
-        tap.lossless = clock.pace == "lockstep"
+        tap.lossless = clock.clock_mode == "lockstep"
     recorder.recording.flush_when_due()
     return len(arrived)
 

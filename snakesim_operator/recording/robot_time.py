@@ -13,13 +13,13 @@ class _Stamped(msgspec.Struct):
     """What the messages have in common; the rest is skipped."""
 
     tick: int | None = None
-    stamp_ns: int | None = None
+    timestamp_ns: int | None = None
 
 
 class _Clock(msgspec.Struct):
     tick: int
     period_ns: int
-    pace: str
+    clock_mode: str
 
 
 class RobotTime:
@@ -45,7 +45,7 @@ class RobotTime:
         except UNDECODABLE:
             return self._now_ns
         if self.clock is None:
-            return min(max(dated.stamp_ns or 0, 0), LATEST_NS)
+            return min(max(dated.timestamp_ns or 0, 0), LATEST_NS)
         if dated.tick is not None:
             at_ns = dated.tick * self.clock.period_ns
             if at_ns >= 0 and abs(at_ns - self._now_ns) <= MAX_AWAY_NS:

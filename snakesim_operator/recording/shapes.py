@@ -24,7 +24,7 @@ from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, Obstacle, WorldContact
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, Obstacle, WorldContact
 
 WORLD_FRAME = "world"
 FORCE_M_PER_N = 0.01
@@ -94,22 +94,22 @@ def body(robot: Description, time_ns: int) -> list[SceneEntity]:
     ]
 
 
-def obstacles(found: Iterable[Obstacle], name: str, colour: Color, time_ns: int) -> SceneEntity:
+def obstacles(found: Iterable[Obstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
     """Obstacles in the world."""
     entity = SceneEntity(timestamp=stamp(time_ns), frame_id=WORLD_FRAME, id=name)
     for one in found:
         x, y, z = one.position_w
         if one.shape == "sphere":
-            entity.spheres.append(_ball(x, y, z, 2 * one.radius_m, colour))
+            entity.spheres.append(_ball(x, y, z, 2 * one.radius_m, color))
             continue
         half_yaw = 0.5 * one.yaw_rad
         turned = Quaternion(w=math.cos(half_yaw), z=math.sin(half_yaw))
         pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=turned)
         if one.shape == "box":
             size = Vector3(**{axis: 2 * half for axis, half in zip("xyz", one.half_size_m, strict=True)})
-            entity.cubes.append(CubePrimitive(pose=pose, size=size, color=colour))
+            entity.cubes.append(CubePrimitive(pose=pose, size=size, color=color))
         else:
-            entity.cylinders.append(_cylinder(pose, one.radius_m, one.height_m, colour))
+            entity.cylinders.append(_cylinder(pose, one.radius_m, one.height_m, color))
     return entity
 
 
@@ -147,9 +147,9 @@ def path(points_w: Iterable[Sequence[float]], time_ns: int) -> SceneEntity:
     return SceneEntity(timestamp=stamp(time_ns), frame_id=WORLD_FRAME, id="path", lines=[line])
 
 
-def raw_image(image: DepthImage | ColourImage, frame_id: str, time_ns: int) -> RawImage:
-    """Depth in millimetres (16UC1), or colour (rgb8)."""
-    if isinstance(image, ColourImage):
+def raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> RawImage:
+    """Depth in millimetres (16UC1), or color (rgb8)."""
+    if isinstance(image, ColorImage):
         data, encoding, pixel_bytes = image.rgb, "rgb8", 3
     else:
         counts = np.frombuffer(image.depth, dtype="<u2")
@@ -166,7 +166,7 @@ def raw_image(image: DepthImage | ColourImage, frame_id: str, time_ns: int) -> R
     )
 
 
-def calibration(image: DepthImage | ColourImage, frame_id: str, time_ns: int) -> CameraCalibration:
+def calibration(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> CameraCalibration:
     """The pinhole of an image."""
     fx, fy, cx, cy = image.fx_px, image.fy_px, image.cx_px, image.cy_px
     return CameraCalibration(
@@ -180,14 +180,14 @@ def calibration(image: DepthImage | ColourImage, frame_id: str, time_ns: int) ->
     )
 
 
-def _cylinder(pose: Pose, radius_m: float, length_m: float, colour: Color) -> CylinderPrimitive:
+def _cylinder(pose: Pose, radius_m: float, length_m: float, color: Color) -> CylinderPrimitive:
     size = Vector3(x=2 * radius_m, y=2 * radius_m, z=length_m)
-    return CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
+    return CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=color)
 
 
-def _ball(x: float, y: float, z: float, diameter_m: float, colour: Color) -> SpherePrimitive:
+def _ball(x: float, y: float, z: float, diameter_m: float, color: Color) -> SpherePrimitive:
     size = Vector3(x=diameter_m, y=diameter_m, z=diameter_m)
-    return SpherePrimitive(pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT), size=size, color=colour)
+    return SpherePrimitive(pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT), size=size, color=color)
 
 
 def _towards(vector: Sequence[float], length: float) -> Quaternion:

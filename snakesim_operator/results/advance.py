@@ -26,7 +26,7 @@ class Advance:
 
     goal: HeadingGoal | WaypointGoal | None
     time_s: Floats  # (m,) since the first row
-    centre_w: Floats  # (m, 2) centre of mass
+    center_w: Floats  # (m, 2) center of mass
     head_w: Floats  # (m, 2)
 
     @staticmethod
@@ -47,7 +47,7 @@ class Advance:
     @staticmethod
     def along(goal: HeadingGoal | WaypointGoal | None, robot: Description, time_s: Floats, nodes: Floats) -> "Advance":
         """nodes: (m, joints + 2, 3), as of `nodes_w`."""
-        return Advance(goal, time_s, body_centre_w(robot, nodes), nodes[:, -1, :2])
+        return Advance(goal, time_s, body_center_w(robot, nodes), nodes[:, -1, :2])
 
     @property
     def goal_m(self) -> float | None:
@@ -74,8 +74,8 @@ class Advance:
 
     @cached_property
     def along_heading_m(self) -> Floats:
-        """(m,) the largest advance of the body so far along its first heading, from its centre to its head."""
-        forward = self.head_w[0] - self.centre_w[0]
+        """(m,) the largest advance of the body so far along its first heading, from its center to its head."""
+        forward = self.head_w[0] - self.center_w[0]
         return self._projected(float(np.arctan2(forward[1], forward[0])))
 
     @cached_property
@@ -106,14 +106,14 @@ class Advance:
         within = max(round(WINDOW_S / SAMPLE_S), 1)
         if len(self.time_s) <= within:
             return 0.0
-        moved = np.hypot(*(self.centre_w[within:] - self.centre_w[:-within]).T)
+        moved = np.hypot(*(self.center_w[within:] - self.center_w[:-within]).T)
         lasts = np.diff(self.time_s)[within - 1 :]
         stood = (moved < MOVING_M) & (self.time_s[within:] <= self.until_s)
         return float(lasts[stood].sum())
 
     def _projected(self, heading_rad: float) -> Floats:
         forward = np.array([np.cos(heading_rad), np.sin(heading_rad)])
-        return np.maximum.accumulate((self.centre_w - self.centre_w[0]) @ forward)
+        return np.maximum.accumulate((self.center_w - self.center_w[0]) @ forward)
 
     def _past_points(self, goal: WaypointGoal) -> Floats:
         points = np.array(goal.points_m)
@@ -165,7 +165,7 @@ class GoalWatch:
         return False
 
 
-def body_centre_w(robot: Description, nodes: Floats) -> Floats:
+def body_center_w(robot: Description, nodes: Floats) -> Floats:
     """Centre of mass on the ground, (..., 2), of nodes (..., joints + 2, 3)."""
     masses = np.array([link.mass_kg for link in robot.links])[:, None]
     return (0.5 * (nodes[..., :-1, :2] + nodes[..., 1:, :2]) * masses).sum(axis=-2) / masses.sum()

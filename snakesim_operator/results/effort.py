@@ -22,7 +22,7 @@ class Effort:
     impulse_n_s_per_m: float | None = None  # of all contacts, over the advance
     torque_headroom: float | None = None  # share of its limit that the joint with least had left, in 95 % of the ticks
     form_closure: float | None = None  # share of the time in which obstacles held it, had its joints been stiff
-    planning_share: float | None = None  # of navigation's turns: in which it searched for a path
+    planning_fraction: float | None = None  # of navigation's turns: in which it searched for a path
 
     @staticmethod
     def of(record: RunRecord, advance: Advance | None, *, has_power: bool) -> "Effort":
@@ -32,7 +32,7 @@ class Effort:
         links, ground = record.description.links, record.config.scene.ground
         per_m = energy_j_per_m(record, advance) if has_power else None
         transport = None if per_m is None else per_m / (GRAVITY_M_S2 * sum(link.mass_kg for link in links))
-        rubs = transport is not None and transport > 0 and ground.uneven is None
+        rubs = transport is not None and transport > 0 and ground.heightfield is None
         length_m = sum(link.length_m for link in links)
         return Effort(
             body_lengths_s=advance.reached_m / advance.until_s / length_m,
@@ -42,7 +42,7 @@ class Effort:
             impulse_n_s_per_m=_impulse_n_s_per_m(record, advance),
             torque_headroom=_headroom(record, advance),
             form_closure=_form_closure(record, advance),
-            planning_share=_planning_share(record, advance),
+            planning_fraction=_planning_fraction(record, advance),
         )
 
 
@@ -100,11 +100,11 @@ def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
     if not record.feels_contacts or advance.reached_m < MIN_DISTANCE_M:
         return None
     begin_ns = record.time_s[0] * 1e9
-    worlds = [one for one in record.worlds if 0 <= (one.stamp_ns - begin_ns) * 1e-9 <= advance.until_s]
+    worlds = [one for one in record.worlds if 0 <= (one.timestamp_ns - begin_ns) * 1e-9 <= advance.until_s]
     if len(worlds) < 2:
         return None
     sums_n = [sum(float(np.linalg.norm(contact.force_w)) for contact in one.contacts) for one in worlds]
-    return float(np.trapezoid(sums_n, [one.stamp_ns * 1e-9 for one in worlds])) / advance.reached_m
+    return float(np.trapezoid(sums_n, [one.timestamp_ns * 1e-9 for one in worlds])) / advance.reached_m
 
 
 def _form_closure(record: RunRecord, advance: Advance) -> float | None:
@@ -121,7 +121,7 @@ def _form_closure(record: RunRecord, advance: Advance) -> float | None:
     return sum(margin > 0.0 for margin in margins) / len(margins) if margins else None
 
 
-def _planning_share(record: RunRecord, advance: Advance) -> float | None:
+def _planning_fraction(record: RunRecord, advance: Advance) -> float | None:
     period_s, begin_s = record.description.period_ns * 1e-9, record.time_s[0]
     nodes = [n for tick, n in record.searched_nodes.items() if 0 <= tick * period_s - begin_s <= advance.until_s]
     return sum(n > 0 for n in nodes) / len(nodes) if nodes else None

@@ -44,7 +44,7 @@ class Estimates:
 
 
 def _off_m(record: RunRecord, world: World) -> float | None:
-    row = record.row_at(world.stamp_ns * 1e-9)
+    row = record.row_at(world.timestamp_ns * 1e-9)
     if not record.posed[row]:
         return None
     x, y, _ = record.position_w[row].tolist()
@@ -64,5 +64,5 @@ def _moved_m(record: RunRecord, first: World, last: World) -> float | None:
 
 
 def _nodes_w(record: RunRecord, world: World) -> Floats:
-    angles = record.angle_rad[record.row_at(world.stamp_ns * 1e-9)]
+    angles = record.angle_rad[record.row_at(world.timestamp_ns * 1e-9)]
     return nodes_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles)[:, :2]

@@ -28,7 +28,7 @@ SIGHT = np.linspace(0.0, 1.0, 24)[1:-1]  # of a line of sight, where it is looke
 class MapScore:
     """Of one map, or of several added up. Lists have an entry for each matched obstacle near the head."""
 
-    position_m: list[float] = field(default_factory=list[float])  # of centres, from where they are
+    position_m: list[float] = field(default_factory=list[float])  # of centers, from where they are
     surface_m: list[float] = field(default_factory=list[float])  # of the side that faces the head, mean
     size_m: list[float] = field(default_factory=list[float])  # reported radius, or longer half, less the true one
     in_sd: list[float] = field(default_factory=list[float])  # error of the position in reported standard deviations
@@ -78,7 +78,7 @@ def score(
 
 
 def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
-    """True obstacles near the head whose centre lies in view, and half of whose facing side no other one hides."""
+    """True obstacles near the head whose center lies in view, and half of whose facing side no other one hides."""
     near = _within(truth, head_w, NEAR_M)
     outlines, found = Outlines.of(near), list[Obstacle]()
     for i, true in enumerate(near):

@@ -1,6 +1,6 @@
-"""When the body moved, by its measured centre of mass, whatever the controller reported of it.
+"""When the body moved, by its measured center of mass, whatever the controller reported of it.
 
-It moves at a time if its centre was displaced by MOVING_M or more within the last WINDOW_S. A body that wriggles in
+It moves at a time if its center was displaced by MOVING_M or more within the last WINDOW_S. A body that wriggles in
 place does not. State, share of time and sentence of a run are all made of this.
 """
 
@@ -65,13 +65,13 @@ def motion_of(record: RunRecord) -> Motion | None:
     measured = _measured_centre(record)
     if measured is None:
         return None
-    time_s, centre_w = measured
+    time_s, center_w = measured
     whole_s = end_s(record)
-    stands = _stands(time_s, centre_w)
+    stands = _stands(time_s, center_w)
     standing: list[Interval] = []
     for first, last in _runs(stands):
-        start_s = _rest_begins_s(time_s, centre_w, first)
-        until_s = whole_s if last == len(stands) - 1 else _rest_ends_s(time_s, centre_w, last)
+        start_s = _rest_begins_s(time_s, center_w, first)
+        until_s = whole_s if last == len(stands) - 1 else _rest_ends_s(time_s, center_w, last)
         if standing and start_s - standing[-1].end_s < WINDOW_S:  # too short to have moved for a window in between
             start_s = standing.pop().start_s
         standing.append(Interval(start_s, max(until_s, start_s), STANDING))
@@ -79,18 +79,18 @@ def motion_of(record: RunRecord) -> Motion | None:
 
 
 def _measured_centre(record: RunRecord) -> tuple[Floats, Floats] | None:
-    """Times on the axis, (m,), and the centre of mass then, (m, 2): by the pose sensor, else as guidance measured it.
+    """Times on the axis, (m,), and the center of mass then, (m, 2): by the pose sensor, else as guidance measured it.
 
     A pose that guidance estimated by dead reckoning is no measurement.
     """
     advance = Advance.of(record)
     if advance is not None:
-        return advance.time_s, advance.centre_w
+        return advance.time_s, advance.center_w
     begin_s = zero_s(record)
     found = [
-        (world.stamp_ns * 1e-9 - begin_s, *world.centre_w[:2])
+        (world.timestamp_ns * 1e-9 - begin_s, *world.center_w[:2])
         for world in record.worlds
-        if world.centre_w is not None and world.pose_from == "sensor" and world.stamp_ns * 1e-9 >= begin_s
+        if world.center_w is not None and world.pose_from == "sensor" and world.timestamp_ns * 1e-9 >= begin_s
     ]
     if len(found) < 2:
         return None
@@ -103,13 +103,13 @@ def _window_begins(time_s: Floats) -> NDArray[np.intp]:
     return np.searchsorted(time_s, time_s - WINDOW_S - 1e-6)
 
 
-def _stands(time_s: Floats, centre_w: Floats) -> NDArray[np.bool_]:
-    """(m,) whether the centre was displaced by less than MOVING_M in the window that ends then.
+def _stands(time_s: Floats, center_w: Floats) -> NDArray[np.bool_]:
+    """(m,) whether the center was displaced by less than MOVING_M in the window that ends then.
 
     The first window is judged as a whole, so that a body that sets off at once has moved from the beginning.
     """
     begins = _window_begins(time_s)
-    displaced_m = np.hypot(*(centre_w - centre_w[begins]).T)
+    displaced_m = np.hypot(*(center_w - center_w[begins]).T)
     stands = displaced_m < MOVING_M
     whole = np.flatnonzero(time_s >= time_s[0] + WINDOW_S - 1e-6)
     if len(whole):
@@ -126,18 +126,18 @@ def _runs(stands: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(first), int(after) - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _rest_begins_s(time_s: Floats, centre_w: Floats, first: int) -> float:
+def _rest_begins_s(time_s: Floats, center_w: Floats, first: int) -> float:
     """When it came to rest: the window that ends with the first standing sample began up to WINDOW_S earlier."""
     if first == 0:
         return 0.0
     begin = int(_window_begins(time_s)[first])
-    away = np.flatnonzero(np.hypot(*(centre_w[begin : first + 1] - centre_w[first]).T) > RESTING_M)
+    away = np.flatnonzero(np.hypot(*(center_w[begin : first + 1] - center_w[first]).T) > RESTING_M)
     at = begin + int(away[-1]) + 1 if len(away) else begin
     return float(time_s[at])
 
 
-def _rest_ends_s(time_s: Floats, centre_w: Floats, last: int) -> float:
+def _rest_ends_s(time_s: Floats, center_w: Floats, last: int) -> float:
     """When it set off again: in the window that ends with the last standing sample it was still near its place."""
     begin = int(_window_begins(time_s)[last])
-    away = np.flatnonzero(np.hypot(*(centre_w[begin : last + 1] - centre_w[begin]).T) > RESTING_M)
+    away = np.flatnonzero(np.hypot(*(center_w[begin : last + 1] - center_w[begin]).T) > RESTING_M)
     return float(time_s[begin + int(away[0]) if len(away) else last])

@@ -1,6 +1,6 @@
 """What a recording holds of a run: a row for each tick, and the outputs of guidance, navigation and control.
 
-The rows have the columns of the black box, made of the messages: joints of `sensor/joints`, set-points of
+The rows have the columns of the black box, made of the messages: joints of `sensor/joints`, setpoints of
 `hal/applied`, pose and contacts as of their newest sample. They begin with the first arming that the recording saw.
 """
 
@@ -62,7 +62,7 @@ class Contents:
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
     unreached: list[str] = field(default_factory=list[str])  # what never came to the recorder
-    ticks: int = 0  # with set-points as applied
+    ticks: int = 0  # with setpoints as applied
     ticks_lost: int | None = 0  # of these, as the file itself tells; None: it does not tell
     last_tick_ns: int | None = None  # robot time of the last of them
     whole: bool = True  # the file has an end
@@ -100,7 +100,7 @@ class Contents:
                     kept.append(message)
             case _:
                 self.at[key][message.tick] = message
-                if isinstance(message, Clock) and message.arming:
+                if isinstance(message, Clock) and message.arm_session:
                     self.armed_wall_ns.append(wall_ns)
 
     def missing(self, ticks: int) -> list[str]:
@@ -125,7 +125,7 @@ class Contents:
             if tick in contacts:
                 peak_n, touched = touching(contacts[tick])
             state, points, clock = joints.get(tick), applied.get(tick), clocks.get(tick)
-            if state is None or points is None or clock is None or not clock.arming or not state.is_of(count):
+            if state is None or points is None or clock is None or not clock.arm_session or not state.is_of(count):
                 continue
             rows.append((tick, state, points, pose, peak_n, touched))
         states, points = [row[1] for row in rows], [row[2] for row in rows]
@@ -161,7 +161,7 @@ class Contents:
                 except WireError as error:
                     self.refused[f"{key}: {error}"[:200]] += 1
                     continue
-                came[sample.tick] = sample.stamp_ns, kind.numbers(sample)
+                came[sample.tick] = sample.timestamp_ns, kind.numbers(sample)
             ticks = np.array(sorted(came), dtype=np.int64)
             row = np.searchsorted(ticks * (robot.period_ns * 1e-9), time_s + 1e-9, side="right") - 1
             names = dict.fromkeys(at for _, numbers in came.values() for at in numbers) or kind.units
@@ -234,7 +234,7 @@ def read_recording(
     contents.replay_of = str(reader.about.get("replay_of", ""))[:500]
     if losses.misplaced:
         for messages in contents.streams.values():
-            messages.sort(key=lambda message: message.stamp_ns or 0)
+            messages.sort(key=lambda message: message.timestamp_ns or 0)
     return contents
 
 
@@ -242,7 +242,7 @@ def _is_news(before: Any, message: Any) -> bool:
     """Worlds are thinned; a path is kept once."""
     match message:
         case World():
-            return message.stamp_ns >= before.stamp_ns + round(1e9 / WORLDS_PER_S)
+            return message.timestamp_ns >= before.timestamp_ns + round(1e9 / WORLDS_PER_S)
         case Trajectory():
             return message.path_id != before.path_id
         case _:

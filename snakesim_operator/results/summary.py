@@ -9,11 +9,11 @@ from msgspec import Meta
 
 from snakesim_hal.base.arithmetic import foreign
 from snakesim_hal.model.locomotion import STANDING_STILL
-from snakesim_hal.wire.messages import ControlState, Fault, Mode, Pace, Timing
-from snakesim_operator.results.advance import Advance, body_centre_w, energy_j, energy_j_per_m, work_j
-from snakesim_operator.results.came_true import came_true
+from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, Mode, Timing
+from snakesim_operator.results.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.effort import Directions, Effort
 from snakesim_operator.results.estimates import Estimates
+from snakesim_operator.results.force_tracking import force_tracking
 from snakesim_operator.results.motion import Motion, motion_of
 from snakesim_operator.results.propulsion import count_hand_overs, propulsion_periods
 from snakesim_operator.results.record import RunRecord
@@ -44,7 +44,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     emulated: Annotated[bool | None, Meta(description="whether nothing real moved; null: the host did not say")] = None
     controller: str
     seed: int
-    pace: Pace
+    clock_mode: ClockMode
     rate_hz: Annotated[float, _number("Hz", "control rate")]
     duration_s: Annotated[float, _number("s", "robot time from the first arming to the end")]
     wall_s: Annotated[float, _number("s", "wall-clock time of the same")]
@@ -52,9 +52,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ticks: int
     overruns: Annotated[int, Meta(description="ticks that missed their deadline (realtime)")]
     answered_fraction: Annotated[float | None, _number("1", "ticks whose command came within the tick")]
-    command_digest: Annotated[str, Meta(description="SHA-256 of every set-point as applied")]
+    command_digest: Annotated[str, Meta(description="SHA-256 of every setpoint as applied")]
     path_distance_m: Annotated[float | None, _number("m", "advance of the body along the scene's route")]
-    net_displacement_m: Annotated[float | None, _number("m", "distance of the centre of mass from its start")]
+    net_displacement_m: Annotated[float | None, _number("m", "distance of the center of mass from its start")]
     mean_speed_m_s: Annotated[
         float | None, _number("m/s", "path distance (or displacement) over the time in which it is known")
     ]
@@ -72,7 +72,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     locomoting_fraction: Annotated[
         float | None,
-        _number("1", "share of the time in which the centre of mass moved 2 cm or more within a second, as measured"),
+        _number("1", "share of the time in which the center of mass moved 2 cm or more within a second, as measured"),
     ]
     propulsion_joints: Annotated[
         list[str] | None, Meta(description="one at a time, in order of use; null: control reported nothing")
@@ -93,11 +93,11 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None,
         _number("N", "largest force of one contact, mean over 50 ms; where a sensor does not tell that, at an instant"),
     ]
-    solved_force_correlation: Annotated[
+    desired_force_correlation: Annotated[
         float | None,
         _number("1", "of measured with solved forces at push-points while it locomoted; null: nothing to compare"),
     ]
-    solved_force_error: Annotated[float | None, _number("1", "|measured - solved| over solved there, median")]
+    desired_force_error: Annotated[float | None, _number("1", "|measured - solved| over solved there, median")]
     empty_push_points: Annotated[float | None, _number("1", "share of those push-points that carried nothing")]
     energy_j: Annotated[float | None, _number("J", "sum over joints of |torque x velocity| over time")]
     torque_joints_j: Annotated[
@@ -120,7 +120,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None,
         _number(
             "s",
-            "time until then in which the centre of mass moved less than 2 cm within the last second, so that it "
+            "time until then in which the center of mass moved less than 2 cm within the last second, so that it "
             "counts from a second after the body came to rest",
         ),
     ] = None
@@ -155,7 +155,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None,
         _number("1", "share of the time until then in which obstacles within 2 cm would hold a stiff body"),
     ] = None
-    planning_share: Annotated[
+    planning_fraction: Annotated[
         float | None, _number("1", "share of navigation's turns until then in which it searched for a path")
     ] = None
     state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
@@ -167,7 +167,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         list[str], Meta(description="services that could not keep up in real time, and what shows it")
     ] = []
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
-    limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
+    limited_commands: Annotated[dict[str, int], Meta(description="joint setpoints changed by the limiter, by limit")]
     faults: list[Fault]
     faults_left_out: Annotated[int, Meta(description="of `faults`, between the first and the newest")] = 0
     isolated: Annotated[list[str], Meta(description="joints that were isolated at the end")] = []
@@ -207,7 +207,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     joints = record.description.joints
     limits = np.array([joint.torque_limit_nm for joint in joints])
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
-    advance, forces = Advance.of(record), came_true(record.control)
+    advance, forces = Advance.of(record), force_tracking(record.control)
     return RunSummary(
         scenario=config.name,
         robot=config.robot.name,
@@ -216,7 +216,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         emulated=record.description.emulated,
         controller=config.commander,
         seed=config.seed,
-        pace=config.pace,
+        clock_mode=config.clock_mode,
         rate_hz=config.rate_hz,
         duration_s=duration_s,
         wall_s=host.wall_s,
@@ -242,8 +242,8 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         if count
         else None,
         peak_contact_force_n=largest(record.contact_peak_n) if has_contacts else None,
-        solved_force_correlation=forces.correlation if forces else None,
-        solved_force_error=forces.median_error if forces else None,
+        desired_force_correlation=forces.correlation if forces else None,
+        desired_force_error=forces.median_error if forces else None,
         empty_push_points=forces.empty if forces else None,
         energy_j=energy_j(record) if has_power else None,
         torque_joints_j=work_j(record, Mode.TORQUE) if has_power else None,
@@ -309,7 +309,7 @@ def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
     first, last = record.nodes_w(row), record.nodes_w(last_row)
     if first is None or last is None:
         return None, None, 0.0
-    net = float(np.linalg.norm(body_centre_w(record.description, last) - body_centre_w(record.description, first)))
+    net = float(np.linalg.norm(body_center_w(record.description, last) - body_center_w(record.description, first)))
     start, end = arc_position_m(record, row), arc_position_m(record, last_row)
     ticks = int(record.ticks[last_row] - record.ticks[row]) + 1  # those in a gap count too: the body moved in it
     known_s = ticks * record.config.period_ns * 1e-9

@@ -20,19 +20,19 @@ def zero_s(record: RunRecord) -> float:
     """The robot's time at the first tick: where every time axis begins."""
     if len(record.time_s):
         return float(record.time_s[0])
-    return record.control[0].stamp_ns * 1e-9 if record.control else 0.0
+    return record.control[0].timestamp_ns * 1e-9 if record.control else 0.0
 
 
 def end_s(record: RunRecord) -> float:
     """The end of the last tick, on the time axis."""
     if len(record.time_s):
         return float(record.time_s[-1]) - zero_s(record) + record.config.period_ns * 1e-9
-    return record.control[-1].stamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
+    return record.control[-1].timestamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
 
 
 def reported_at_s(record: RunRecord, state: ControlState) -> float:
     """When a state was reported, on the time axis and within the run."""
-    return min(max(state.stamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
+    return min(max(state.timestamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
 
 
 def reported_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:

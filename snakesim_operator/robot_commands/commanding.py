@@ -74,9 +74,9 @@ def _add_param(commands: Any) -> None:
         command = verbs.add_parser(verb, help=about)
         command.add_argument("robot", metavar="ROBOT", help="its namespace, as printed by `snakesim status`")
         if verb == "get":
-            command.add_argument("name", metavar="NAME", help="such as control.lead_s")
+            command.add_argument("name", metavar="NAME", help="such as control.speed_kp_s")
         if verb == "set":
-            command.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.lead_s=0.3")
+            command.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.speed_kp_s=0.3")
         add_network(command)
         command.set_defaults(act=act)
 

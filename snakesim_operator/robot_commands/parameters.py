@@ -127,7 +127,7 @@ def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[Cont
 
     Args:
         session: A session on the robot's network.
-        changes: Values by name, such as `control.lead_s`.
+        changes: Values by name, such as `control.speed_kp_s`.
         who: Who asks.
 
     Raises:
@@ -207,7 +207,9 @@ def list_parameters(where: RobotSelection) -> int:
         settings = in_force(session)
     parameters = parameters_of(settings)
     by = (
-        "from its configuration" if settings.who is None else f"set by {settings.who} at {settings.stamp_ns * 1e-9:g} s"
+        "from its configuration"
+        if settings.who is None
+        else f"set by {settings.who} at {settings.timestamp_ns * 1e-9:g} s"
     )
     say(f"controller {settings.controller}, {len(parameters)} parameters, {by}")
     rows = [(PREFIX + one.name, one.shown, one.range, one.about) for one in parameters]

@@ -152,7 +152,8 @@ def _in_words(robot: _Robot) -> list[str]:
     lines = [
         f"{link.namespace}: {status.lifecycle} - {status.why}",
         f"  {describe_what_moves(robot.description)}",
-        f"  robot {status.robot}, backend {status.backend}, {status.pace} at {status.rate_hz:g} Hz, tick {status.tick}"
+        f"  robot {status.robot}, backend {status.backend}, "
+        f"{status.clock_mode} at {status.rate_hz:g} Hz, tick {status.tick}"
         f", on {link.endpoint}",
         f"  lease: {status.lease_holder or 'free'} (epoch {status.lease_epoch})",
         f"  alive: {', '.join(status.alive) or 'none'}",

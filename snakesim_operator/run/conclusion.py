@@ -143,9 +143,9 @@ def _print_host(host: HostRecord) -> None:
         say(f"  {'fault':<22}{fault.cause}")
 
 
-def _came_true(summary: RunSummary) -> str:
+def _force_tracking(summary: RunSummary) -> str:
     """How well measured forces follow the solved ones; empty when there was nothing to compare."""
-    error, empty, follows = summary.solved_force_error, summary.empty_push_points, summary.solved_force_correlation
+    error, empty, follows = summary.desired_force_error, summary.empty_push_points, summary.desired_force_correlation
     if error is None or empty is None:
         return ""
     correlation = "of unknown correlation" if follows is None else f"correlation {follows:.2f}"
@@ -172,7 +172,7 @@ def print_summary(summary: RunSummary) -> None:
         ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
         ("energy per metre", _energy_per_metre(summary)),
         ("contact over 50 ms", number(summary.peak_contact_force_n, "N", 1)),
-        *([("solved forces", words)] if (words := _came_true(summary)) else []),
+        *([("solved forces", words)] if (words := _force_tracking(summary)) else []),
         ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
         *_last_report(summary),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),

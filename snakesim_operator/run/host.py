@@ -20,6 +20,6 @@ def run_host(arguments: argparse.Namespace) -> int:
         if arguments.out is not None:
             arguments.out = held.enter_context(claimed(arguments.out, say))
             write(config, arguments.out / CONFIG)
-        say(f"{given.link.namespace}: {config.robot.name} on backend {config.backend}, {config.pace}")
+        say(f"{given.link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
         say(f"network: {given.link.endpoint}, namespace {given.link.namespace}; Ctrl-C ends it")
         return host(given)

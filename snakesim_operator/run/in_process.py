@@ -110,8 +110,8 @@ def simulate(
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
     the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before
-    the first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest may
-    be its computer's own (`summary.own_arithmetic`).
+    the first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest
+    may be its computer's own (`summary.own_arithmetic`).
     """
     if not isinstance(config, RunConfig):
         raise ConfigError(
@@ -223,7 +223,7 @@ def _go(
                 if turn % TAKEN_EVERY == 0:
                     if recording is not None:
                         recording.flush_when_due()
-                    if progress is not None and host.authority.arming:  # before that there is nothing to wait for
+                    if progress is not None and host.authority.arm_session:  # before that there is nothing to wait for
                         progress.show(host.status(), control.newest(lambda _state: True), armed=True)
                     if (until_goal or config.mission.until_goal) and watch.over(host.black_box):
                         host.complete()

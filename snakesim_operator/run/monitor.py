@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import ControlState, Description, LifecycleReque
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.ended import AT_GOAL
 from snakesim_operator.run.ending import Ending
-from snakesim_operator.run.patience import Patience
+from snakesim_operator.run.patience import StartupTimeout
 from snakesim_operator.run.process_faults import ProcessFaults
 from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import Progress
@@ -61,7 +61,7 @@ class RunMonitor:
         session.on_alive(self._recorder_came, keys.alive(RECORDER))
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
-        self._patience = Patience(config.services, config.start_limit_s)
+        self._patience = StartupTimeout(config.services, config.start_limit_s)
         self._waits = ProcessorWaits(config.lease_ns * 1e-9)
         self._status: Status | None = None
         self._silent_polls = 0  # since the last status: a run that was stopped itself does not count

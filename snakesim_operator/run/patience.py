@@ -7,7 +7,7 @@ from snakesim_hal.wire.messages import Status
 MOST_AT_ONCE_S = 1.0  # while a status does not come, the host or this process is slow: nobody waits for the robot
 
 
-class Patience:
+class StartupTimeout:
     """Counts robot time; where that stands still, as in lockstep before the arming, time in which the host is heard.
 
     It starts again with whatever comes, so that a slow computer has the whole time for each part.
@@ -32,7 +32,7 @@ class Patience:
         ):
             self._waited_s = 0.0
         elif status.tick > last.tick:
-            self._waited_s += (status.stamp_ns - last.stamp_ns) * 1e-9
+            self._waited_s += (status.timestamp_ns - last.timestamp_ns) * 1e-9
         else:
             self._waited_s += min(now_s - heard_s, MOST_AT_ONCE_S)
         return self._waited_s > self.limit_s

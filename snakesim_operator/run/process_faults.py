@@ -37,10 +37,10 @@ class RobotTime:
         """None before the first arming."""
         for clock in self._clocks.drain():
             if self._last_ns is None:
-                self._last_ns = clock.stamp_ns if clock.arming else None
+                self._last_ns = clock.timestamp_ns if clock.arm_session else None
                 continue
-            self._elapsed_ns += max(clock.stamp_ns - self._last_ns, 0)
-            self._last_ns = clock.stamp_ns
+            self._elapsed_ns += max(clock.timestamp_ns - self._last_ns, 0)
+            self._last_ns = clock.timestamp_ns
         return None if self._last_ns is None else self._elapsed_ns * 1e-9
 
 
@@ -48,7 +48,7 @@ class ProcessFaults:
     """Carries out faults planned in the scenario, and those requested on `fault/run`."""
 
     def __init__(self, config: RunConfig, session: Session, supervisor: Supervisor, say: Callable[[str], None]) -> None:
-        self._allowed = config.faults_allowed
+        self._allowed = config.allow_fault_injection
         self._supervisor = supervisor
         self._say = say
         self._plan = Plan(injection for injection in planned(config) if injection.part == RUN)
@@ -119,8 +119,9 @@ class ProcessFaults:
         if robot.emulated or self._allowed:
             return None
         return (
-            f"{robot.robot} on backend {robot.backend} is real: fault injection needs `faults_allowed = true` in the "
-            f"scenario, or --set faults_allowed=true"
+            f"{robot.robot} on backend {robot.backend} is real: fault injection needs "
+            "`allow_fault_injection = true` in the "
+            f"scenario, or --set allow_fault_injection=true"
         )
 
     def _check(self, injection: Injection) -> None:

@@ -176,7 +176,7 @@ def _conduct(
             recorder += ["--raw-only"] if request.raw_only else []
             supervisor.start(RECORDER, recorder, vital=False)
         with _session_of_run(link, supervisor, ending) as session:
-            say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
+            say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.clock_mode}")
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
                 say("no control service of its own: a client that takes the lease commands and arms the robot")

@@ -96,7 +96,7 @@ def packages() -> Iterator[Finding]:
 
 
 def opengl() -> Iterator[Finding]:
-    """Whether MuJoCo can draw without a screen; only colour images, videos and the model `rendered` need that."""
+    """Whether MuJoCo can draw without a screen; only color images, videos and the model `rendered` need that."""
     if not extras.has("sim"):
         return
     detail: list[str] = []
@@ -108,7 +108,7 @@ def opengl() -> Iterator[Finding]:
             return
         detail.append(f"{kind.upper()}: {why}")
     fix = ["sudo apt install libegl1 libgl1-mesa-dri"]
-    yield Finding(what="OpenGL", state="warn", detail=f"no colour images and videos: {'; '.join(detail)}", fix=fix)
+    yield Finding(what="OpenGL", state="warn", detail=f"no color images and videos: {'; '.join(detail)}", fix=fix)
 
 
 def _probe(kind: str) -> str | None:

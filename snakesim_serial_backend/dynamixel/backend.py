@@ -4,28 +4,28 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from snakesim_drivers.emulation.twin_body import TwinBody
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.buses import Bus
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_drivers.kit.drive_settings import answer_limit_s, body_of, port_of, who
-from snakesim_drivers.kit.drive_type import FamilyBackend, buses_of
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, buses_of
 from snakesim_drivers.kit.readings import Readings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_serial_backend.dynamixel.emulator import CURRENT_A, MOST_CURRENT, EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
 from snakesim_serial_backend.dynamixel.servos import Servos
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
-from snakesim_serial_backend.dynamixel.twin import CURRENT_A, MOST_CURRENT, DynamixelTwin
 from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
 
 GAP_S, GAP_SHARE = 0.002, 0.2  # of silence, or of a period, after which no answer is expected
 
 
-class DynamixelBackend(FamilyBackend):
+class DynamixelBackend(DriverTypeBackend):
     """A `snakesim_hal.backend.Backend` on Dynamixel X servos, real or emulated."""
 
     Settings, name = DynamixelSettings, NAME
@@ -45,7 +45,7 @@ class DynamixelBackend(FamilyBackend):
     def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
         """Servos, and the load of their ports."""
         check_joints(config, settings, joints)
-        check_load(config.rate_hz / settings.every_ticks, settings, joints)
+        check_load(config.rate_hz / settings.decimation, settings, joints)
 
     @classmethod
     def buses(
@@ -54,24 +54,24 @@ class DynamixelBackend(FamilyBackend):
         settings: DynamixelSettings,
         joints: Mapping[int, Joint],
         clock: Clock,
-        body: TwinBody | None,
+        body: EmulatedBody | None,
     ) -> list[Bus]:
         """One for each port, or one of emulated servos."""
         gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
         log = _log(settings.log)
 
         def open_servos(port: str, mine: Sequence[int], readings: Readings) -> Servos:
-            twin = None
+            emulator = None
             if body is not None:
                 pty = Pty()
-                twin = twin_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
-                wire = SerialWire(pty.path, settings.baud, log, pty, twin)
+                emulator = emulator_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
+                wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
             else:
                 wire = SerialWire(port, settings.baud, log)
             on_it = Port(wire, gap_s)
             servos = [servo_of(joints[j], on_it) for j in mine]
-            answer_s = answer_limit_s(config, settings.every_ticks)
-            return Servos(servos, on_it, readings, settings, clock.ns, answer_s, twin)
+            answer_s = answer_limit_s(config, settings.decimation)
+            return Servos(servos, on_it, readings, settings, clock.ns, answer_s, emulator)
 
         return buses_of(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
 
@@ -80,7 +80,7 @@ def servo_of(joint: Joint, port: Port) -> Servo:
     """A servo with the numbers of its joint, at its horn."""
     drive, motor, limits = joint.drive, joint.motor, joint.limits
     turns = drive.sign * drive.gear
-    ends = drive.zero_rad + turns * limits.least_rad, drive.zero_rad + turns * limits.most_rad
+    ends = drive.zero_rad + turns * limits.lower_rad, drive.zero_rad + turns * limits.upper_rad
     return Servo(
         id=joint.id,
         name=joint.name,
@@ -88,24 +88,24 @@ def servo_of(joint: Joint, port: Port) -> Servo:
         constant=constant_of(joint),
         stiffness=motor.stiffness_nm_per_rad / drive.gear**2,
         damping=motor.damping_nm_s_per_rad / drive.gear**2,
-        least_rad=min(ends),
-        most_rad=max(ends),
+        lower_rad=min(ends),
+        upper_rad=max(ends),
         torque_nm=limits.torque_nm / drive.gear,
         speed_rad_s=limits.speed_rad_s * drive.gear,
     )
 
 
 def constant_of(joint: Joint) -> float:
-    """Its torque constant, N·m/A; without one, of a twin whose current limit is twice what its joint may ask for."""
-    most_a = MOST_CURRENT * CURRENT_A / 2
-    return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / most_a
+    """Its torque constant, N·m/A; without one, that of an emulator with twice the current it needs."""
+    max_a = MOST_CURRENT * CURRENT_A / 2
+    return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / max_a
 
 
 def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError for joints that no servo can be."""
     real = not all(map(is_emulated, settings.ports))
     for joint in joints:
-        travel_rad = (joint.limits.most_rad - joint.limits.least_rad) * joint.drive.gear
+        travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(f"{who(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}")
         if travel_rad + 2 * SLACK_RAD >= TURN:
@@ -135,20 +135,20 @@ def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joi
         )
 
 
-def twin_on(
+def emulator_on(
     config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: Clock, pose: str | None
-) -> DynamixelTwin:
+) -> EmulatedDynamixel:
     """Emulated servos of a whole robot."""
     joints = config.robot.joint_table
     each = [ptys[bus] for bus in port_of(joints, settings.ports)]
-    return twin_of(joints, settings, body_of(config, settings, NAME, pose), each, clock)
+    return emulator_of(joints, settings, body_of(config, settings, NAME, pose), each, clock)
 
 
-def twin_of(
-    joints: Sequence[Joint], settings: DynamixelSettings, body: TwinBody, ptys: Sequence[Pty], clock: Clock
-) -> DynamixelTwin:
+def emulator_of(
+    joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: Clock
+) -> EmulatedDynamixel:
     """Emulated servos. ptys: of every joint."""
-    return DynamixelTwin(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.ns)
+    return EmulatedDynamixel(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.ns)
 
 
 def _log(path: str) -> TextIO | None:

@@ -113,7 +113,7 @@ def _unfit(servo: Servo, said: Packet | None, kept: Packet | None, settings: Dyn
         )
     if (secondary_id := kept.data[at.SECONDARY_ID]) <= LAST_ID:
         return (
-            f"has the secondary id {secondary_id} (register {at.SECONDARY_ID}), and would take the set-points of that "
+            f"has the secondary id {secondary_id} (register {at.SECONDARY_ID}), and would take the setpoints of that "
             f"id, too: set it to 255, which is off"
         )
     if kept.data[at.STARTUP] & TORQUE_AT_START:
@@ -157,10 +157,11 @@ def _set_up(servo: Servo) -> None:
 def _present(servo: Servo) -> Packet:
     said = _answer(servo, at.PRESENT, at.present_form.size)
     angle_rad = at.present_form.unpack(said.data)[2] * at.RAD
-    if at.whole_turns(angle_rad, servo.least_rad, servo.most_rad, SLACK_RAD) is None:
+    if at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD) is None:
         raise BackendError(
             f"{servo.who}: woke up at {angle_rad:.2f} rad, which no number of whole turns, or more than one, brings "
-            f"into its travel of {servo.least_rad:.2f} to {servo.most_rad:.2f} rad; nothing was enabled. Turn it there "
+            f"into its travel of {servo.lower_rad:.2f} to {servo.upper_rad:.2f} rad; "
+            "nothing was enabled. Turn it there "
             f"by hand, or correct `zero_rad`"
         )
     return said

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_drivers.emulation.twin_body import serve_until_stopped
+from snakesim_drivers.emulation.emulated_body import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
 from snakesim_hal.base.terminal import exit_code, say
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_hal.programs.preflight import backend_settings
-from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, twin_on
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, emulator_on
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
@@ -55,15 +55,15 @@ def serve(arguments: argparse.Namespace) -> int:
     """Until a stop signal."""
     overrides = [Override("backend", NAME, "snakesim dynamixels"), *map(parse_set, arguments.set)]
     loaded = load(arguments.scenario, overrides)
-    config = msgspec.structs.replace(loaded.config, pace="realtime")
+    config = msgspec.structs.replace(loaded.config, clock_mode="realtime")
     links: list[Path] = arguments.link or [Path("servos")]
     settings: DynamixelSettings = backend_settings(config, DynamixelBackend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
     with named(links) as ptys:
-        twin = twin_on(config, settings, ptys, Clock(config), arguments.pose)
+        emulator = emulator_on(config, settings, ptys, Clock(config), arguments.pose)
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
-        ready = f"servos ready: {len(twin.servos)} on {ends}"
-        serve_until_stopped(ready, twin, partial(select.select, ptys, [], []))
+        ready = f"servos ready: {len(emulator.servos)} on {ends}"
+        serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []))
     return 0
 
 

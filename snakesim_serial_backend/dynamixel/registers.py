@@ -115,9 +115,9 @@ def law(d: int, p: int, unit_nm: float) -> tuple[float, float]:
     return p / P_SCALE * unit_nm / RAD, d / D_SCALE * unit_nm / RAD * LAW_S
 
 
-def whole_turns(angle_rad: float, least_rad: float, most_rad: float, slack_rad: float) -> int | None:
+def whole_turns(angle_rad: float, lower_rad: float, upper_rad: float, slack_rad: float) -> int | None:
     """Turns to add to what a servo says, so that it is within its travel; None: there are none, or several such."""
     turn = 2 * math.pi
-    first = math.ceil((least_rad - slack_rad - angle_rad) / turn)
-    last = math.floor((most_rad + slack_rad - angle_rad) / turn)
+    first = math.ceil((lower_rad - slack_rad - angle_rad) / turn)
+    last = math.floor((upper_rad + slack_rad - angle_rad) / turn)
     return first if first == last else None

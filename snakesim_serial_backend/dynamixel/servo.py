@@ -21,8 +21,8 @@ class Servo:
     constant: float  # N·m/A
     stiffness: float  # N·m/rad
     damping: float  # N·m·s/rad
-    least_rad: float
-    most_rad: float
+    lower_rad: float
+    upper_rad: float
     torque_nm: float  # that its joint may ask of it
     speed_rad_s: float
     unit_nm: float = 1.0  # of a unit of current
@@ -48,7 +48,7 @@ class Servo:
     def out_of_reach_rad(self, towards: float) -> float:
         """A goal beyond its travel by so much that its law asks for full torque at any speed within."""
         beyond_rad = OUT_OF_REACH * (self.torque_nm + self.damping * self.speed_rad_s) / self.stiffness
-        return self.most_rad + beyond_rad if towards > 0 else self.least_rad - beyond_rad
+        return self.upper_rad + beyond_rad if towards > 0 else self.lower_rad - beyond_rad
 
     def gains(self) -> bytes:
         """Of its position law, as registers."""

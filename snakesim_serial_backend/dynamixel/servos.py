@@ -1,4 +1,4 @@
-"""Dynamixel X servos as a family of drives: a `snakesim_drivers.kit.drive_backend.Drives`.
+"""Dynamixel X servos as a driver type of drives: a `snakesim_drivers.kit.drive_backend.Drives`.
 
 Every tick all servos say current, velocity and position in one fast sync read, one of them says its health,
 and all get goal current and goal position in one sync write. They stay in current-based position mode: a torque is that
@@ -11,7 +11,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 
-from snakesim_drivers.emulation.twin_body import FAULTS
+from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import Readings
 from snakesim_hal.base.arrays import Floats
@@ -19,11 +19,11 @@ from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.bring_up import ANSWERS_TWICE, GARBLED, bring_up
+from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
 from snakesim_serial_backend.wire import is_emulated
 
 BOOTS_WITHIN_NS = 2_000_000_000
@@ -43,10 +43,10 @@ class Servos:
         settings: DynamixelSettings,
         clock_ns: Callable[[], int],
         answer_s: float,
-        twin: DynamixelTwin | None,
+        emulator: EmulatedDynamixel | None,
     ) -> None:
-        """twin: the servos, if they are emulated here; answer_s: how long a tick waits for answers."""
-        self._twin, self.servos = twin, list(servos)
+        """emulator: the servos, if they are emulated here; answer_s: how long a tick waits for answers."""
+        self._emulator, self.servos = emulator, list(servos)
         self.emulated = is_emulated(port.wire.port)
         self._port = port
         self._readings, self._settings, self._clock_ns, self._answer_s = readings, settings, clock_ns, answer_s
@@ -110,7 +110,7 @@ class Servos:
         if not said.alert:
             servo.errors = 0
         if not servo.follows:  # it may have restarted, and forgotten its turns
-            turns = at.whole_turns(angle_rad, servo.least_rad, servo.most_rad, SLACK_RAD)
+            turns = at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD)
             servo.turns = servo.turns if turns is None else turns
         self._readings.moved(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
         self._readings.pushed(i, current * servo.unit_nm)
@@ -160,7 +160,7 @@ class Servos:
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """Set-points; torque on and off. An emergency stop is torque off, too: servos know no other."""
+        """Setpoints; torque on and off. An emergency stop is torque off, too: servos know no other."""
         everybody = range(len(self.servos))
         if not may_enable:
             following &= {i for i in everybody if self.servos[i].follows}
@@ -231,10 +231,10 @@ class Servos:
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Faults of servos that are emulated here, and of their bus."""
-        if self._twin is None or (injection.target_type, injection.kind) not in INJECTED:
+        if self._emulator is None or (injection.target_type, injection.kind) not in INJECTED:
             return False
         if injection.target_type == "joint":
-            self._twin.inject(injection, begins=begins)
+            self._emulator.inject(injection, begins=begins)
         else:
             self._port.wire.cut(begins=begins)
         return True
@@ -247,5 +247,5 @@ class Servos:
                 self._port.wire.let_run()
         finally:
             self._port.wire.close()
-        if self._twin is not None:
-            self._twin.close()
+        if self._emulator is not None:
+            self._emulator.close()

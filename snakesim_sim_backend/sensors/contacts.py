@@ -4,8 +4,8 @@ import math
 
 import mujoco
 
-from snakesim_hal.model.felt_force import FeltForce
 from snakesim_hal.model.kinematics import tangents
+from snakesim_hal.model.measured_force import FeltForce
 from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
@@ -34,15 +34,17 @@ class ContactReader:
         self._felt = FeltForce(sim.model.opt.timestep)
         physics.after_step = self._feel
 
-    def read(self, tick: int, stamp_ns: int) -> Contacts:
+    def read(self, tick: int, timestamp_ns: int) -> Contacts:
         """All contacts above the threshold."""
         found = [
             self._in_link(touch) for touch in self._touches.read() if math.hypot(*touch.force_w) >= self._threshold_n
         ]
-        felt_n = self._felt.largest_n
-        if not felt_n < LARGEST_N:  # also what is no number: of the steps in which a simulation diverged
-            felt_n = None
-        return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=found[:MAX_CONTACTS], felt_n=felt_n)
+        measured_force_n = self._felt.max_n
+        if not measured_force_n < LARGEST_N:  # also what is no number: of the steps in which a simulation diverged
+            measured_force_n = None
+        return Contacts(
+            tick=tick, timestamp_ns=timestamp_ns, contacts=found[:MAX_CONTACTS], measured_force_n=measured_force_n
+        )
 
     def _feel(self) -> None:
         self._felt.add(self._touches.sizes_n())

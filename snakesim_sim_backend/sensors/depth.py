@@ -26,19 +26,19 @@ class RayCamera:
         rays_c = np.stack([np.full(u.shape, camera.focal_px), left, up], -1).reshape(-1, 3) / camera.focal_px
         self._rays = Rays(self._mount, scope, rays_c, camera.range_max_m)
 
-    def read(self, tick: int, stamp_ns: int) -> DepthImage:
+    def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """An image from where the link is now."""
-        return depth_image(self._camera, self._mount, tick, stamp_ns, self._rays.cast(), self._noise)
+        return depth_image(self._camera, self._mount, tick, timestamp_ns, self._rays.cast(), self._noise)
 
 
 def depth_image(
-    camera: DepthCamera, mount: Mount, tick: int, stamp_ns: int, depth_m: Floats, noise: np.random.Generator
+    camera: DepthCamera, mount: Mount, tick: int, timestamp_ns: int, depth_m: Floats, noise: np.random.Generator
 ) -> DepthImage:
     """The message. depth_m: (height * width,) along the optical axis, row by row, without noise."""
     return DepthImage(
         **mount.seen_by(camera),
         tick=tick,
-        stamp_ns=stamp_ns,
+        timestamp_ns=timestamp_ns,
         range_min_m=camera.range_min_m,
         range_max_m=camera.range_max_m,
         scale_m=SCALE_M,

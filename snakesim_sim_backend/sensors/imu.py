@@ -19,7 +19,7 @@ class ImuReader:
         self._noise = noise if any(sigma) else None
         self._links = list(range(count))
 
-    def read(self, tick: int, stamp_ns: int) -> Imu:
+    def read(self, tick: int, timestamp_ns: int) -> Imu:
         """One entry a link, tail to head."""
         values = self._values
         if self._noise is not None:
@@ -27,7 +27,7 @@ class ImuReader:
         triples = list(map(tuple, values.reshape(-1, 3).tolist()))
         return Imu(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=self._links,
             angular_velocity_rad_s=triples[: self._count],
             acceleration_m_s2=triples[self._count :],

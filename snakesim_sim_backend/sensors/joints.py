@@ -22,7 +22,7 @@ class JointReader:
 
     def __init__(self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Normal, period_ns: int) -> None:
         count = motors.count
-        self._unfelt = [2 * count + i for i in motors.without_torque]
+        self._unmeasured = [2 * count + i for i in motors.without_torque]
         self._count = count
         self._angles, self._velocities = of_joints(data, count)
         self._torques = motors.applied_nm()
@@ -32,22 +32,22 @@ class JointReader:
         self._all_valid = [True] * count
         self._under_way: deque[tuple[int, list[float]]] = deque(maxlen=1 + ticks_of(sensor.delay_s, period_ns))
 
-    def read(self, tick: int, stamp_ns: int) -> JointState:
+    def read(self, tick: int, timestamp_ns: int) -> JointState:
         """The reading that arrives at this tick."""
         values = np.concatenate((self._angles, self._velocities, self._torques))
         count = self._count
         if self._noise is not None:
             values += self._sigma * self._noise(3 * count)
-        if self._unfelt:
-            values[self._unfelt] = 0.0
-        self._under_way.append((stamp_ns, values.tolist()))
+        if self._unmeasured:
+            values[self._unmeasured] = 0.0
+        self._under_way.append((timestamp_ns, values.tolist()))
         taken_ns, numbers = self._under_way[0]
         return JointState(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             angle_rad=numbers[:count],
             velocity_rad_s=numbers[count : 2 * count],
             torque_nm=numbers[2 * count :],
             valid=self._all_valid,
-            age_ns=[stamp_ns - taken_ns] * count,
+            age_ns=[timestamp_ns - taken_ns] * count,
         )

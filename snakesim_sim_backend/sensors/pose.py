@@ -21,7 +21,7 @@ class PoseReader:
         self._sigma = np.repeat(sigma, 3)
         self._noise = noise if any(sigma) else None
 
-    def read(self, tick: int, stamp_ns: int) -> Pose:
+    def read(self, tick: int, timestamp_ns: int) -> Pose:
         """The base, as from motion capture. Velocities have no noise of their own."""
         px, py, pz, w, x, y, z = self._qpos.tolist()
         vx, vy, vz, ox, oy, oz = self._qvel.tolist()
@@ -39,7 +39,7 @@ class PoseReader:
             w, x, y, z = w / norm, x / norm, y / norm, z / norm
         return Pose(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             position_w=(px, py, pz),
             orientation_wxyz=(w, x, y, z),
             velocity_w=(vx, vy, vz),

@@ -21,12 +21,12 @@ class PowerReader:
         self._supply_v = np.array([joint.supply.voltage_v for joint in joints])
         self._idle_a = np.array([joint.supply.idle_a for joint in joints])
 
-    def read(self, tick: int, stamp_ns: int) -> Power:
+    def read(self, tick: int, timestamp_ns: int) -> Power:
         """The modules' present values."""
         watts = self._windings.power_w(self._torques, self._velocities)
         return Power(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             voltage_v=self._supply_v.tolist(),
             current_a=(self._idle_a + watts / self._supply_v).tolist(),
             motor_c=self._windings.winding_c.tolist(),

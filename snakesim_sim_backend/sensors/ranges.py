@@ -17,13 +17,13 @@ class RayBeams:
     def __init__(self, sensor: RangeSensor, scope: Scope, _settings: NoSettings) -> None:
         self._sensor, self._noise = sensor, scope.noise
         self._mount = Mount(sensor, scope)
-        self._first_rad = -sensor.view_rad / 2
-        self._step_rad = sensor.view_rad / max(sensor.beams - 1, 1)
+        self._first_rad = -sensor.fov_rad / 2
+        self._step_rad = sensor.fov_rad / max(sensor.beams - 1, 1)
         angles = self._first_rad + self._step_rad * np.arange(sensor.beams)
         rays_s = np.stack([np.cos(angles), np.sin(angles), np.zeros(sensor.beams)], -1)
         self._rays = Rays(self._mount, scope, rays_s, sensor.range_max_m)
 
-    def read(self, tick: int, stamp_ns: int) -> Ranges:
+    def read(self, tick: int, timestamp_ns: int) -> Ranges:
         """A scan from where the link is now."""
         sensor = self._sensor
         found_m = self._rays.cast()
@@ -34,7 +34,7 @@ class RayBeams:
             seen &= self._noise.random(sensor.beams) >= sensor.dropout
         return Ranges(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=self._mount.link,
             position_l=self._mount.position_l,
             orientation_l_wxyz=self._mount.orientation_l_wxyz,

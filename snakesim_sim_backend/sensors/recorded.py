@@ -36,14 +36,14 @@ class RecordedDepth:
         """Raises ConfigError."""
         self._images = _read(settings.file, camera)
         self._link = scope.config.robot.link_index(camera.link)
-        self._after_ns = [image.stamp_ns - self._images[0].stamp_ns for image in self._images]
+        self._after_ns = [image.timestamp_ns - self._images[0].timestamp_ns for image in self._images]
         steps = len(self._after_ns) - 1
         self._lasts_ns = self._after_ns[-1] + (self._after_ns[-1] // steps if steps else 1)
 
-    def read(self, tick: int, stamp_ns: int) -> DepthImage:
+    def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """An image, as if measured now, on the link of the robot file."""
-        i = bisect.bisect_right(self._after_ns, stamp_ns % self._lasts_ns) - 1
-        return msgspec.structs.replace(self._images[i], tick=tick, stamp_ns=stamp_ns, link=self._link)
+        i = bisect.bisect_right(self._after_ns, timestamp_ns % self._lasts_ns) - 1
+        return msgspec.structs.replace(self._images[i], tick=tick, timestamp_ns=timestamp_ns, link=self._link)
 
 
 def _read(file: str, camera: DepthCamera) -> list[DepthImage]:
@@ -58,7 +58,7 @@ def _read(file: str, camera: DepthCamera) -> list[DepthImage]:
             f"make one with `snakesim echo sensor/depth/{camera.name} > {file}`"
         ) from error
     flawed = any(2 * image.width * image.height != len(image.depth) for image in images)
-    in_order = all(image.stamp_ns < later.stamp_ns for image, later in pairwise(images))
+    in_order = all(image.timestamp_ns < later.timestamp_ns for image, later in pairwise(images))
     if not images or flawed or not in_order:
         why = "some images are not whole" if flawed else "its stamps do not increase" if images else "it is empty"
         raise ConfigError(f"the recording of camera {camera.name!r}, {file}, cannot be used: {why}")

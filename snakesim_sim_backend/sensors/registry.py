@@ -15,7 +15,7 @@ from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plu
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import AnyMounted
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColourImage, Contacts, Imu, Message, OwnSample, Pose, Power
+from snakesim_hal.wire.messages import ColorImage, Contacts, Imu, Message, OwnSample, Pose, Power
 from snakesim_sim_backend.sensors.contacts import ContactReader
 from snakesim_sim_backend.sensors.depth import RayCamera
 from snakesim_sim_backend.sensors.imu import ImuReader
@@ -23,7 +23,7 @@ from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.sensors.power import PowerReader
 from snakesim_sim_backend.sensors.ranges import RayBeams
 from snakesim_sim_backend.sensors.recorded import RecordedDepth
-from snakesim_sim_backend.sensors.rendered import RenderedColour, RenderedDepth
+from snakesim_sim_backend.sensors.rendered import RenderedColor, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
 SYNCHRONOUS: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
@@ -58,8 +58,8 @@ def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
 def _model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
     """Its class, and its settings, which are checked; None where `find` finds none."""
     message = keys.message_at(key)
-    if message is ColourImage:
-        return RenderedColour, RenderedColour.Settings()
+    if message is ColorImage:
+        return RenderedColor, RenderedColor.Settings()
     assert message is not None
     model = THREADED.get((message, sensor.model)) or find(SENSORS, sensor.model)
     if model is None:

@@ -1,4 +1,4 @@
-"""Images drawn by MuJoCo's renderer: in colour, or depth as a graphics card has it. Needs OpenGL, but no screen."""
+"""Images drawn by MuJoCo's renderer: in color, or depth as a graphics card has it. Needs OpenGL, but no screen."""
 
 import os
 from typing import Any
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.sensors import DepthCamera
-from snakesim_hal.wire.messages import ColourImage, DepthImage
+from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_sim_backend.ground import PLANE_GROUP
 from snakesim_sim_backend.sensors.depth import depth_image
 from snakesim_sim_backend.sensors.mount import Mount
@@ -32,25 +32,25 @@ class RenderedDepth:
         self._camera, self._noise = camera, scope.noise
         self._view = View(camera, scope, smooth=False)
 
-    def read(self, tick: int, stamp_ns: int) -> DepthImage:
+    def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """An image from where the link is now."""
         depth_m = self._view.draw()[1].ravel().astype(np.float64)
-        return depth_image(self._camera, self._view.mount, tick, stamp_ns, depth_m, self._noise)
+        return depth_image(self._camera, self._view.mount, tick, timestamp_ns, depth_m, self._noise)
 
 
-class RenderedColour:
-    """A colour image, without noise, dropouts and range."""
+class RenderedColor:
+    """A color image, without noise, dropouts and range."""
 
-    Settings, message = NoSettings, ColourImage
+    Settings, message = NoSettings, ColorImage
 
     def __init__(self, camera: DepthCamera, scope: Scope, _settings: NoSettings) -> None:
         self._camera = camera
         self._view = View(camera, scope, smooth=True)
 
-    def read(self, tick: int, stamp_ns: int) -> ColourImage:
+    def read(self, tick: int, timestamp_ns: int) -> ColorImage:
         """An image from where the link is now."""
         fixed = self._view.mount.seen_by(self._camera)
-        return ColourImage(**fixed, tick=tick, stamp_ns=stamp_ns, rgb=self._view.draw()[0].tobytes())
+        return ColorImage(**fixed, tick=tick, timestamp_ns=timestamp_ns, rgb=self._view.draw()[0].tobytes())
 
 
 class View:
@@ -124,5 +124,5 @@ def opened_context(width: int, height: int, what: str) -> Any:
         raise ConfigError(
             f"{what} is rendered, which needs OpenGL by {kind.upper()}, and that does not work here: "
             f"{type(error).__name__}: {error}. Install the Debian packages {PACKAGES[kind]} and libgl1-mesa-dri; or "
-            f'leave out `colour` and take `model = "rays"`, which need no OpenGL'
+            f'leave out `color` and take `model = "rays"`, which need no OpenGL'
         ) from error

@@ -41,7 +41,7 @@ class BodyScope(Scope):
 class Reader(Protocol):
     """Makes the samples of one sensor."""
 
-    def read(self, tick: int, stamp_ns: int) -> Message:
+    def read(self, tick: int, timestamp_ns: int) -> Message:
         """The sample of this tick, without rate and delay."""
         ...
 

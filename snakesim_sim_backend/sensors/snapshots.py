@@ -28,18 +28,18 @@ class Snapshots:
         return self._thread.submit(work).result()
 
     def begin(
-        self, read: Callable[[int, int], Message], tick: int, stamp_ns: int, qpos: NDArray[np.float64]
+        self, read: Callable[[int, int], Message], tick: int, timestamp_ns: int, qpos: NDArray[np.float64]
     ) -> Future[Message]:
         """Make a sample of the state `qpos`, which is copied, in the order of these calls."""
-        return self._thread.submit(self._read, read, tick, stamp_ns, qpos.copy())
+        return self._thread.submit(self._read, read, tick, timestamp_ns, qpos.copy())
 
     def close(self) -> None:
         """Begin nothing more."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _read(
-        self, read: Callable[[int, int], Message], tick: int, stamp_ns: int, qpos: NDArray[np.float64]
+        self, read: Callable[[int, int], Message], tick: int, timestamp_ns: int, qpos: NDArray[np.float64]
     ) -> Message:
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self.data)
-        return read(tick, stamp_ns)
+        return read(tick, timestamp_ns)

@@ -56,14 +56,14 @@ class Sensors:
                 channel = SynchronousSensor(SYNCHRONOUS[message](sensor, scope), sensor, config)
             self._others.append((key, channel))
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Every sensor that is due. Ticks must come in order, each once."""
         others: dict[str, Message] = {}
         for key, channel in self._others:
-            arrived = channel.arriving(tick, stamp_ns)
+            arrived = channel.arriving(tick, timestamp_ns)
             if arrived is not None:
                 others[key] = arrived
-        return Samples(self._joints.read(tick, stamp_ns), others)
+        return Samples(self._joints.read(tick, timestamp_ns), others)
 
     def lateness(self) -> list[str]:
         """What to report of dropped samples since the last call: the first one, and each doubling."""
@@ -95,9 +95,9 @@ class SynchronousSensor:
         self._due = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
         self._line = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
 
-    def arriving(self, tick: int, stamp_ns: int) -> Message | None:
+    def arriving(self, tick: int, timestamp_ns: int) -> Message | None:
         """Take a sample if due, and return the one that arrives at this tick."""
-        taken = self._read(tick, stamp_ns) if self._due.at(stamp_ns) else None
+        taken = self._read(tick, timestamp_ns) if self._due.at(timestamp_ns) else None
         return self._line.pass_on(tick, taken)
 
 
@@ -114,15 +114,15 @@ class ThreadedSensor:
         config = scope.config
         self._key, self._read, self._snapshots, self._late = key, reader.read, snapshots, late
         self._qpos = scope.data.qpos
-        self._waits = config.pace != "realtime"
+        self._waits = config.clock_mode != "realtime"
         self._due = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
         self._delay_ticks = max(ticks_of(sensor.delay_s, config.period_ns), 1)
         self._under_way: deque[tuple[int, Future[Message]]] = deque()  # with the tick of arrival
 
-    def arriving(self, tick: int, stamp_ns: int) -> Message | None:
+    def arriving(self, tick: int, timestamp_ns: int) -> Message | None:
         """Take a sample if due, and return the one that arrives at this tick."""
-        if self._due.at(stamp_ns):
-            sample = self._snapshots.begin(self._read, tick, stamp_ns, self._qpos)
+        if self._due.at(timestamp_ns):
+            sample = self._snapshots.begin(self._read, tick, timestamp_ns, self._qpos)
             self._under_way.append((tick + self._delay_ticks, sample))
         if not self._under_way or self._under_way[0][0] > tick:
             return None

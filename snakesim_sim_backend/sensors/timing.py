@@ -16,12 +16,12 @@ class SamplingSchedule:
         self._top, self._bottom = top, bottom * 10**9
         self._period_ns = period_ns
 
-    def at(self, stamp_ns: int) -> bool:
+    def at(self, timestamp_ns: int) -> bool:
         """Whether the sensor samples at the tick of this stamp."""
-        if self._always or stamp_ns == 0:
+        if self._always or timestamp_ns == 0:
             return True
-        before = (stamp_ns - self._period_ns) * self._top // self._bottom
-        return stamp_ns * self._top // self._bottom > before
+        before = (timestamp_ns - self._period_ns) * self._top // self._bottom
+        return timestamp_ns * self._top // self._bottom > before
 
 
 def ticks_of(delay_s: float, period_ns: int) -> int:

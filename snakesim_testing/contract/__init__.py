@@ -4,7 +4,7 @@
 
 `plugin`      the pytest plugin: options, fixtures and the table at the end
 `bench`       one backend with its settings, opened by one user at a time
-`rig`         an open backend, driven tick by tick through the real gate
+`rig`         an open backend, driven tick by tick through the real limiter
 `loopback`    the same behind the real host, with a real client
 `tolerances`  all tolerances of the tests, with their reasons
 `test_*`      the clauses

@@ -11,7 +11,7 @@ from snakesim_hal.backend import Backend, BackendFactory
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import Override, RunConfig, Service, load, parse_set
 from snakesim_hal.programs.preflight import backend_settings, on_backend
-from snakesim_hal.wire.messages import Pace
+from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.contract.loopback import Hosted
 from snakesim_testing.contract.rig import HOLDER, Rig
 
@@ -23,7 +23,7 @@ class EmulatedDrives(Protocol):
     """The emulated drives of an open backend, for clauses about what drives do while their driver does nothing."""
 
     def enabled(self) -> list[bool]:
-        """Return for each joint whether its drive would follow a set-point now: in truth, not as the driver has it."""
+        """Return for each joint whether its drive would follow a setpoint now: in truth, not as the driver has it."""
         ...
 
     def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
@@ -77,19 +77,21 @@ class Bench:
 
     @cached_property
     def config(self) -> RunConfig:
-        """The scenario with the backend, at the pace of the bench. Raises ConfigError."""
+        """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
         overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
         config = on_backend(load(self._scenario, overrides).config, self.factory)
         # The tests' own controller is the only service.
         paces = self.factory.check(config, backend_settings(config, self.factory))
-        pace = "lockstep" if "lockstep" in paces else "realtime"  # the first: quick, and the same on every machine
-        return msgspec.structs.replace(config, pace=pace, services={HOLDER: Service()})
+        clock_mode = (
+            "lockstep" if "lockstep" in paces else "realtime"
+        )  # the first: quick, and the same on every machine
+        return msgspec.structs.replace(config, clock_mode=clock_mode, services={HOLDER: Service()})
 
     @property
-    def pace(self) -> Pace:
-        """At which pace the tests run it."""
-        return self.config.pace
+    def clock_mode(self) -> ClockMode:
+        """At which clock mode the tests run it."""
+        return self.config.clock_mode
 
     # --- opening and closing -------------------------------------------------------------------------------
 
@@ -103,7 +105,7 @@ class Bench:
         """A rig on a fresh backend."""
         backend = self.open()
         try:
-            self._rig = Rig(backend, self.pace, self.config.period_ns)
+            self._rig = Rig(backend, self.clock_mode, self.config.period_ns)
         except BaseException:
             backend.close()
             raise

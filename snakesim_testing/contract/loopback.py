@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from snakesim_hal.backend import Backend, Samples, SetPoints
+from snakesim_hal.backend import Backend, Samples, Setpoints
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
@@ -54,9 +54,9 @@ class RecordingBackend:
         self.seen: list[JointState] = []
         self.planted: Callable[[int], Fault | None] | None = None  # tick -> a fault to report besides the backend's own
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """The backend's, recorded."""
-        samples = self._inner.sample(tick, stamp_ns)
+        samples = self._inner.sample(tick, timestamp_ns)
         self.seen.append(samples.joints)
         return samples
 
@@ -74,7 +74,7 @@ class Controller:
     plan: Plan = stay
     last_sent_tick: int = -1
     epoch: int = 0
-    arming: int = 0
+    arm_session: int = 0
     stopped: threading.Event = field(default_factory=threading.Event)
 
     def run(self, link: Link) -> None:
@@ -85,8 +85,8 @@ class Controller:
             joints = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
             client.announce()
-            arming = armed_at = -1
-            held: SetPoints | None = None
+            arm_session = armed_at = -1
+            held: Setpoints | None = None
             for clock in client.ticks(silence_s=0.05):
                 if self.stopped.is_set():
                     return
@@ -98,22 +98,22 @@ class Controller:
                     continue
                 if clock.lifecycle != "armed" or held is None:
                     held = commander.stay(measured)
-                elif clock.arming != arming:
-                    arming, armed_at = clock.arming, clock.tick
+                elif clock.arm_session != arm_session:
+                    arm_session, armed_at = clock.arm_session, clock.tick
                 asked = self._asked(clock, held, clock.tick - armed_at)
                 if asked is not None:
                     commander.send(clock, measured, asked)
-                    self.last_sent_tick, self.epoch, self.arming = clock.tick, clock.lease_epoch, clock.arming
+                    self.last_sent_tick, self.epoch, self.arm_session = clock.tick, clock.lease_epoch, clock.arm_session
                     client.done(clock.tick)
 
-    def _asked(self, clock: Clock, held: SetPoints, ticks: int) -> SetPoints | None:
+    def _asked(self, clock: Clock, held: Setpoints, ticks: int) -> Setpoints | None:
         asked = self.plan(ticks) if clock.lifecycle == "armed" else {}
         if asked is None:
             return None
         mode, target = list(held.mode), list(held.target)
         for joint, (wanted_mode, wanted) in asked.items():
             mode[joint], target[joint] = wanted_mode, wanted
-        return SetPoints(mode, target, held.torque_limit_nm)
+        return Setpoints(mode, target, held.torque_limit_nm)
 
 
 class Hosted:
@@ -194,7 +194,7 @@ class Hosted:
             "tick": self.tick,
             "sequence": 2**40,
             "lease_epoch": self.controller.epoch,
-            "arming": self.controller.arming,
+            "arm_session": self.controller.arm_session,
             "layout": self.robot.layout,
             "valid_for_ns": self.robot.lease_ns,
             "mode": [Mode.POSITION] * count,

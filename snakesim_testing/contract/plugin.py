@@ -169,7 +169,7 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
     yield rig
     if rig.late_periods > 1:
         what = f"{bench.name}: this machine fell {rig.late_periods:.1f} periods behind real time"
-        request.node.add_report_section("call", "pace", what)
+        request.node.add_report_section("call", "clock_mode", what)
         rig.late_periods = 0.0
     if request.node.stash.get(_failed, False):
         bench.spoil()

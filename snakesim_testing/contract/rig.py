@@ -1,4 +1,4 @@
-"""An open backend on the bench, driven tick by tick as by the host, through the real authority and its gate."""
+"""An open backend on the bench, driven tick by tick as by the host, through the real authority and its limiter."""
 
 import contextlib
 import time
@@ -9,11 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.backend import Backend, Samples, SetPoints
+from snakesim_hal.backend import Backend, Samples, Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
+    ClockMode,
     EstopRequest,
     Fault,
     JointCommand,
@@ -22,7 +23,6 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     LifecycleState,
     Mode,
-    Pace,
     Power,
     request_to_arm,
 )
@@ -39,10 +39,10 @@ def _no_sleep(_seconds: float) -> None:
 
 @dataclass
 class Record:
-    """Joint states and set-points over some ticks. All arrays are (ticks, n_joints)."""
+    """Joint states and setpoints over some ticks. All arrays are (ticks, n_joints)."""
 
     samples: list[Samples]
-    set_points: list[SetPoints]
+    setpoints: list[Setpoints]
     faults: list[Fault]  # reported by the backend in these ticks
 
     @property
@@ -71,7 +71,7 @@ class Rig:
     """One opening of a backend. Every clause that needs no network is tested on it."""
 
     backend: Backend
-    pace: Pace
+    clock_mode: ClockMode
     period_ns: int
     spoiled: bool = False  # unusable for further tests: closed, or a joint is silent
     closed: bool = False
@@ -88,7 +88,7 @@ class Rig:
         self._sequence = 0
         self._anchor_ns = time.monotonic_ns()
         self._samples: list[Samples] = []
-        self._set_points: list[SetPoints] = []
+        self._setpoints: list[Setpoints] = []
         self.first = self._sample()
         # On a bus the first joint states may take a few periods.
         for _ in range(t.ARMING_PERIODS):
@@ -140,7 +140,7 @@ class Rig:
         """Everything after a tick."""
         first = len(self._samples) - (self.tick - tick)
         faults = [fault for found_at, fault in self._found if found_at >= tick]
-        return Record(self._samples[first:], self._set_points[first - 1 :], faults)
+        return Record(self._samples[first:], self._setpoints[first - 1 :], faults)
 
     def periods(self, seconds: float) -> int:
         """Number of periods in a time, rounded up."""
@@ -148,20 +148,20 @@ class Rig:
 
     # --- one period ----------------------------------------------------------------------------------------
 
-    def hand(self, points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Hand set-points to the backend without the gate, and let a period pass."""
+    def hand(self, points: Setpoints, lifecycle: LifecycleState) -> None:
+        """Hand setpoints to the backend without the limiter, and let a period pass."""
         self.backend.enact(points, lifecycle)
         self.let_pass(points)
 
-    def let_pass(self, set_points: SetPoints | None = None) -> None:
+    def let_pass(self, setpoints: Setpoints | None = None) -> None:
         """Let a period pass and sample, as the host does. Faults go to the authority, as in the host."""
-        self._set_points.append(set_points or self._set_points[-1])
+        self._setpoints.append(setpoints or self._setpoints[-1])
         self.backend.advance()
         for fault in self.backend.faults():
             self._found.append((self.tick, fault))
             self.authority.fault(fault)
         self.tick += 1
-        if self.pace == "realtime":
+        if self.clock_mode == "realtime":
             self._wait_for_deadline()
         self._sample()
 
@@ -170,18 +170,18 @@ class Rig:
         began = self.tick
         for _ in range(periods):
             self.authority.expire(self._now_ns, self.tick)
-            self.hand(self.authority.decide().set_points, self.authority.state)
+            self.hand(self.authority.decide().setpoints, self.authority.state)
         return self.since(began)
 
     def drive(self, asked: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
-        """Command some joints, while the others hold the start pose; through lease, gate and lifecycle."""
+        """Command some joints, while the others hold the start pose; through lease, limiter and lifecycle."""
         began = self.tick
         for _ in range(periods):
             self._offer(self.points(asked, torque_limit_nm))
             self.idle()
         return self.since(began)
 
-    def offer(self, points: SetPoints) -> Record:
+    def offer(self, points: Setpoints) -> Record:
         """One command as it is, and the period after it."""
         began = self.tick
         self._offer(points)
@@ -189,7 +189,7 @@ class Rig:
         return self.since(began)
 
     def press(self, asked: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
-        """The same without the gate, which would not drive a joint against its stop; the lifecycle still applies."""
+        """The same without the limiter, which would not drive a joint against its stop; the lifecycle still applies."""
         began = self.tick
         for _ in range(periods):
             self._offer(self.points(dict.fromkeys(asked, (Mode.PASSIVE, 0.0))))
@@ -198,8 +198,8 @@ class Rig:
             self.hand(self.points(asked, torque_limit_nm), self.authority.state)
         return self.since(began)
 
-    def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> SetPoints:
-        """Set-points of all joints; those without a command hold the start pose.
+    def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> Setpoints:
+        """Setpoints of all joints; those without a command hold the start pose.
 
         A joint without a velocity mode gets the positions that lead along at that speed, one each time.
         """
@@ -209,11 +209,11 @@ class Rig:
             if wanted_mode is Mode.VELOCITY and not self.has(joint, Mode.VELOCITY):
                 wanted_mode, wanted = Mode.POSITION, self._next_along(joint, wanted)
             mode[joint], target[joint] = wanted_mode, wanted
-        return SetPoints(mode, target, torque_limit_nm or self.full_torque_nm)
+        return Setpoints(mode, target, torque_limit_nm or self.full_torque_nm)
 
     def freeze_host(self, seconds: float, freeze_driver: Callable[[float, Callable[[float], None]], None]) -> None:
         """Let time pass in which the host does nothing, as when its process is stopped and goes on later."""
-        freeze_driver(seconds, time.sleep if self.pace == "realtime" else _no_sleep)
+        freeze_driver(seconds, time.sleep if self.clock_mode == "realtime" else _no_sleep)
         self.tick += self.periods(seconds)
 
     # --- the lifecycle -------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ class Rig:
     def may_lose_a_joint(self) -> Iterator[None]:
         """Context in which one failed joint is isolated, whatever the robot file allows. Begins and ends disarmed."""
         usual = self.authority
-        self.authority = Authority(msgspec.structs.replace(self.robot, may_lose_joints=1))
+        self.authority = Authority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
         self.idle()
         yield
         self.disarm()
@@ -309,7 +309,7 @@ class Rig:
         away = np.abs(np.array(self.now.angle_rad) - self.home_rad)
         return bool(away.max() < t.REACHED_RAD and np.abs(self.now.velocity_rad_s).max() < t.STILL_RAD_S)
 
-    def _offer(self, points: SetPoints) -> None:
+    def _offer(self, points: Setpoints) -> None:
         """Send a command; a rejection shows in the joint states."""
         if self.authority.state == "disarmed" and not self.authority.lease.live(self._now_ns):
             self.authority.on_lease(LeaseRequest(action="acquire", holder=HOLDER), self._now_ns)
@@ -318,7 +318,7 @@ class Rig:
             tick=self.tick,
             sequence=self._sequence,
             lease_epoch=self.authority.lease.epoch,
-            arming=self.authority.arming,
+            arm_session=self.authority.arm_session,
             layout=self.robot.layout,
             valid_for_ns=self.robot.lease_ns,
             mode=points.mode,

@@ -31,7 +31,7 @@ def what_is_still_seen(rig: Rig) -> list[JointState]:
 
 
 def test_a_closed_backend_drives_nothing(bench: Bench, rig: Rig) -> None:
-    """Closed while a joint moves, and handed set-points afterwards: nothing is driven any more."""
+    """Closed while a joint moves, and handed setpoints afterwards: nothing is driven any more."""
     rig.cruise()
     before = rig.now.angle_rad[0]
     rig.close()
@@ -58,7 +58,7 @@ def test_a_backend_opens_again_after_it_was_closed(bench: Bench) -> None:
 
 def test_in_lockstep_the_same_seed_and_commands_give_the_same_samples(bench: Bench) -> None:
     """Bit-identical in lockstep."""
-    if bench.pace != "lockstep":
+    if bench.clock_mode != "lockstep":
         pytest.skip("this backend supports real time only, which is not exactly repeatable")
 
     def once() -> list[Samples]:

@@ -23,7 +23,7 @@ def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> 
         drive = {"serial": joint.serial, "firmware": joint.firmware}  # which the drive says, not the file
         assert joint == msgspec.structs.replace(expected, **drive)
     assert robot.links == wanted.links
-    for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "safe_action", "own"):
+    for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "stop_mode", "own"):
         assert getattr(robot, name) == getattr(wanted, name), name
 
 

@@ -33,7 +33,7 @@ def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: Rig) -> None:
 
 @pytest.mark.parametrize("state", ["disarmed", "estop"])
 def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig: Rig, state: LifecycleState) -> None:
-    """The second line of defence: given moving set-points by mistake, a robot that is not armed does not follow.
+    """The second line of defence: given moving setpoints by mistake, a robot that is not armed does not follow.
 
     A simulator need not do this (see `Backend.enact`); the host hands it none.
     """
@@ -43,8 +43,8 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig
         rig.hand(rig.points(asked), state)
     rig.idle(t.TRANSPORT_PERIODS)  # disarmed: the only state after a stop
     moved = float(np.abs(rig.since(began).angle_rad - before).max())
-    if moved >= t.STILL_RAD and bench.pace == "lockstep":
-        pytest.skip("a simulator may follow set-points in every state; the host hands it safe ones only")
+    if moved >= t.STILL_RAD and bench.clock_mode == "lockstep":
+        pytest.skip("a simulator may follow setpoints in every state; the host hands it safe ones only")
     assert moved < t.STILL_RAD, f"{state}, and it moved by {moved:.3f} rad"
 
 
@@ -67,7 +67,7 @@ def test_disarmed_joints_have_no_torque(rig: Rig) -> None:
 
 
 def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
-    """Stopped on its way, cleared and armed again: no joint resumes an earlier set-point."""
+    """Stopped on its way, cleared and armed again: no joint resumes an earlier setpoint."""
     rig.cruise()
     rig.estop()
     rig.idle(rig.periods(t.SETTLE_S))

@@ -27,7 +27,7 @@ def test_a_torque_limit_of_zero_lets_nothing_move(rig: Rig) -> None:
 
 
 def test_no_joint_goes_beyond_its_limits(rig: Rig, pushing: Pushing) -> None:
-    """Not even without the gate, which would prevent it: pushed by torque and by speed, the stop holds."""
+    """Not even without the limiter, which would prevent it: pushed by torque and by speed, the stop holds."""
     for i, joint in enumerate(rig.robot.joints):
         angles = pushing.all.angle_rad[:, i]
         assert angles.max() < joint.angle_max_rad + t.OVERSHOOT_RAD, f"{joint.name}: {angles.max():.3f} rad"

@@ -75,7 +75,7 @@ def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
 
 
 def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
-    """Without commands for less than a lease the joint keeps its set-point."""
+    """Without commands for less than a lease the joint keeps its setpoint."""
     rig.needs(Mode.VELOCITY)
     rig.cruise()
     rig.idle(t.LAPSE_PERIODS)
@@ -83,7 +83,7 @@ def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
 
 
 def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
-    """`advance` alone keeps the last set-points active."""
+    """`advance` alone keeps the last setpoints active."""
     rig.needs(Mode.VELOCITY)
     rig.cruise()
     for _ in range(t.HELD_PERIODS):
@@ -92,7 +92,7 @@ def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
 
 
 def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> None:
-    """Described without a mode, a joint is never given a set-point in it: the command is refused as a whole."""
+    """Described without a mode, a joint is never given a setpoint in it: the command is refused as a whole."""
     lacking = [mode for mode in Mode if not rig.has(0, mode)]
     if not lacking:
         pytest.skip(f"{rig.robot.joints[0].name} is described with every mode")
@@ -104,7 +104,7 @@ def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> Non
         record = rig.offer(wrong)
         assert rig.authority.rejected["wrong_mode"] == refused + 1, f"{mode.name.lower()} mode was accepted"
         assert np.abs(record.angle_rad - rig.home_rad).max() < t.REACHED_RAD, "it moved"
-        assert all(mode not in points.mode for points in record.set_points)
+        assert all(mode not in points.mode for points in record.setpoints)
 
 
 def must_cruise(rig: Rig) -> None:

@@ -24,7 +24,7 @@ def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: Rig, healthy: 
     """One joint state a tick, stamped with the robot's own time."""
     ticks = [joints.tick for joints in healthy.joints]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
-    assert all(joints.stamp_ns == joints.tick * rig.period_ns for joints in healthy.joints)
+    assert all(joints.timestamp_ns == joints.tick * rig.period_ns for joints in healthy.joints)
 
 
 def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record) -> None:
@@ -36,9 +36,9 @@ def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record
         stamps: list[int] = []
         for sample in healthy.samples:
             if (message := sample.others.get(sensor.key)) is not None:
-                stamp_ns: int = message.stamp_ns  # pyright: ignore[reportAttributeAccessIssue]
-                stamps.append(stamp_ns)
-                age_ns = sample.joints.stamp_ns - stamp_ns
+                timestamp_ns: int = message.timestamp_ns  # pyright: ignore[reportAttributeAccessIssue]
+                stamps.append(timestamp_ns)
+                age_ns = sample.joints.timestamp_ns - timestamp_ns
                 assert 0 <= age_ns <= oldest_ns, f"{sensor.key}: {age_ns * 1e-6} ms old"
         assert all(before < after for before, after in pairwise(stamps)), f"{sensor.key}: out of order"
 

@@ -6,12 +6,12 @@ degrees, a wrong order or sign, a missing limit, or a joint that goes on moving 
 
 # --- transport, in control periods -----------------------------------------------------------------------------
 
-TRANSPORT_PERIODS = 2  # set-points act from the next sample's synchronisation on; the sample after that shows it
+TRANSPORT_PERIODS = 2  # setpoints act from the next sample's synchronisation on; the sample after that shows it
 ARMING_PERIODS = 15  # modules change their state one after another, and confirm it
 AGE_PERIODS = 1  # every joint is read every tick: a reading is of this tick, or of the one before
-LAPSE_PERIODS = 3  # without commands, when set-points have to hold; less than a lease of five
+LAPSE_PERIODS = 3  # without commands, when setpoints have to hold; less than a lease of five
 SENSOR_PERIODS = 3  # a sensor with its own rate may start late by this much, besides its delay and one interval
-HELD_PERIODS = 5  # how long set-points have to hold without being handed over again: a lease
+HELD_PERIODS = 5  # how long setpoints have to hold without being handed over again: a lease
 CLOSING_PERIODS = 5  # for how long a closed backend is observed
 ATTEMPTS = 3  # with host and controller in real time in one process, a busy machine may miss a lease of 100 ms
 
@@ -30,20 +30,20 @@ CRUISE_RAD_S = 0.5
 NEAR_STOP = 0.8  # of the joint's limit: where a push against the stop begins
 BEYOND_RAD = 1.0  # the stop: the target of a joint that can push only by its position
 PUSH_SHARE = 0.08  # of full torque, in torque mode against the stop
-LIMIT_SHARE = 0.1  # of full torque, as the limit in the set-points...
+LIMIT_SHARE = 0.1  # of full torque, as the limit in the setpoints...
 DEMAND_SHARE = 0.25  # ... while velocity mode asks for this much
 
 # --- tolerances ------------------------------------------------------------------------------------------------
 
 REACHED_RAD = 0.03  # friction of joint and ground over stiffness, noise, quantisation (1e-4 rad)
-STILL_RAD = 0.02  # has not moved: a tenth of STEP_RAD, several times the noise and the vibration from neighbours
+STILL_RAD = 0.02  # has not moved: a tenth of STEP_RAD, several times the noise and the vibration from neighbors
 STILL_RAD_S = 0.05  # is at rest: a tenth of CRUISE_RAD_S; quantisation is 1e-3 rad/s
 OVERSHOOT_RAD = 0.08  # beyond the joint's limit: a stop gives a little
 SPEED_SHARE = 0.35  # velocity mode is a gain, not an integrator: friction reduces the speed
 INTEGRAL_RAD = 0.03  # angle against integrated velocity: sampling, and a period of disagreement
 TORQUE_SHARE = 0.15  # of the commanded torque; gauges and motor constants are not better
 TORQUE_NM = 0.06  # besides: friction between motor and gauge, noise, quantisation (1e-3 N·m, limits 1e-2 N·m)
-# Of full torque, in a tick, with small targets. The gate's start is up to two periods old on a bus: at
+# Of full torque, in a tick, with small targets. The limiter's start is up to two periods old on a bus: at
 # these speeds that is a tenth. A target that is not bumpless, or a motor that restarts, makes several tenths.
 BUMP_SHARE = 0.25
 RATE_SHARE = 0.3  # of a sensor's stated rate

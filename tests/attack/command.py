@@ -10,7 +10,7 @@ from tests.harness.command import Running as Run
 
 LIMIT_S = 60.0
 # 50 Hz has the longest lease, 100 ms: a busy machine may well forget a process for 50 ms.
-HOLDING = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50")
+HOLDING = ("triplet", "--controller", "hold", "--clock-mode", "realtime", "--set", "rate_hz=50")
 STANDING = (*HOLDING, "--duration", "3600", "--stay")
 
 

@@ -1,4 +1,4 @@
-"""What set-points may be, by the robot's own description: whoever commands, nothing else may reach the motors."""
+"""What setpoints may be, by the robot's own description: whoever commands, nothing else may reach the motors."""
 
 from typing import Any
 

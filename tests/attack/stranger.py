@@ -220,7 +220,7 @@ class Stranger:
             "mode": [wire.POSITION] * len(about["joints"]),
             "target": [angle + NUDGE_RAD for angle in state["angle_rad"]],
             "torque_limit_nm": None,
-            "arming": clock["arming"],
+            "arm_session": clock["arm_session"],
             **changes,
         }
 

@@ -30,11 +30,11 @@ def test_a6_a_command_of_no_or_another_arming_is_never_applied(robot: Robot, kin
     late = operator.command(clock)
     match kind:
         case "left_out":
-            del late["arming"]
+            del late["arm_session"]
         case "none":
-            late["arming"] = None
+            late["arm_session"] = None
         case "after":
-            late["arming"] += 2
+            late["arm_session"] += 2
     assert operator.request("arm")["ok"]
     for i in range(20):
         tick = operator.next("hal/clock")["tick"]

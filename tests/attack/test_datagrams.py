@@ -11,12 +11,12 @@ from tests.attack.effort import effort
 from tests.attack.robot import standing
 from tests.harness.endpoint import free_endpoint
 
-POSE = {"stamp_ns": 0, "position_w": [0.0, 0.0, 0.0], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
+POSE = {"timestamp_ns": 0, "position_w": [0.0, 0.0, 0.0], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
 
 
-def frame(stamp_ns: int | None = None) -> bytes:
+def frame(timestamp_ns: int | None = None) -> bytes:
     """A good one, captured now."""
-    return json.dumps({**POSE, "stamp_ns": time.monotonic_ns() if stamp_ns is None else stamp_ns}).encode()
+    return json.dumps({**POSE, "timestamp_ns": time.monotonic_ns() if timestamp_ns is None else timestamp_ns}).encode()
 
 
 def wrong_poses() -> list[bytes]:
@@ -28,9 +28,9 @@ def wrong_poses() -> list[bytes]:
         b'{"a":' * 300,
         b"",
         b"\xff" * 2048,
-        b'{"stamp_ns": 0, "position_w": [1e999, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
-        b'{"stamp_ns": 0, "position_w": [NaN, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
-        *(frame(stamp_ns) for stamp_ns in (-1, 0, 2**62, 10**400)),
+        b'{"timestamp_ns": 0, "position_w": [1e999, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
+        b'{"timestamp_ns": 0, "position_w": [NaN, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
+        *(frame(timestamp_ns) for timestamp_ns in (-1, 0, 2**62, 10**400)),
         json.dumps({**POSE, "orientation_wxyz": [0, 0, 0, 0]}).encode(),
         json.dumps({**POSE, "position_w": [10**400, 0, 0]}).encode(),
         json.dumps({**POSE, "more": "x" * 40_000}).encode(),

@@ -113,7 +113,13 @@ def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) ->
     status |= {"robot": EVIL, "backend": EVIL, "lease_holder": EVIL, "alive": [EVIL], "waiting_for": [EVIL]}
     status |= {"isolated": [EVIL], "derated": {EVIL: 0.5}, "realtime_warnings": [EVIL], "commands_rejected": {EVIL: 1}}
     clock = operator.next("hal/clock")
-    state = {"tick": clock["tick"], "stamp_ns": clock["stamp_ns"], "controller": EVIL, "state": "Idle", "reason": EVIL}
+    state = {
+        "tick": clock["tick"],
+        "timestamp_ns": clock["timestamp_ns"],
+        "controller": EVIL,
+        "state": "Idle",
+        "reason": EVIL,
+    }
     with Stranger(robot.endpoint) as stranger:
         publisher = stranger.latch("hal/status", status)
         for _ in range(20):

@@ -45,10 +45,10 @@ class Controller(Hold):
 
 
 class Backend(SimBackend):
-    def sample(self, tick, stamp_ns):
+    def sample(self, tick, timestamp_ns):
         if tick == 30:
             DEEDS["%s"]()
-        return super().sample(tick, stamp_ns)
+        return super().sample(tick, timestamp_ns)
 """
 GONE, LATE = "control is gone", "lease of control expired"
 BY_CONTROLLER = {
@@ -90,7 +90,7 @@ def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str,
     ended = snakesim(
         tmp_path,
         *("run", "triplet", "--controller", chosen["controller"], "--backend", chosen["backend"]),
-        *("--pace", "realtime", "--set", "rate_hz=50", "--duration", "60"),
+        *("--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "60"),
         *("--out", str(out), "--endpoint", free_endpoint()),
     )
     summary = json.loads((out / "summary.json").read_bytes())

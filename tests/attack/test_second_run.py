@@ -22,12 +22,12 @@ TIMES = range(effort(1, 4))
 
 def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
     """A second run starts on the network of a disarmed robot; it must refuse, and the robot must stay as it is."""
-    armings = operator.next("hal/clock")["arming"]
+    armings = operator.next("hal/clock")["arm_session"]
     operator.forget()
     out = str(home / "second")
     second = snakesim(home, "run", *SHORT, "--backend", "sim", "--out", out, *network)
     seen = {heard.message["lifecycle"] for heard in operator.heard("hal/clock")}
-    assert "armed" not in seen and operator.next("hal/clock")["arming"] == armings, second.said
+    assert "armed" not in seen and operator.next("hal/clock")["arm_session"] == armings, second.said
     assert second.code in (1, 2), second.said
     assert "planar13" in second.said, f"the live robot is not named: {second.said}"
     assert "Traceback" not in second.said

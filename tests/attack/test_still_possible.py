@@ -53,14 +53,14 @@ def commanding(stranger: Stranger, epoch: int, target: float) -> AbstractContext
 
 def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_limits(robot: Robot) -> None:
     operator = robot.operator
-    about, armings = operator.newest("hal/description"), operator.next("hal/clock")["arming"]
+    about, armings = operator.newest("hal/description"), operator.next("hal/clock")["arm_session"]
     operator.forget()
     with Stranger(robot.endpoint) as stranger:
         stranger.receive("hal/clock", "sensor/joints", "hal/status", "hal/description")
         answer = stranger.ask("hal/lease", {"action": "acquire", "holder": "mallory", "priority": 255})[0]
         assert answer["ok"], answer
         operator.until(lambda: operator.lifecycle() == "disarmed", "disarmed, as the lease changes hands", 2.0)
-        assert operator.next("hal/clock")["arming"] == armings
+        assert operator.next("hal/clock")["arm_session"] == armings
         with commanding(stranger, answer["epoch"], 1e4):
             operator.until(lambda: operator.status()["ready_to_arm"], "ready to arm")
             assert stranger.request("arm", who="mallory")["ok"]

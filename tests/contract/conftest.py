@@ -9,7 +9,7 @@ import pytest
 from snakesim_can_backend.protocol.definitions import Frame, node_of
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Pace
+from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.contract.bench import Bench
 from tests.contract.drives import DrivesOfAnyFamily, DrivesOfModules
 
@@ -26,31 +26,31 @@ WHISKER = Path(__file__).parents[2] / "docs" / "whisker.py"
 OF_SENSORS = ("sensor", "sample", "contradicts_itself", "listed")  # clauses that a camera may concern
 LOOKS_AHEAD = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
-    'robot.sensors.range=[{name="front", beams=9, view_rad=2.0}]',
+    'robot.sensors.range=[{name="front", beams=9, fov_rad=2.0}]',
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
 WITHOUT_THE_DRIVER = "test_drives_"  # moteus does it otherwise; for buses in threads see tests/unit/hal/drivers
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 HEAD_OF_SERVOS = (
-    'robot.drive.family="odrive"',
-    'robot.joints.joint_3.family="dynamixel"',
-    'robot.joints.joint_4.family="dynamixel"',
+    'robot.drive.driver="odrive"',
+    'robot.joints.joint_3.driver="dynamixel"',
+    'robot.joints.joint_4.driver="dynamixel"',
 )
 ALL_FAMILIES = (
-    'robot.drive.family="odrive"',
-    'robot.joints.joint_2.family="moteus"',
-    'robot.joints.joint_3.family="dynamixel"',
-    'robot.joints.joint_4.family="dynamixel"',
+    'robot.drive.driver="odrive"',
+    'robot.joints.joint_2.driver="moteus"',
+    'robot.joints.joint_3.driver="dynamixel"',
+    'robot.joints.joint_4.driver="dynamixel"',
 )
-ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
+ON_VCAN = ('backend.channels=["vcan0"]', 'backend.emulators="process"')
 
 
 class InRealTime(MixedBackend):
     """Each bus in a thread of its own, where emulated drives in this process would let it be in turn."""
 
     @classmethod
-    def check(cls, config: RunConfig, settings: Any) -> tuple[Pace, ...]:
+    def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
         super().check(config, settings)
         return ("realtime",)
 

@@ -3,13 +3,13 @@
 from contextlib import ExitStack
 from typing import Any
 
+from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
-from snakesim_can_backend.moteus.twin import MoteusTwin
+from snakesim_can_backend.odrive.emulator import EmulatedOdrive
 from snakesim_can_backend.odrive.protocol import State
-from snakesim_can_backend.odrive.twin import OdriveTwin
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
+from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from tests.unit.can_backend.loop import chain_of
 
 POLL_S = 0.02
@@ -24,7 +24,7 @@ class DrivesOfAnyFamily:
     def enabled(self) -> list[bool]:
         found: dict[int, bool] = {}
         for line in self._lines:
-            found |= dict(zip(line.bus.joints, enabled_drives(line.drives._twin), strict=True))
+            found |= dict(zip(line.bus.joints, enabled_drives(line.drives._emulator), strict=True))
         return [found[joint] for joint in range(len(found))]
 
     def freeze_driver(self, seconds: float, sleep: Any) -> None:
@@ -35,7 +35,7 @@ class DrivesOfAnyFamily:
             self._backend._clock.robot_ns += round(seconds * 1e9)
             sleep(seconds)
             for line in self._lines:
-                line.drives._twin()
+                line.drives._emulator()
 
 
 class DrivesOfModules:
@@ -54,14 +54,14 @@ class DrivesOfModules:
         self._chain._step_to(self._chain._sync_time + round(seconds * 1e6))
 
 
-def enabled_drives(twin: Any) -> list[bool]:
-    """Of the emulated drives of one family, those that would follow a set-point."""
-    match twin:
-        case OdriveTwin():
-            return [axis.state == State.CLOSED_LOOP for axis in twin.axes]
-        case MoteusTwin():
-            return [controller.mode == MoteusMode.POSITION for controller in twin.controllers]
-        case DynamixelTwin():
-            return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in twin.servos]
+def enabled_drives(emulator: Any) -> list[bool]:
+    """Of the emulated drives of one driver type, those that would follow a setpoint."""
+    match emulator:
+        case EmulatedOdrive():
+            return [axis.state == State.CLOSED_LOOP for axis in emulator.axes]
+        case EmulatedMoteus():
+            return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
+        case EmulatedDynamixel():
+            return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
         case _:
-            raise TypeError(f"drives of an unknown family: {twin}")
+            raise TypeError(f"drives of an unknown driver type: {emulator}")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
@@ -43,11 +43,11 @@ class Liar(Workbench):
         super().__init__(config, settings)
         self.description = self.describes(self.description)
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
-        return Samples(self.reads(super().sample(tick, stamp_ns).joints))
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
+        return Samples(self.reads(super().sample(tick, timestamp_ns).joints))
 
-    def enact(self, set_points: SetPoints, lifecycle: Any) -> None:
-        super().enact(self.hears(set_points), lifecycle)
+    def enact(self, setpoints: Setpoints, lifecycle: Any) -> None:
+        super().enact(self.hears(setpoints), lifecycle)
 
     def describes(self, robot: Description) -> Description:
         return robot
@@ -55,7 +55,7 @@ class Liar(Workbench):
     def reads(self, joints: JointState) -> JointState:
         return joints
 
-    def hears(self, points: SetPoints) -> SetPoints:
+    def hears(self, points: Setpoints) -> Setpoints:
         return points
 
 
@@ -128,7 +128,7 @@ class NoisyDescription(Workbench):
 
 @reads("joints_carry_the_tick_and_stamp_that_were_asked_for")
 def stamped_by_itself(joints):
-    return replace(joints, stamp_ns=joints.stamp_ns + 1_000_000)
+    return replace(joints, timestamp_ns=joints.timestamp_ns + 1_000_000)
 
 
 @reads("every_vector_has_one_entry_a_joint")
@@ -156,10 +156,10 @@ def zero_for_unknown(joints):
 class OldReadingsAsNew(Workbench):
     held: Any = None
 
-    def sample(self, tick, stamp_ns):
+    def sample(self, tick, timestamp_ns):
         if tick % 8 == 0:
-            self.held = super().sample(tick, stamp_ns)
-        return Samples(replace(self.held.joints, tick=tick, stamp_ns=stamp_ns))
+            self.held = super().sample(tick, timestamp_ns)
+        return Samples(replace(self.held.joints, tick=tick, timestamp_ns=timestamp_ns))
 
 
 class WithPose(Liar):
@@ -167,9 +167,9 @@ class WithPose(Liar):
 
     ahead_ns = 0
 
-    def sample(self, tick, stamp_ns):
-        seen = pose(tick, stamp_ns + self.ahead_ns)
-        return Samples(super().sample(tick, stamp_ns).joints, {keys.POSE: seen})
+    def sample(self, tick, timestamp_ns):
+        seen = pose(tick, timestamp_ns + self.ahead_ns)
+        return Samples(super().sample(tick, timestamp_ns).joints, {keys.POSE: seen})
 
 
 @breaks("nothing_comes_that_is_not_listed")
@@ -193,10 +193,10 @@ class WithSonar(Liar):
     def describes(self, robot):
         return listing(robot, keys.ranges("sonar"))
 
-    def sample(self, tick, stamp_ns):
+    def sample(self, tick, timestamp_ns):
         sonar = Ranges(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=self.link,
             position_l=(0.0, 0.0, 0.0),
             orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -206,7 +206,7 @@ class WithSonar(Liar):
             range_max_m=2.0,
             range_m=[self.found_m],
         )
-        return Samples(super().sample(tick, stamp_ns).joints, {keys.ranges("sonar"): sonar})
+        return Samples(super().sample(tick, timestamp_ns).joints, {keys.ranges("sonar"): sonar})
 
 
 @breaks("every_sample_fits_the_robot")
@@ -222,7 +222,7 @@ class SaysTheFurthestForNothing(WithSonar):
 # --- modes and units -------------------------------------------------------------------------------------------
 
 
-def let_go(points: SetPoints) -> SetPoints:
+def let_go(points: Setpoints) -> Setpoints:
     """With all joints passive."""
     return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
@@ -234,7 +234,7 @@ def targets_in_degrees(points):
 
 @hears("position_mode_turns_the_joint_that_is_asked_and_no_other")
 def head_to_tail(points):
-    return SetPoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
+    return Setpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
 
 
 @hears("position_mode_turns_the_joint_that_is_asked_and_no_other", "torque_mode_pushes_with_the_torque_that_is_asked")
@@ -257,7 +257,7 @@ def one_mode_for_all(points):
 def holds_what_is_lost(points):
     held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
     target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
-    return SetPoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
+    return Setpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
 
 
 @hears("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
@@ -336,8 +336,8 @@ class MovesAfterAll(Liar):
         first = replace(robot.joints[0], modes=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY])
         return replace(robot, joints=[first, *robot.joints[1:]])
 
-    def enact(self, set_points, lifecycle):
-        super().enact(set_points, lifecycle)
+    def enact(self, setpoints, lifecycle):
+        super().enact(setpoints, lifecycle)
         self.angle[0] += 0.05
 
 
@@ -358,16 +358,16 @@ def zero_is_no_limit(points):
 class NoStops(Workbench):
     def __init__(self, config, settings):
         super().__init__(config, settings)
-        self.least_rad, self.most_rad = np.full_like(self.angle, -3.0), np.full_like(self.angle, 3.0)
+        self.lower_rad, self.upper_rad = np.full_like(self.angle, -3.0), np.full_like(self.angle, 3.0)
 
 
 @breaks("a_mode_switch_makes_no_jump")
 class JumpsOnSwitch(Workbench):
     """A change of mode starts with full torque."""
 
-    def enact(self, set_points, lifecycle):
+    def enact(self, setpoints, lifecycle):
         before = self.mode
-        super().enact(set_points, lifecycle)
+        super().enact(setpoints, lifecycle)
         self.torque = np.where(self.mode != before, 3.5, self.torque)
 
     def advance(self):
@@ -385,8 +385,8 @@ class RobotThatTrustsTheHost(Workbench):
     def check(config, settings):
         return ("realtime",)
 
-    def enact(self, set_points, lifecycle):
-        super().enact(set_points, "armed")
+    def enact(self, setpoints, lifecycle):
+        super().enact(setpoints, "armed")
 
 
 @breaks(
@@ -395,9 +395,9 @@ class RobotThatTrustsTheHost(Workbench):
     "a_controller_that_falls_silent_stops_the_joints_within_the_lease",
 )
 class GoesOnAfterArmed(Workbench):
-    def enact(self, set_points, lifecycle):
+    def enact(self, setpoints, lifecycle):
         if lifecycle == "armed" or (self.mode == Mode.PASSIVE).all():
-            super().enact(set_points, lifecycle)
+            super().enact(setpoints, lifecycle)
 
 
 @breaks("arming_again_goes_on_from_where_the_robot_is")
@@ -406,13 +406,13 @@ class TakesUpTheOldTarget(Workbench):
     armed_for = 0
     was_armed = False
 
-    def enact(self, set_points, lifecycle):
+    def enact(self, setpoints, lifecycle):
         armed = lifecycle == "armed"
         self.armed_for = self.armed_for + 1 if armed else 0
         resume = self.was_armed and armed and self.armed_for <= 6
-        super().enact(self.old if resume else set_points, lifecycle)
+        super().enact(self.old if resume else setpoints, lifecycle)
         if armed and not resume:
-            self.old = set_points
+            self.old = setpoints
         self.was_armed = self.was_armed or (not armed and self.old is not None)
 
 
@@ -420,9 +420,9 @@ class TakesUpTheOldTarget(Workbench):
 class NeverWakesAgain(Workbench):
     stopped = False
 
-    def enact(self, set_points, lifecycle):
+    def enact(self, setpoints, lifecycle):
         self.stopped = self.stopped or lifecycle in ("fault", "estop")
-        super().enact(set_points, "estop" if self.stopped else lifecycle)
+        super().enact(setpoints, "estop" if self.stopped else lifecycle)
 
 
 @breaks("a_healthy_robot_reports_no_fault")
@@ -452,8 +452,8 @@ FROZEN = "drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_a
 class EnablesWhatHasTripped(DrivesWorkbench):
     """Whatever it sends enables drives again."""
 
-    def enact(self, set_points, lifecycle):
-        super().enact(set_points, lifecycle)
+    def enact(self, setpoints, lifecycle):
+        super().enact(setpoints, lifecycle)
         self.enabled |= self.tripped
 
 
@@ -461,8 +461,8 @@ class EnablesWhatHasTripped(DrivesWorkbench):
 class ClearsATripBeforeItIsRead(DrivesWorkbench):
     """Any command that lets a drive go ends what its watchdog has latched."""
 
-    def enact(self, set_points, lifecycle):
-        super().enact(set_points, lifecycle)
+    def enact(self, setpoints, lifecycle):
+        super().enact(setpoints, lifecycle)
         if lifecycle != "armed":
             self.tripped[:] = False
 
@@ -488,10 +488,10 @@ class LetsGoAtOnce(DrivesWorkbench):
 class Creeps(Workbench):
     crept = 0.0
 
-    def enact(self, set_points, lifecycle):
+    def enact(self, setpoints, lifecycle):
         self.crept += 0.004 * (lifecycle == "armed")
-        beyond = [target + self.crept for target in set_points.target]
-        super().enact(dataclasses.replace(set_points, target=beyond), lifecycle)
+        beyond = [target + self.crept for target in setpoints.target]
+        super().enact(dataclasses.replace(setpoints, target=beyond), lifecycle)
 
 
 # --- closing ---------------------------------------------------------------------------------------------------
@@ -540,10 +540,10 @@ class ModulesThatTellThemselvesASimulator(Liar):
         super().advance()
         self.stepped_s = time.monotonic()
 
-    def sample(self, tick, stamp_ns):
+    def sample(self, tick, timestamp_ns):
         if self.stepped_s and time.monotonic() - self.stepped_s > 0.05:
-            raise BackendError("the modules have stopped: no set-point for 50 ms")
-        return super().sample(tick, stamp_ns)
+            raise BackendError("the modules have stopped: no setpoint for 50 ms")
+        return super().sample(tick, timestamp_ns)
 
 
 # --- as a plugin -----------------------------------------------------------------------------------------------

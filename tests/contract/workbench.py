@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_drivers.kit.braking import AT_REST_RAD_S
 from snakesim_drivers.kit.drive_backend import LATCHED
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
 DOCS = Path(__file__).parents[2] / "docs" / "backends.md"
@@ -46,7 +46,7 @@ class DrivesWorkbench(Workbench):
         self.braked_s = 0.0
         self.was: LifecycleState = "disarmed"
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
         was_latched, self.was = self.was in LATCHED, lifecycle
         if was_latched and lifecycle not in LATCHED:
             self.tripped[:] = self.reported[:] = False
@@ -57,8 +57,8 @@ class DrivesWorkbench(Workbench):
                 self.enabled = self.still_brakes()
             case _:
                 self.enabled[:] = False
-        modes = [mode if on else Mode.PASSIVE for mode, on in zip(set_points.mode, self.enabled, strict=True)]
-        super().enact(dataclasses.replace(set_points, mode=modes), lifecycle)
+        modes = [mode if on else Mode.PASSIVE for mode, on in zip(setpoints.mode, self.enabled, strict=True)]
+        super().enact(dataclasses.replace(setpoints, mode=modes), lifecycle)
 
     def may_be_enabled(self) -> Any:
         return ~self.tripped
@@ -107,13 +107,13 @@ class BusWorkbench(DrivesWorkbench):
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)
         joints = len(self.angle)
-        self.on_its_way: SetPoints | None = None
+        self.on_its_way: Setpoints | None = None
         self.lifecycle: LifecycleState = "disarmed"
         self.armed_for = 0
         self.samples = 0
         self.old = (np.zeros(joints), np.zeros(joints), np.zeros(joints))
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """The synchronisation: what was handed over acts from here on. Odd joints answer a period late."""
         if self.on_its_way is not None:
             self.armed_for = self.armed_for + 1 if self.lifecycle == "armed" else 0
@@ -121,7 +121,7 @@ class BusWorkbench(DrivesWorkbench):
             super().enact(self.on_its_way, self.lifecycle)
             self.mode = np.where(asleep, int(Mode.PASSIVE), self.mode)
             self.limit = np.round(self.limit, 2)
-        fresh = super().sample(tick, stamp_ns).joints
+        fresh = super().sample(tick, timestamp_ns).joints
         now = np.round(fresh.angle_rad, 4), np.round(fresh.velocity_rad_s, 3), np.round(fresh.torque_nm, 3)
         late = np.arange(len(self.angle)) % 2 == 1
         if self.samples == 0 and self.KNOWN_AT_ONCE:
@@ -138,11 +138,11 @@ class BusWorkbench(DrivesWorkbench):
             )
         )
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
         """Put it on the bus."""
         if not self.open:
-            super().enact(set_points, lifecycle)
-        self.on_its_way, self.lifecycle = set_points, lifecycle
+            super().enact(setpoints, lifecycle)
+        self.on_its_way, self.lifecycle = setpoints, lifecycle
 
 
 class RealTimeWorkbench(BusWorkbench):

@@ -56,7 +56,7 @@ def completes(machine: Machine, folder: Path, *arguments: str, backend: str = "c
     """A run in real time; again, because a computer that stutters stops a robot now and then."""
     said = [""]
     while "(exit code 0)" not in said[-1] and len(said) < 5:
-        said.append(run(machine, folder, *LISTENING, "--pace", "realtime", *arguments, backend=backend))
+        said.append(run(machine, folder, *LISTENING, "--clock-mode", "realtime", *arguments, backend=backend))
     assert "(exit code 0)" in said[-1], "\n".join(said)
 
 
@@ -68,18 +68,18 @@ def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: M
 
 
 @pytest.mark.parametrize(
-    ("family", "command", "of"),
+    ("driver", "command", "of"),
     [pytest.param("odrive", "odrives", "axes", marks=pytest.mark.slow), ("moteus", "moteus", "controllers")],
 )
 def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_says_they_are_mounted(
-    machine: Machine, tmp_path: Path, family: str, command: str, of: str
+    machine: Machine, tmp_path: Path, driver_type: str, command: str, of: str
 ) -> None:
     """ODrives on classic CAN; moteus on CAN FD, with ids of 29 bits."""
     built = ("robot.joints.joint_2.sign=-1", "robot.joints.joint_5.zero_rad=0.4")
-    gains = ("backend.kp_nm_per_turn=1000", "backend.kd_nm_s_per_turn=100") if family == "moteus" else ()
+    gains = ("backend.kp_nm_per_turn=1000", "backend.kd_nm_s_per_turn=100") if driver_type == "moteus" else ()
     sets = [word for text in (*built, *gains) for word in ("--set", text)]
     with drives(machine, tmp_path, of, command, "--pose", POSE, *sets):
-        completes(machine, tmp_path, "--duration", "4", *sets, backend=family)
+        completes(machine, tmp_path, "--duration", "4", *sets, backend=driver_type)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.1
 
 
@@ -91,7 +91,7 @@ def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpre
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
     with drives(machine, tmp_path, "modules", "modules"):
         beside = ("--set", "services.control.place=host", *LISTENING)
-        bad = ("--controller", "./bad.py:Controller", "--pace", "realtime", "--duration", "60", *beside)
+        bad = ("--controller", "./bad.py:Controller", "--clock-mode", "realtime", "--duration", "60", *beside)
         said = run(machine, tmp_path, *bad)
         assert "(exit code 1)" in said, said
         found = machine.run(SNAKESIM, "can", "scan", CHANNEL)
@@ -117,6 +117,6 @@ def test_channels_of_udp_multicast_are_buses_of_their_own(machine: Machine) -> N
 
 
 def test_its_own_modules_move_in_lockstep_as_on_any_bus(machine: Machine, tmp_path: Path) -> None:
-    said = run(machine, tmp_path, "--pace", "lockstep", "--duration", "2", "--set", 'backend.twins="process"')
+    said = run(machine, tmp_path, "--clock-mode", "lockstep", "--duration", "2", "--set", 'backend.emulators="process"')
     assert "(exit code 0)" in said, said
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.02

@@ -13,12 +13,12 @@ pytestmark = pytest.mark.e2e
 
 BESIDE = ("--set", "services.control.place=host")
 # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
-REALTIME = ("triplet", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "60", *BESIDE)
+REALTIME = ("triplet", "--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "60", *BESIDE)
 
 
 def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
     """As in a process of its own, and as in the one of all: test_in_process.py."""
-    arguments = ("triplet", "--duration", "2", "--pace", "lockstep")
+    arguments = ("triplet", "--duration", "2", "--clock-mode", "lockstep")
     _, apart = command.run_to_summary(tmp_path / "apart", *arguments)
     ended, beside = run_to_summary(tmp_path / "beside", *arguments, *BESIDE)
     assert ended.code == 0 and beside.command_digest == apart.command_digest

@@ -32,16 +32,16 @@ from snakesim_drivers.mounting import Mounting
 class Held(Workbench):
     """Drives that somebody turns by hand: their angles stand in a file."""
 
-    def sample(self, tick, stamp_ns):
+    def sample(self, tick, timestamp_ns):
         drives = np.array(json.loads(Path("drives.json").read_text()))
         self.angle = Mounting(self.robot.joint_table).joint_angle_rad(drives)
-        return super().sample(tick, stamp_ns)
+        return super().sample(tick, timestamp_ns)
 '''
 SCENARIO = """
 robot = "./snake.toml"
 scene = "flat"
 controller = "hold"
-pace = "realtime"
+clock_mode = "realtime"
 rate_hz = 50
 
 [start]
@@ -131,7 +131,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
     assert [joint.drive.sign for joint in found] == SIGN.tolist()
     assert [joint.drive.zero_rad for joint in found] == pytest.approx(ZERO_RAD.tolist(), abs=1e-3)
     ends = found[0].limits
-    assert (ends.least_rad, ends.most_rad) == pytest.approx((-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3)
+    assert (ends.lower_rad, ends.upper_rad) == pytest.approx((-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3)
     text = (home / "snake.toml").read_text()
     assert "# paper, section IV-A" in text and "sign = -1 # turned by hand, " in text
 

@@ -32,7 +32,7 @@ SCENARIO = """
 robot = "./snake.toml"
 scene = "flat"
 controller = "hold"
-pace = "lockstep"
+clock_mode = "lockstep"
 rate_hz = 100
 seed = 1
 
@@ -40,7 +40,7 @@ seed = 1
 on_route = false
 
 [services.control]
-lag_ticks = 2
+latency_ticks = 2
 """
 JOINTS = 3
 

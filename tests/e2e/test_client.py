@@ -22,7 +22,7 @@ pytestmark = pytest.mark.e2e
 
 CLIENT, STEER, STOP = (REPOSITORY / "docs" / name for name in ("client.py", "steer.py", "stop.py"))
 DEPTH = 8192
-ROBOT = ("triplet", "--set", "rate_hz=50", "--duration", "600", "--stay", "--pace")
+ROBOT = ("triplet", "--set", "rate_hz=50", "--duration", "600", "--stay", "--clock-mode")
 EXTERNAL = ("--set", "services.control.external=true")
 
 

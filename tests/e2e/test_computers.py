@@ -105,7 +105,7 @@ def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, compute
 
 @common
 def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
-    wrong = PROGRAM.replace('[parse_set(f"duration_s={sys.argv[2]}")]', '[parse_set("pace=realtime")]')
+    wrong = PROGRAM.replace('[parse_set(f"duration_s={sys.argv[2]}")]', '[parse_set("clock_mode=realtime")]')
     (tmp_path / "program.py").write_text(wrong)
     ended = call([sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path))
     assert ended.code == 1 and "errors.ConfigError" in ended.err and "must be 'lockstep'" in ended.err

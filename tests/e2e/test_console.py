@@ -27,7 +27,7 @@ from tests.unit.operator.console.rig import ReadyStop
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
 RUN = (
-    *("triplet", "--controller", "lateral_undulation", "--pace", "realtime", "--set", "rate_hz=50"),
+    *("triplet", "--controller", "lateral_undulation", "--clock-mode", "realtime", "--set", "rate_hz=50"),
     *("--duration", "600", "--stay", "--console"),
 )
 STOP_LIMIT_S = 10.0  # from the key to motors that are off: far above what it takes when no other tests run beside
@@ -190,8 +190,8 @@ def stop_in(tab: Tab, run: Running) -> float:
         from_ns, recent = None, deque[float](maxlen=5)
         while len(recent) < 5 or max(recent) > 0.02:
             for one in joints.drain():
-                from_ns = one.stamp_ns if from_ns is None else from_ns
-                assert one.stamp_ns < from_ns + COAST_LIMIT_S * 1e9, f"joints still move: {list(recent)} rad/s"
+                from_ns = one.timestamp_ns if from_ns is None else from_ns
+                assert one.timestamp_ns < from_ns + COAST_LIMIT_S * 1e9, f"joints still move: {list(recent)} rad/s"
                 recent.append(fastest_rad_s(one))
             time.sleep(0.005)
     return stopped_after_s

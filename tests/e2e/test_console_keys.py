@@ -17,7 +17,7 @@ pytestmark = pytest.mark.e2e
 LIMIT_S = 60.0
 T = TypeVar("T")
 REPEAT_S = 0.04  # of a held key
-RUN = ("peg_row", "--pace", "realtime", "--duration", "600", "--stay", "--console", "--no-record")
+RUN = ("peg_row", "--clock-mode", "realtime", "--duration", "600", "--stay", "--console", "--no-record")
 
 
 def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -> None:

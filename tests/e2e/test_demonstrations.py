@@ -14,7 +14,7 @@ from tests.harness.wait import wait_until
 from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
-RUN = ("clutter", "--pace", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
+RUN = ("clutter", "--clock-mode", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
 THEIRS = REPOSITORY / "build" / "lerobot"  # an environment of its own: lerobot brings PyTorch, 6 GB
 LEROBOT = "lerobot==0.4.4"
 LOADED = """

@@ -82,7 +82,7 @@ def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tu
     assert "Holm's correction for 2 comparisons" in ended.out
     (score,) = json.loads((home / "part" / "card.json").read_bytes())["scores"]
     assert (score["controller"], score["runs"], score["crossed"]) == ("hold", 2, 0)
-    assert score["medians"]["jam_ratio"] is not None and score["medians"]["solved_force_error"] is None
+    assert score["medians"]["jam_ratio"] is not None and score["medians"]["desired_force_error"] is None
 
 
 def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> None:
@@ -91,7 +91,7 @@ def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> No
     assert [row[2:4] for row in rows] == [["path_following", "2/2"], ["hold", "0/2"]] * 2
     assert done(out) == CASES and all((out / name).is_file() for name in TABLES)
     scores = json.loads((out / "card.json").read_bytes())["scores"]
-    assert all(0 < score["medians"]["planning_share"] <= 1 for score in scores)
+    assert all(0 < score["medians"]["planning_fraction"] <= 1 for score in scores)
     assert all(0 <= score["medians"]["form_closure"] <= 1 for score in scores)
 
 
@@ -136,17 +136,17 @@ STOPPED = {
         "workers, on this computer",
         "cases are done; the same command goes on with\n  --resume --out stopped",
     ),
-    "optimise": ("keeps all trials", "the same command goes on with\n  --storage stopped.db"),
+    "optimize": ("keeps all trials", "the same command goes on with\n  --storage stopped.db"),
     "train": ("generation 1:", "stopped/policy.onnx is the best policy until then, .* goes on with --resume"),
 }
 TYPED = {
     "evaluate": ("./quick.toml", "--fields", "400", "--out", "stopped"),
-    "optimise": ("peg_row", "--vary", "control.propulsion_n=5:40", "--goal", "advance_m", "--storage", "stopped.db"),
+    "optimize": ("peg_row", "--vary", "control.propulsion_n=5:40", "--goal", "advance_m", "--storage", "stopped.db"),
     "train": ("surveyed_clutter", "--duration", "0.2", "--population", "4", "--fields", "1", "--out", "stopped"),
 }
 
 
-@pytest.mark.parametrize("command", ["evaluate", pytest.param("optimise", marks=pytest.mark.slow), "train"])
+@pytest.mark.parametrize("command", ["evaluate", pytest.param("optimize", marks=pytest.mark.slow), "train"])
 def test_ctrl_c_ends_it_at_once_and_leaves_nothing_but_its_results(command: str, tmp_path: Path) -> None:
     (tmp_path / "quick.toml").write_text(SUITE)
     (tmp_path / "tmp").mkdir()
@@ -255,11 +255,11 @@ def test_a_sweep_runs_every_value(home: Path) -> None:
 
 @pytest.mark.slow
 def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Path) -> None:
-    given = ["optimise", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40", "--seed", "2"]
+    given = ["optimize", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40", "--seed", "2"]
     given += ["--goal", "path_distance_m", "--workers", "2"]
     first = snakesim(*given, "--trials", "2", cwd=home)
     assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
-    (kept,) = (home / "runs").glob("optimise-*.db")
+    (kept,) = (home / "runs").glob("optimize-*.db")
     assert f"runs/{kept.name} keeps all trials" in first.out, first.out + first.err
     more = snakesim(*given, "--storage", f"runs/{kept.name}", "--trials", "4", cwd=home)
     assert "holds 2 trials already" in more.out and "trial 4:" in more.out, more.out + more.err
@@ -273,7 +273,7 @@ def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Pat
 
 @pytest.mark.slow
 def test_a_search_on_a_row_of_a_suite_prints_an_evaluation(home: Path) -> None:
-    given = ["optimise", "./quick.toml", "--rows", "2", "--set", "controller=path_following", "--set", "duration_s=0.4"]
+    given = ["optimize", "./quick.toml", "--rows", "2", "--set", "controller=path_following", "--set", "duration_s=0.4"]
     given += ["--vary", "control.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1", "--seeds", "2"]
     found = snakesim(*given, "--storage", "row.db", cwd=home)
     _, said = found.out.split("best advance_m: ")

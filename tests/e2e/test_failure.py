@@ -20,9 +20,9 @@ pytestmark = pytest.mark.e2e
 LONG = ["triplet", "--controller", "hold", "--duration", "600"]
 
 
-@pytest.mark.parametrize("pace", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
-def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path: Path, pace: str) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--pace", pace) as run:
+@pytest.mark.parametrize("clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
+def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path: Path, clock_mode: str) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             statuses = session.reader(keys.STATUS, Status)
             wait_until(lambda: bool(statuses.drain()), "a status")
@@ -43,11 +43,11 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
     assert told_later.code == 1 and "lease of control expired" in told_later.out
 
 
-@pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
-def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, pace: str) -> None:
+@pytest.mark.parametrize("clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
+def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
-        "from snakesim_gnc.control.controller import Action, SetPoints\n"
+        "from snakesim_gnc.control.controller import Action, Setpoints\n"
         "from snakesim_gnc.control.hold import Hold\n"
         "from snakesim_hal.wire.messages import Mode\n\n\n"
         "class Wave(Hold):\n"
@@ -55,12 +55,12 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, pace
         "        if view.time_s < 0.5:\n"
         "            return super().update(view)\n"
         "        angles = list(view.joints.angle_rad)[:-1]\n"
-        "        return Action(SetPoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
+        "        return Action(Setpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
-    flags = ["--controller", "./wave.py:Wave", "--pace", pace, "--duration", "60"]
+    flags = ["--controller", "./wave.py:Wave", "--clock-mode", clock_mode, "--duration", "60"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     said = (
-        "controller ./wave.py:Wave (class Wave): SetPoints.mode has 12 values, must have 13: one a joint, "
+        "controller ./wave.py:Wave (class Wave): Setpoints.mode has 12 values, must have 13: one a joint, "
         "joint_1 to joint_13"
     )
     assert ended.code == 1 and summary.duration_s < 5.0  # not after the time that a stalled service is given
@@ -80,7 +80,7 @@ def test_a_controller_that_is_too_slow_is_named_as_the_cause_of_the_stop(tmp_pat
         "        time.sleep(0.1)\n"
         "        return super().update(view)\n"
     )
-    flags = ["--controller", "./slow.py:Slow", "--pace", "realtime", "--duration", "10"]
+    flags = ["--controller", "./slow.py:Slow", "--clock-mode", "realtime", "--duration", "10"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     assert ended.code == 1
     assert re.match(r"control: update\(\) took \d\d\d ms of 10 ms; lease of control expired", summary.ended)

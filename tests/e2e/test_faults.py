@@ -14,19 +14,19 @@ pytestmark = pytest.mark.e2e
 
 
 @pytest.mark.parametrize(
-    ("backend", "pace"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
+    ("backend", "clock_mode"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
 )
-def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, pace: str) -> None:
+def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, clock_mode: str) -> None:
     """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
     faults = ["duplicate:actuator/joints@0.5-1.5", "duplicate:sensor/joints@0.5-1.5", "slow:simulator@1-1.2=0.5"]
     flags = [word for fault in faults for word in ("--fault", fault)]
     ended, _ = run_to_summary(
-        tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--pace", pace, *flags
+        tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--clock-mode", clock_mode, *flags
     )
     record = RunRecord.load(tmp_path / "run").host
     assert ended.code == 0 and record.armed_ticks == 200
     replayed = record.rejected_commands["replayed"]
-    assert replayed == 100 if pace == "lockstep" else 90 <= replayed <= 110
+    assert replayed == 100 if clock_mode == "lockstep" else 90 <= replayed <= 110
     assert [text.partition(": ")[2] for text in record.injected] == [
         "duplicate:sensor/joints@0.5-1.5=1 begins",
         "slow:simulator@1-1.2=0.5 begins",
@@ -37,7 +37,17 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str
 
 @pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
 def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
-    arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--backend", backend]
+    arguments = [
+        "triplet",
+        "--controller",
+        "hold",
+        "--duration",
+        "600",
+        "--clock-mode",
+        "realtime",
+        "--backend",
+        backend,
+    ]
     with armed_run(tmp_path / "run", *arguments) as run:
         result = tell(run, "fault", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
         assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
@@ -56,7 +66,7 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
 
 
 def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
-    flags = ["--pace", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
+    flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
@@ -83,7 +93,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         "        return super().update(view)\n"
     )
     arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
-    arguments += ["--pace", "realtime", "--unchecked"]
+    arguments += ["--clock-mode", "realtime", "--unchecked"]
     loaded = [tmp_path / part for part in ("host", "control")]
     with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
@@ -92,7 +102,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         run.process.terminate()
         run.end()
     assert [file.read_text() for file in loaded] == ["", ""], "no process has the code that carries them out"
-    allowed = ("--set", "faults_allowed=true", "--duration", "0.5", "--out", str(tmp_path / "allowed"))
+    allowed = ("--set", "allow_fault_injection=true", "--duration", "0.5", "--out", str(tmp_path / "allowed"))
     snakesim("run", *arguments, *allowed, "--endpoint", free_endpoint(), cwd=tmp_path)
     assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
     ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)

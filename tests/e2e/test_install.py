@@ -153,7 +153,7 @@ ALONE = """
 robot = "planar13"
 scene = "flat"
 controller = "hold"
-pace = "lockstep"
+clock_mode = "lockstep"
 duration_s = 0.3
 
 [start]
@@ -204,7 +204,8 @@ def stops_and_arms(snakesim: Run) -> None:
     assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[report]" in ran.out, ran
     at = ("--endpoint", free_endpoint())
     stays = threading.Thread(
-        target=snakesim, args=("run", *WORKBENCH, "--pace", "realtime", "--duration", "8", "--stay", "--no-record", *at)
+        target=snakesim,
+        args=("run", *WORKBENCH, "--clock-mode", "realtime", "--duration", "8", "--stay", "--no-record", *at),
     )
     stays.start()
     wait_until(lambda: "armed" in snakesim("status", *at).out.replace("disarmed", ""), "an armed robot")
@@ -217,7 +218,15 @@ def stops_and_arms(snakesim: Run) -> None:
 def drives_modules(snakesim: Run) -> None:
     """The driver, on a bus with emulated modules."""
     assert "together" in snakesim("can", "load", "triplet").out
-    drives = ("--backend", "can", "--set", "backend.plant=inertia", "--no-record", "--endpoint", free_endpoint())
+    drives = (
+        "--backend",
+        "can",
+        "--set",
+        "backend.physics_model=inertia",
+        "--no-record",
+        "--endpoint",
+        free_endpoint(),
+    )
     ran = snakesim("run", "alone.toml", *drives)
     assert ran.code == 0, ran
 

@@ -35,11 +35,11 @@ class Told(Workbench):
 
     ticks = 0
 
-    def enact(self, set_points, lifecycle):
-        super().enact(set_points, lifecycle)
+    def enact(self, setpoints, lifecycle):
+        super().enact(setpoints, lifecycle)
         self.ticks += 1
-        told = {"tick": self.ticks, "lifecycle": lifecycle, "mode": set_points.mode, "target": set_points.target}
-        Path("new.json").write_text(json.dumps({**told, "limit_nm": set_points.torque_limit_nm}))
+        told = {"tick": self.ticks, "lifecycle": lifecycle, "mode": setpoints.mode, "target": setpoints.target}
+        Path("new.json").write_text(json.dumps({**told, "limit_nm": setpoints.torque_limit_nm}))
         Path("new.json").replace("told.json")
 """
 

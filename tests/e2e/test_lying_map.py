@@ -38,7 +38,7 @@ def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], 
         result = simulate(config)
     assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0) > 0.3
     record, last = result.record, result.record.worlds[-1]
-    nodes = record.nodes_w(record.row_at(last.stamp_ns * 1e-9))
+    nodes = record.nodes_w(record.row_at(last.timestamp_ns * 1e-9))
     assert nodes is not None
     truth, along = [placed.obstacle for placed in record.placed], nodes[-1] - nodes[-2]
     found = score(last.obstacles, truth, nodes[-1], float(np.arctan2(along[1], along[0])))
@@ -56,8 +56,8 @@ def test_perceived_is_the_true_map_and_to_the_bit_the_same_whatever_the_scene_fi
 
 
 def test_dead_reckoning_takes_no_pose_and_still_knows_where_it_is() -> None:
-    reported, _ = worlds("perceived", "mission.localisation=dead_reckoning")
-    assert all(world.pose_stamp_ns is None for world in reported)
+    reported, _ = worlds("perceived", "mission.localization=dead_reckoning")
+    assert all(world.pose_timestamp_ns is None for world in reported)
     sd_m = reported[-1].base_position_sd_m
     assert sd_m is not None and 0.0 < sd_m < 0.05
 

@@ -27,12 +27,12 @@ SCENARIO = """
 robot = "{robot}"
 scene = "plain.toml"
 controller = "{controller}"
-pace = "lockstep"
+clock_mode = "lockstep"
 duration_s = {seconds}
 [start]
 on_route = false
 [services.control]
-lag_ticks = 2
+latency_ticks = 2
 """
 
 

@@ -14,7 +14,18 @@ from tests.whole.command import snakesim, tell
 
 pytestmark = pytest.mark.e2e
 
-LONG = ("triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--set", "rate_hz=50", "--stay")
+LONG = (
+    "triplet",
+    "--controller",
+    "hold",
+    "--duration",
+    "600",
+    "--clock-mode",
+    "realtime",
+    "--set",
+    "rate_hz=50",
+    "--stay",
+)
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,7 @@ def robot(tmp_path: Path) -> str:
 
 
 def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robot: str) -> None:
-    run = ("peg_row", "--set", robot, "--duration", "600", "--stay", "--pace", "realtime")
+    run = ("peg_row", "--set", robot, "--duration", "600", "--stay", "--clock-mode", "realtime")
     with running(tmp_path / "run", *run) as started:
         started.wait_for(" of 600 s")  # armed, and moving
         with snakesim.Robot.connect(started.endpoint) as live:
@@ -90,8 +90,12 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
     assert type(whisker).__name__ == "Whisker" and whisker.bend_max_rad == 1.4
 
 
-BENT = "bend_rad=float(np.clip(bend_rad, -most_rad, most_rad))"
-LIES = {BENT: "bend_rad=7.0", "stamp_ns=stamp_ns": "stamp_ns=stamp_ns + 10**9", "link=self._mount.link": "link=99"}
+BENT = "bend_rad=float(np.clip(bend_rad, -upper_rad, upper_rad))"
+LIES = {
+    BENT: "bend_rad=7.0",
+    "timestamp_ns=timestamp_ns": "timestamp_ns=timestamp_ns + 10**9",
+    "link=self._mount.link": "link=99",
+}
 SAID = {
     "every_sample_survives_the_wire": "sensor/own/left: Whisker.bend_rad is 7.0",
     "no_sample_contradicts_itself": "sensor/own/left: bent by 7.0 rad, and it bends no further than 1.4 rad",

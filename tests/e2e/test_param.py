@@ -11,7 +11,7 @@ from tests.whole.command import snakesim
 
 pytestmark = pytest.mark.e2e
 
-LONG = ("peg_row", "--duration", "600", "--set", "rate_hz=50", "--pace", "realtime", "--stay")
+LONG = ("peg_row", "--duration", "600", "--set", "rate_hz=50", "--clock-mode", "realtime", "--stay")
 
 
 @pytest.fixture(scope="module")

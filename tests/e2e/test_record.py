@@ -23,7 +23,7 @@ from tests.whole import command
 pytestmark = pytest.mark.e2e
 
 # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
-LONG = ["triplet", "--controller", "hold", "--duration", "30", "--pace", "realtime", "--set", "rate_hz=50"]
+LONG = ["triplet", "--controller", "hold", "--duration", "30", "--clock-mode", "realtime", "--set", "rate_hz=50"]
 SHORT = ["triplet", "--duration", "5", "--seed", "7"]
 RATE_HZ = 50
 IN_ONE, LOCKED = ["--in-process"], "mount -o remount,ro ."

@@ -29,7 +29,7 @@ from tests.whole import command
 pytestmark = pytest.mark.e2e
 
 TRUSTED = "https://app.foxglove.dev"
-LONG = ["triplet", "--controller", "hold", "--duration", "7", "--pace", "realtime", "--set", "rate_hz=50"]
+LONG = ["triplet", "--controller", "hold", "--duration", "7", "--clock-mode", "realtime", "--set", "rate_hz=50"]
 
 
 def sighted_live(address: str, origin: str | None = None) -> list[str]:

@@ -57,7 +57,7 @@ for _name, _texts in DEFINED.items():
         ((_, _fields),) = get_types_from_msg(_text, f"{_name}{_part}").items()
         STORE.register({f"{_name}{_part}": _fields})
 ROUTER = '{mode: "router", listen: {endpoints: ["%s"]}, scouting: {multicast: {enabled: false}}}'
-RUN = ("clutter", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "rate_hz=50")
+RUN = ("clutter", "--clock-mode", "lockstep", "--duration", "600", "--stay", "--set", "rate_hz=50")
 
 
 @contextmanager
@@ -184,7 +184,7 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
 
 def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    late = ("run", "triplet", "--pace", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
+    late = ("run", "triplet", "--clock-mode", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
     with (
         ros_router(tmp_path) as (at, _),
         session_at(at) as session,
@@ -200,7 +200,16 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
 
 def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
     """Arm, command single joints, fall silent, stop, clear, disarm: all of it as a node of rmw_zenoh would."""
-    alone = ("triplet", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "services.control.external=true")
+    alone = (
+        "triplet",
+        "--clock-mode",
+        "lockstep",
+        "--duration",
+        "600",
+        "--stay",
+        "--set",
+        "services.control.external=true",
+    )
     with running(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
         bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
         with session_at(at) as session, background(tmp_path, *bridge):
@@ -229,7 +238,7 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
 
 def _tunes(ros: RosSide) -> None:
     """`ros2 param list`, `describe`, `set` and `get`."""
-    name = "control.lead_s"
+    name = "control.speed_kp_s"
     listed = ros.parameters("list_parameters", "ListParameters", [], 0)
     assert name in listed.result.names
     (about,) = ros.parameters("describe_parameters", "DescribeParameters", [name]).descriptors
@@ -241,7 +250,7 @@ def _tunes(ros: RosSide) -> None:
     assert (now.type, now.double_value, nothing.type) == (3, 0.3, 0)
     wanted = ros.parameter(name, -1.0)
     refused = ros.parameters("set_parameters_atomically", "SetParametersAtomically", [wanted]).result
-    assert not refused.successful and "lead_s" in refused.reason
+    assert not refused.successful and "speed_kp_s" in refused.reason
 
 
 def _sees(ros: RosSide) -> None:
@@ -307,8 +316,8 @@ def _steers(ros: RosSide, endpoint: str) -> None:
 
         def sent(ago_s: float) -> bool:
             """Whether a Twist that its node sent so long ago becomes an intent."""
-            stamp_ns = time.time_ns() - round(ago_s * 1e9)
-            ros.session.put(key, payload, attachment=struct.pack("<qqB16s", 7, stamp_ns, 16, bytes(range(16))))
+            timestamp_ns = time.time_ns() - round(ago_s * 1e9)
+            ros.session.put(key, payload, attachment=struct.pack("<qqB16s", 7, timestamp_ns, 16, bytes(range(16))))
             time.sleep(0.1)
             return bool(intents.drain())
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.e2e
 
 
 def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--pace", "lockstep")
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--clock-mode", "lockstep")
     assert ended.code == 0, ended.out + ended.err
     assert summary.path_distance_m is not None and summary.path_distance_m >= 0.5
     joints = [int(name.removeprefix("joint_")) for name in summary.propulsion_joints or []]
@@ -51,7 +51,17 @@ def starved(pid: int) -> Iterator[None]:
 
 
 def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_path: Path) -> None:
-    arguments = ["triplet", "--controller", "hold", "--duration", "60", "--pace", "realtime", "--set", "rate_hz=50"]
+    arguments = [
+        "triplet",
+        "--controller",
+        "hold",
+        "--duration",
+        "60",
+        "--clock-mode",
+        "realtime",
+        "--set",
+        "rate_hz=50",
+    ]
     with armed_run(tmp_path / "run", *arguments) as run, starved(run.part("control")):
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
@@ -59,18 +69,28 @@ def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_
     assert "; lease of control expired: " in ended and f"fault: {TOO_SLOW}" in run.said()
 
 
-@pytest.mark.parametrize("pace", [pytest.param("realtime", marks=pytest.mark.slow), "free"])
-def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
+@pytest.mark.parametrize("clock_mode", [pytest.param("realtime", marks=pytest.mark.slow), "free"])
+def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
     """Or the computer is found to be too slow, by measuring it: in these paces a lease is one of the wall clock."""
     # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
-    arguments = ["triplet", "--controller", "hold", "--duration", "2", "--pace", pace, "--set", "rate_hz=50"]
+    arguments = [
+        "triplet",
+        "--controller",
+        "hold",
+        "--duration",
+        "2",
+        "--clock-mode",
+        clock_mode,
+        "--set",
+        "rate_hz=50",
+    ]
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
-    assert summary.pace == pace
+    assert summary.clock_mode == clock_mode
     if ended.code:
         assert summary.ended.startswith(TOO_SLOW), ended.out + ended.err
     else:
         assert summary.ticks == 100
-    if pace == "realtime" and not ended.code:
+    if clock_mode == "realtime" and not ended.code:
         assert summary.overruns or summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
         assert summary.tick_times.keys() == {"cycle", "late", "read", "write"}
@@ -78,7 +98,7 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
 
 
 def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
-    short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--pace", "lockstep"]
+    short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--clock-mode", "lockstep"]
     ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)
     assert ended.code == 0, ended.out + ended.err
     assert summary.ended == "complete" and 1.0 < summary.duration_s < 7.0

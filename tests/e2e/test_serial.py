@@ -52,7 +52,7 @@ def pose(folder: Path) -> Iterator[str]:
 def run(folder: Path, pose: str, *arguments: str) -> Ended:
     """A run that holds its pose."""
     where = ("--set", 'backend.ports=["servos"]', "--set", f'backend.pose_listen="{pose}"')
-    slow = ("--set", "rate_hz=25", "--set", "backend.watchdog_s=0.5", "--pace", "realtime")
+    slow = ("--set", "rate_hz=25", "--set", "backend.watchdog_s=0.5", "--clock-mode", "realtime")
     hold = ("run", "triplet", "--backend", "dynamixel", "--controller", "hold", *where, *slow)
     return snakesim(*hold, "--endpoint", free_endpoint(), *arguments, cwd=folder)
 
@@ -81,4 +81,4 @@ def test_servos_that_stop_while_the_host_is_frozen_are_reported_and_stay_off(pos
     assert ended.code == 1 and record.lifecycle == "fault", ended.said
     stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
     assert len(stopped) == 13, record.faults
-    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"
+    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arm_session"

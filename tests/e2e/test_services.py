@@ -115,23 +115,25 @@ class Lost(MotionCapture):
 
 
 @pytest.mark.parametrize(
-    ("pace", "wrong"),
+    ("clock_mode", "wrong"),
     [
         ("lockstep", "array"),
         ("one", "number"),
         *(pytest.param(*row, marks=pytest.mark.slow) for row in (("realtime", "number"), ("one", "rotation"))),
     ],
 )
-def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(home: Path, pace: str, wrong: str) -> None:
+def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
+    home: Path, clock_mode: str, wrong: str
+) -> None:
     field, words = MALFORMED[wrong]
     lost = LOST.replace("{}", field)
     (home / "lab" / "lost.py").write_text(f"import msgspec\nimport numpy as np\n{SERVICE}{lost}")
     code = [*SHORT, "--duration", "60", "--set", "services.sensor.code=./lab/lost.py:Lost"]
-    if pace == "one":
+    if clock_mode == "one":
         ended, summary = in_process.run_to_summary(home / "run", *code)
         log = (home / "run" / WORDS).read_text()
     else:
-        ended, summary = run_to_summary(home / "run", *code, "--pace", pace)
+        ended, summary = run_to_summary(home / "run", *code, "--clock-mode", clock_mode)
         log = (home / "run" / "sensor.log").read_text()
     assert ended.code == 1 and summary.duration_s < 5.0  # it ends at once
     said = re.compile(
@@ -161,7 +163,7 @@ def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Pat
     (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
     flags = [*SHORT, "--set", "services.sensor.code=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
     ended, summary = run_to_summary(home / "run", *flags)
-    why = "waiting for guidance, which has no sensor/pose yet (mission.localisation=dead_reckoning does without"
+    why = "waiting for guidance, which has no sensor/pose yet (mission.localization=dead_reckoning does without"
     given_up = "not ready to arm within 3 s"
     for said in (summary.ended, ended.out):
         assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out

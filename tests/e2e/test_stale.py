@@ -22,7 +22,7 @@ TRIES = 4
 def undisturbed(out: Path, fault: str) -> tuple[Ended, RunSummary]:
     """A run with a fault; again when a computer that stutters has ended its lease of 50 ms, as it says or before."""
     for left in reversed(range(TRIES)):
-        flags = ("--pace", "realtime", "--duration", "6", "--fault", fault)
+        flags = ("--clock-mode", "realtime", "--duration", "6", "--fault", fault)
         ended, summary = run_to_summary(out, "triplet", *flags)
         if not left or (TOO_SLOW not in ended.out and (not summary.faults or stopped_after_s(out, summary) > FROM_S)):
             return ended, summary

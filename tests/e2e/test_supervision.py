@@ -81,9 +81,9 @@ def interrupt(run: Running) -> RunSummary:
     return summary_of(run.out)
 
 
-@pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
-def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--pace", pace, "--stay") as run:
+@pytest.mark.parametrize("clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
+def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             first, services = robot.reaches("armed"), pids(run, *SERVICES)
@@ -91,7 +91,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str)
             wait_until(lambda: robot.status().lease_epoch > first.lease_epoch + 1, "another host's lease", BACK_S)
             robot.is_ready()
             assert robot.status().lifecycle == "disarmed" and robot.status().commands_accepted == 0
-            assert robot.status().tick == 0 or pace == "realtime"
+            assert robot.status().tick == 0 or clock_mode == "realtime"
             assert pids(run, *SERVICES) == services  # they found the new host by themselves
             wait_until(lambda: robot.is_commanded(20), "commands to the new host")
         summary = interrupt(run)
@@ -101,7 +101,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str)
 
 
 def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot, before = Robot(session), run.part("control")
             os.kill(before, signal.SIGKILL)
@@ -121,7 +121,7 @@ def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_pat
 
 
 def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--pace", "realtime", "--stay", "--with-router") as run:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -147,7 +147,7 @@ def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> Non
 
 
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -175,7 +175,7 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
 
 def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
     frozen_soon = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
-    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--with-router", *frozen_soon) as run:
+    with running(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon) as run:
         run.wait_for("injected fault: freeze:host")
         frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
         assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]

@@ -23,7 +23,7 @@ from tests.harness.wait import wait_until
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[2] / "docs" / "steer.py"
 UP, LEFT = b"\x1b[A", b"\x1b[D"
-NOTHING = Intent(stamp_ns=0, who="nobody")
+NOTHING = Intent(timestamp_ns=0, who="nobody")
 
 
 class Terminal:
@@ -97,7 +97,7 @@ def lifecycle(session: Session) -> str:
 
 def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with running(out, "peg_row", "--pace", "realtime", "--duration", "300") as run:
+    with running(out, "peg_row", "--clock-mode", "realtime", "--duration", "300") as run:
         run.wait_for("Locomoting")
         with open_session(Link(run.endpoint, "planar13")) as session:
             intents, way = session.reader(keys.INTENT, Intent), Way(session)

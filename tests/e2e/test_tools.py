@@ -53,7 +53,7 @@ def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
 
 def test_a_closed_terminal_ends_a_run_in_order(tmp_path: Path) -> None:
     (ours, theirs), endpoint = pty.openpty(), free_endpoint()
-    run = ["run", "triplet", "--pace", "realtime", "--out", "run", "--endpoint", endpoint]
+    run = ["run", "triplet", "--clock-mode", "realtime", "--out", "run", "--endpoint", endpoint]
     process = subprocess.Popen(
         ["env", "--default-signal=HUP", "setsid", "--ctty", *SNAKESIM, *run],
         cwd=tmp_path,
@@ -81,7 +81,7 @@ INTERRUPTED = (
     ["status"],
     ["arm", "planar13", "sim"],
     ["modules", "triplet"],
-    ["run", "triplet", "--pace", "realtime", "--out", "run"],
+    ["run", "triplet", "--clock-mode", "realtime", "--out", "run"],
 )
 
 
@@ -123,7 +123,7 @@ def first_line_ran(pid: int) -> bool:
 
 
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
-    arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime"]
+    arguments = ["triplet", "--controller", "hold", "--duration", "600", "--clock-mode", "realtime"]
     with armed_run(tmp_path / "run", *arguments) as run:
         rate = command.tell(run, "echo", "sensor/joints", "--hz", "--count", "2")
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
@@ -163,7 +163,7 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     example = next(block for block in blocks if "class Wave" in block)
     assert len([line for line in example.splitlines() if line.strip()]) <= 24
     (tmp_path / "wave.py").write_text(f"import shape, queue\n{example}", encoding="utf-8")
-    (tmp_path / "shape.py").write_text("")  # a neighbour, which the file may import
+    (tmp_path / "shape.py").write_text("")  # a neighbor, which the file may import
     for name in ("random", "queue", "can", "calendar"):  # replace no module in any process of a run
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__)")
     flags = ("--duration", "2", "--in-process")

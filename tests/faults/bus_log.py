@@ -23,6 +23,6 @@ def commands(frames: list[Frame], action: Action) -> int:
     return sent.count(action)
 
 
-def set_points(frames: list[Frame]) -> int:
-    """How many set-points the driver sent."""
+def setpoints(frames: list[Frame]) -> int:
+    """How many setpoints the driver sent."""
     return sum(opcode_of(frame.id) == Opcode.SET_POINT for frame in frames)

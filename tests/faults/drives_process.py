@@ -16,22 +16,22 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_can_backend.bus.adapter import open_wire
+from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.family.backend import CanDriveBackend
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
-from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import TwinServer
-from snakesim_drivers.emulation.twin_body import TwinBody, make_plant
+from snakesim_drivers.emulation.emulated_body import EmulatedBody, make_physics_model
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_drivers.kit.drive_settings import body_of
-from snakesim_drivers.kit.drive_type import FamilyBackend, Part
-from snakesim_drivers.motion_capture.mocap_twin import PoseSender
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, Part
+from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
 from snakesim_hal.base.terminal import say
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, load
 from snakesim_hal.programs.preflight import backend_settings
-from snakesim_serial_backend.dynamixel.backend import twin_of
+from snakesim_serial_backend.dynamixel.backend import emulator_of
 from snakesim_serial_backend.dynamixel.command import named
 from snakesim_serial_backend.wire import Pty
 from tests.contract.drives import enabled_drives
@@ -84,38 +84,40 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
         return _modules(config, settings, pose, opened)
     parts: list[Part] = backend.parts(config, settings)
     body, clock = body_of(config, settings, config.backend, pose), Clock(config)
-    twins = [_twin(part, body.part(list(part.joints)), clock, opened) for part in parts]
+    emulators = [_emulator(part, body.part(list(part.joints)), clock, opened) for part in parts]
 
     def run() -> None:
-        for twin in twins:
-            twin()
+        for emulator in emulators:
+            emulator()
 
     def enabled() -> list[bool]:
         found: dict[int, bool] = {}
-        for part, twin in zip(parts, twins, strict=True):
-            found |= dict(zip(part.joints, enabled_drives(twin), strict=True))
+        for part, emulator in zip(parts, emulators, strict=True):
+            found |= dict(zip(part.joints, enabled_drives(emulator), strict=True))
         return [found[joint] for joint in range(len(found))]
 
     return Drives(run, enabled)
 
 
-def _twin(part: Part, body: TwinBody, clock: Clock, opened: ExitStack) -> Any:
-    """The emulated drives of one family, all on its first bus."""
-    family: type[FamilyBackend] = part.family
+def _emulator(part: Part, body: EmulatedBody, clock: Clock, opened: ExitStack) -> Any:
+    """The emulated drives of one driver type, all on its first bus."""
+    driver_type: type[DriverTypeBackend] = part.driver_type
     joints = list(part.joints.values())
-    if issubclass(family, CanDriveBackend):
+    if issubclass(driver_type, CanDriveBackend):
         wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
-        return opened.enter_context(closing(family.twin(joints, part.settings, body, [wire] * len(joints), clock.ns)))
+        return opened.enter_context(
+            closing(driver_type.emulator(joints, part.settings, body, [wire] * len(joints), clock.ns))
+        )
     ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
-    return twin_of(joints, part.settings, body, ptys * len(joints), clock)
+    return emulator_of(joints, part.settings, body, ptys * len(joints), clock)
 
 
 def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> Drives:
     wires = [opened.enter_context(closing(open_wire(c, FROM_HOST, settings.bit_rate))) for c in settings.channels]
     send_pose = opened.enter_context(closing(PoseSender(pose)))
-    plant = make_plant(config, settings, config.backend)
-    chain = ModuleChain(config, settings, plant, stepped=False, send_pose=send_pose)
-    server = TwinServer(wires, chain)
+    physics_model = make_physics_model(config, settings, config.backend)
+    chain = ModuleChain(config, settings, physics_model, stepped=False, send_pose=send_pose)
+    server = EmulatorServer(wires, chain)
     return Drives(
         lambda: server.run_due(time.monotonic_ns()), lambda: [slot.module.state in DRIVEN for slot in chain.slots]
     )

@@ -152,12 +152,12 @@ class Observer:
     # --- what is looked for -----------------------------------------------------------------------------------
 
     def first_safe(self, since_ns: int) -> Heard[AppliedCommand] | None:
-        """The first set-points after a time that are the host's own safe action."""
+        """The first setpoints after a time that are the host's own stop mode."""
         return next((h for h in self.applied if h.at_ns >= since_ns and h.message.sequence is None), None)
 
     def safe_after_ms(self, since_ns: int) -> float:
         """How long until then."""
-        return (self.until(lambda: self.first_safe(since_ns), "the safe action", 3.0).at_ns - since_ns) / 1e6
+        return (self.until(lambda: self.first_safe(since_ns), "the stop mode", 3.0).at_ns - since_ns) / 1e6
 
     def first_fault(self, since_ns: int) -> Status:
         """The first status after a time that tells a fault."""
@@ -226,7 +226,7 @@ class Observer:
         def follows() -> bool:
             return self.state() == "armed" and any(h.message.sequence is not None for h in self.applied)
 
-        self.until(lambda: follows() or self.state() == "fault", "commands applied after arming", 5.0)
+        self.until(lambda: follows() or self.state() == "fault", "commands applied after arm_session", 5.0)
         return self.state() != "fault"
 
     def _make_ready(self, limit_s: float) -> None:

@@ -18,11 +18,11 @@ Made by `make faults`{when}; do not edit. Raw results of every trial: [`faults.j
 
 **How.** Each row injects a fault, measures, and asserts, at least 20 times on each backend. The robot is the 13-joint
 snake of the shipped scenario `triplet` at 100 Hz in real time (T = {period:.0f} ms, lease {lease:.0f} ms), with host,
-guidance, navigation and control as processes of their own; `can` is the CAN driver with module twins on a virtual bus,
-if nothing else is said. The host is the product's own process in every row but those that say so.
+guidance, navigation and control as processes of their own; `can` is the CAN driver with emulated joint modules on a
+virtual bus, if nothing else is said. The host is the product's own process in every row but those that say so.
 
-**What the times are.** Upper bounds: from just before the injection until an observer has received the first set-points
-that are the host's own safe action (`hal/applied` without a sequence). The observer is a process of its own, with
+**What the times are.** Upper bounds: from just before the injection until an observer has received the first setpoints
+that are the host's own stop mode (`hal/applied` without a sequence). The observer is a process of its own, with
 real-time priority where the system allows it. The lease counts from the last good command, and is looked at once a
 period; so what must be done within the lease is done at most one period after its end.
 
@@ -61,7 +61,7 @@ def _lines(results: dict[tuple[str, str], Result]) -> Iterator[str]:
     yield from _summary(results)
     for heading in HEADINGS:
         yield f"## {heading.fault}\n"
-        yield f"Safe behaviour: {heading.expected}. Deadline: {heading.deadline}.\n"
+        yield f"Safe behavior: {heading.expected}. Deadline: {heading.deadline}.\n"
         yield f"| {' | '.join(COLUMNS)} |"
         yield f"|{'---|' * len(COLUMNS)}"
         for row in heading.rows:

@@ -28,7 +28,7 @@ PERIOD_S = 0.01
 
 def configuration(backend: str, **dotted: Any) -> RunConfig:
     """The triplet in real time at 100 Hz, for as long as anybody likes; `__` in a name stands for the dot."""
-    values = {"backend": backend, "pace": "realtime", "duration_s": 3600.0, **dotted}
+    values = {"backend": backend, "clock_mode": "realtime", "duration_s": 3600.0, **dotted}
     overrides = [Override(name.replace("__", "."), value, f"--{name}") for name, value in values.items()]
     return load("triplet", overrides).config
 

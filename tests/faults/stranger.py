@@ -71,7 +71,7 @@ class Stranger:
 
     def without_arming(self) -> None:
         """An answer to the newest state that names no arming."""
-        self.send(self.forged(arming=0))
+        self.send(self.forged(arm_session=0))
 
     def again(self, back: int) -> None:
         """The bytes of the controller's newest command (1), or of an older one."""

@@ -72,7 +72,7 @@ def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, place
         name,
         fault,
         "every module stops by itself, motor off, latched",
-        f"100 ms after the last set-point, in the module's own time{reported}",
+        f"100 ms after the last setpoint, in the module's own time{reported}",
         limit_ms,
         "ms",
         {"sim": NO_MODULES_LEFT, "can": measure},
@@ -87,7 +87,7 @@ def joint_row(name: str, kind: str, what: str) -> Row:
         name,
         f"a joint module: {about}",
         "fault names the joint, group to safe stop, latched",
-        "50 ms from right after the module's last good answer to the safe action on the bus",
+        "50 ms from right after the module's last good answer to the stop mode on the bus",
         50.0,
         "ms",
         {"sim": NO_MODULES, "can": partial(modules.at_host, kind, what)},
@@ -118,7 +118,7 @@ def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * P
         name,
         fault,
         "fault, group to safe stop, recovers only to disarmed",
-        f"{limit_ms:.0f} ms to the safe action on the bus",
+        f"{limit_ms:.0f} ms to the stop mode on the bus",
         limit_ms,
         "ms",
         {"sim": NO_BUS, "can": partial(modules.at_host, kind, what)},
@@ -135,7 +135,7 @@ def drive_row(
         name,
         fault,
         "fault, which names the joint if it is one; every motor off after the braking; none on again before the clear",
-        f"{limit_ms:.0f} ms to the safe action: {why}",
+        f"{limit_ms:.0f} ms to the stop mode: {why}",
         limit_ms,
         "ms",
         dict.fromkeys(DRIVE_TYPES, measure),
@@ -169,7 +169,7 @@ def flood_row(name: str, fault: str, flood: str) -> Row:
 def stop_row(name: str, fault: str, measure: Measure) -> Row:
     """An emergency stop while somebody attacks the network."""
     expected = "every joint is made safe at once, the stop is latched and confirmed to who asked"
-    return Row(name, fault, expected, f"{STOP_MS:.0f} ms from asking to the set-points", STOP_MS, "ms", both(measure))
+    return Row(name, fault, expected, f"{STOP_MS:.0f} ms from asking to the setpoints", STOP_MS, "ms", both(measure))
 
 
 HEADINGS: tuple[Heading, ...] = (
@@ -183,7 +183,7 @@ HEADINGS: tuple[Heading, ...] = (
             lease_row(
                 "controller_hung",
                 "control: interpreter busy, by the injector (which takes the request at the controller's next tick)",
-                controller.hung,
+                controller.suspended,
                 more_ms=PERIOD_MS,
             ),
         ),
@@ -200,14 +200,14 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
-        "drives stop by themselves; fault names the joint; no drive is enabled again before clear and arming",
+        "drives stop by themselves; fault names the joint; no drive is enabled again before clear and arm_session",
         "a watchdog, 100 ms; at 50 Hz (T = 20 ms) for the driver 3 T, and 100 ms for what drives report by themselves",
         (
             Row(
                 "drive_host_frozen",
                 "host: SIGSTOP for 1 s, then SIGCONT",
                 "every drive off by its own watchdog; each stop a fault that names its joint; none enabled again",
-                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before clear and arming",
+                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before clear and arm_session",
                 0.0,
                 "drives enabled again",
                 dict.fromkeys(DRIVE_TYPES, drives.host_frozen),
@@ -270,8 +270,8 @@ HEADINGS: tuple[Heading, ...] = (
         (
             Row(
                 "two_controllers",
-                "two writers at one gate, interleaved by chance",
-                "no set-point and no right for the second",
+                "two writers at one limiter, interleaved by chance",
+                "no setpoint and no right for the second",
                 "at once: with the call",
                 0.0,
                 "frames from the second",
@@ -357,7 +357,7 @@ HEADINGS: tuple[Heading, ...] = (
         ),
     ),
     Heading(
-        "one joint fails, and the robot file allows for it (`may_lose_joints = 1`)",
+        "one joint fails, and the robot file allows for it (`max_isolated_joints = 1`)",
         "that joint is let go, the others go on",
         "50 ms",
         (
@@ -369,7 +369,7 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "bus-off, error-passive, transmit queue full, interface down, receive overflow, babbling node, duplicate id",
-        "fault; recovers only to disarmed; duplicate refused at arming",
+        "fault; recovers only to disarmed; duplicate refused at arm_session",
         "2-3 T; flood 100 ms",
         (
             bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off"),
@@ -477,7 +477,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "the second ends with an error that names the robot; nothing is armed",
                 "-",
                 0.0,
-                "set-points not passive",
+                "setpoints not passive",
                 both(attacks.second_run),
             ),
         ),
@@ -491,9 +491,9 @@ HEADINGS: tuple[Heading, ...] = (
                 "host_restarts",
                 "host: SIGKILL while moving, started again",
                 "boots disarmed, refuses what was streamed before, moves nothing until armed",
-                "before the first set-points: none but passive ones until armed",
+                "before the first setpoints: none but passive ones until armed",
                 0.0,
-                "set-points not passive",
+                "setpoints not passive",
                 both(controller.host_restarts),
             ),
         ),

@@ -1,7 +1,7 @@
 """Frames on a CAN bus that nobody should send, while a driver opens the bus, arms its modules and drives them.
 
-Driver and module twins are the real ones, on a virtual bus; a third end of it sends. What may come of it is a fault,
-or a BackendError when the bus is opened: never another exception, and nothing that cannot be published.
+Driver and emulated joint modules are the real ones, on a virtual bus; a third end of it sends. What may come of it is a
+fault, or a BackendError when the bus is opened: never another exception, and nothing that cannot be published.
 """
 
 import random
@@ -32,7 +32,7 @@ from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
 
 PER_TICK = 40
 PER_OPENING = 2000  # frames until the bus is opened again, with the stranger on it
-ROBOT = config(pace="realtime", robot__sensors__contacts__rate_hz=50.0, robot__sensors__imu__rate_hz=50.0)
+ROBOT = config(clock_mode="realtime", robot__sensors__contacts__rate_hz=50.0, robot__sensors__imu__rate_hz=50.0)
 KINDS = ("again", "bit-flipped", "other node", "other message", "length", "random", "odd id")
 
 

@@ -70,12 +70,12 @@ def main() -> None:
         print(json.dumps(_ended(child, folder)), flush=True)
 
 
-def _be(arguments: list[str], cwd: Path, most_bytes: int) -> None:
+def _be(arguments: list[str], cwd: Path, max_bytes: int) -> None:
     """The command; it ends the process as it would end its own."""
     os.chdir(cwd)
     for descriptor, name in ((0, os.devnull), (1, "out"), (2, "err")):
         os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
-    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
+    resource.setrlimit(resource.RLIMIT_AS, (max_bytes, max_bytes))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
     from snakesim_operator.cli import main as snakesim
 

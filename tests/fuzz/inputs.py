@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_can_backend.twin import faults as twin_faults
+from snakesim_can_backend.emulator import faults as twin_faults
 from snakesim_drivers.motion_capture.mocap import MAX_BYTES, MocapReceiver
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
@@ -62,7 +62,7 @@ class Input:
     name: str
     seeds: list[bytes]
     take: Callable[[bytes], str]  # what became of a payload, in a word or two
-    most_bytes: int = LARGEST
+    max_bytes: int = LARGEST
 
 
 @dataclass
@@ -77,7 +77,7 @@ def run(inputs: list[Input], payloads: int, seed: int) -> dict[str, Outcome]:
     """So many payloads into each. Raises whatever an input raises that it must not."""
     outcomes: dict[str, Outcome] = {}
     for number, one in enumerate(inputs):
-        maker = TextMaker(random.Random(seed * 1000 + number), one.seeds, one.most_bytes)
+        maker = TextMaker(random.Random(seed * 1000 + number), one.seeds, one.max_bytes)
         outcome = outcomes[one.name] = Outcome()
         for _ in range(payloads):
             kind, payload = maker.make()
@@ -113,7 +113,7 @@ def all_inputs(folder: Path) -> Iterator[list[Input]]:
 def mocap() -> Iterator[Input]:
     """Motion capture: a datagram by UDP, as a stranger would send it, and a good one after it."""
     now_ns = 0
-    receiver = MocapReceiver("127.0.0.1:0", 0.01, lambda _stamp_ns: now_ns)
+    receiver = MocapReceiver("127.0.0.1:0", 0.01, lambda _timestamp_ns: now_ns)
     host, _, port = receiver.address.rpartition(":")
     with closing(receiver), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
 
@@ -168,8 +168,8 @@ def stop_port() -> Iterator[Input]:
         yield Input("stop port", [REQUEST + bytes(16) + who for who in (b"", b"a person", b"x" * 64)], take, 60_000)
 
 
-def _pose(stamp_ns: int, *, reported: bool = True) -> bytes:
-    plain = {"stamp_ns": stamp_ns, "position_w": [0.1, 0.2, 0.3], "orientation_wxyz": [1, 0, 0, 0]}
+def _pose(timestamp_ns: int, *, reported: bool = True) -> bytes:
+    plain = {"timestamp_ns": timestamp_ns, "position_w": [0.1, 0.2, 0.3], "orientation_wxyz": [1, 0, 0, 0]}
     velocities = {"velocity_w": [0.0, 0.1, 0.0], "angular_velocity_w": [0.0, 0.0, 1.0]}
     return msgspec.json.encode({**plain, **(velocities if reported else {})})
 

@@ -1,7 +1,7 @@
 """Fuzzing of a robot that runs: real processes, a real network, a stranger who sends, and a stopwatch.
 
 First the run is left alone, then the stranger sends; both for about the same time. What is compared: processes, logs,
-memory, overruns, commands that were taken, who commands, and every set-point that went to the motors.
+memory, overruns, commands that were taken, who commands, and every setpoint that went to the motors.
 """
 
 import os
@@ -29,7 +29,7 @@ from tests.harness.processes import parts_of, processes_of
 from tests.harness.wait import wait_until
 
 ROBOT = "planar13"
-SCENARIO = ("triplet", "--controller", "hold", "--pace", "realtime", "--duration", "86400")
+SCENARIO = ("triplet", "--controller", "hold", "--clock-mode", "realtime", "--duration", "86400")
 LOOK_S = 0.5
 SETTLED_TICKS = 20  # after arming: until then it is the host that holds the angles, then the controller
 WARM_UP = 0.1  # of the stretch: until then, memory may grow
@@ -185,7 +185,7 @@ def _stranger(endpoint: str, request: Request) -> Iterator[subprocess.Popen[byte
 
 
 def _foreign(out: Path, record: HostRecord) -> list[str]:
-    """Set-points that the holding controller did not ask for."""
+    """Setpoints that the holding controller did not ask for."""
     found = [f"fault {fault.what}: {fault.cause}" for fault in record.faults]
     _, box = read_black_box(out / BLACK_BOX)
     modes, targets = box["mode"], box["target"]
@@ -195,7 +195,7 @@ def _foreign(out: Path, record: HostRecord) -> list[str]:
         moved = np.flatnonzero((targets != targets[-1]).any(axis=1))
         off = float(np.abs(targets - targets[-1]).max())
         if moved[-1] > SETTLED_TICKS:
-            found.append(f"set-points that nobody asked for in {len(moved)} ticks, up to {off:.3g} rad away")
+            found.append(f"setpoints that nobody asked for in {len(moved)} ticks, up to {off:.3g} rad away")
     return found
 
 

@@ -73,7 +73,7 @@ def pass_tick(hal: Rig) -> None:
     hal.now_ns += PERIOD_NS // 4
     hal.tick += 1
     hal.authority.expire(hal.now_ns, hal.tick)
-    assert all(abs(target) <= 5.0 for target in hal.authority.decide().set_points.target)
+    assert all(abs(target) <= 5.0 for target in hal.authority.decide().setpoints.target)
 
 
 def run(payloads: int, seed: int) -> Report:

@@ -46,9 +46,9 @@ def flipped(rng: random.Random, payload: bytes) -> bytes:
 class TextMaker:
     """Makes one payload after the other; the same ones for the same random numbers."""
 
-    def __init__(self, rng: random.Random, seeds: Sequence[bytes], most_bytes: int = LARGEST) -> None:
-        """seeds: valid ones; most_bytes: none is longer."""
-        self._rng, self._seeds, self._most = rng, [seed for seed in seeds if seed], most_bytes
+    def __init__(self, rng: random.Random, seeds: Sequence[bytes], max_bytes: int = LARGEST) -> None:
+        """seeds: valid ones; max_bytes: none is longer."""
+        self._rng, self._seeds, self._most = rng, [seed for seed in seeds if seed], max_bytes
         self._kinds: dict[str, Callable[[bytes], bytes]] = {
             "valid": lambda seed: seed,
             "random": lambda seed: rng.randbytes(rng.randrange(300)),

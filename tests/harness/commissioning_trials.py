@@ -17,8 +17,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from snakesim_drivers.emulation.emulated_body import EmulatedBody, Motion, make_physics_model
 from snakesim_drivers.emulation.mounted import Mounted
-from snakesim_drivers.emulation.twin_body import Motion, TwinBody, make_plant
 from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.identify import Identify
@@ -223,13 +223,17 @@ def _shaken(
 ) -> tuple[dict[str, Floats], Floats]:
     """Return the columns of a record of the controller on emulated drives, and what the gyros of the links measured.
 
-    Bus and host are left out, so that a hundred trials take minutes. Latencies are whole steps of the plant.
+    Bus and host are left out, so that a hundred trials take minutes. Latencies are whole steps of the physics model.
     """
-    settings = BodySettings(mounted=dict(truth), plant_settings=config.backends["can"]["plant_settings"])
-    plant = make_plant(config, settings, "can")
+    settings = BodySettings(
+        mounted=dict(truth), physics_model_settings=config.backends["can"]["physics_model_settings"]
+    )
+    physics_model = make_physics_model(config, settings, "can")
     joints = config.robot.joint_table
-    body = TwinBody(Motion(config, plant, truth, None), range(len(joints)))
-    robot = describe(config.robot, backend="twin", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash="")
+    body = EmulatedBody(Motion(config, physics_model, truth, None), range(len(joints)))
+    robot = describe(
+        config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
+    )
     controller = Identify(robot, msgspec.convert(config.control_settings, Identify.Settings))
     noise = np.random.default_rng(config.seed).standard_normal
     sensor = config.robot.sensors.joints
@@ -239,8 +243,8 @@ def _shaken(
     in_truth = [joint.motor.torque_constant_nm_per_a or 1.0 for joint in body.joints]
     as_measured = np.array(by_file) / np.array(in_truth)
     period_s = config.period_ns * 1e-9
-    steps = round(period_s / plant.step_s)
-    late = [round(one / plant.step_s) for one in latency_s]
+    steps = round(period_s / physics_model.step_s)
+    late = [round(one / physics_model.step_s) for one in latency_s]
     imu_ticks = round(config.rate_hz / IMU_RATE_HZ)
     waiting: dict[int, list[tuple[int, float]]] = defaultdict(list)  # step -> joint and target
     ticks = round(config.duration_s * config.rate_hz)
@@ -248,16 +252,16 @@ def _shaken(
     link_rates = np.full((ticks, len(joints) + 1, 3), np.nan)
     for tick in range(ticks):
         reporting = [i for i in range(len(joints)) if tick % imu_ticks == 7 * i % imu_ticks]
-        imu = plant.imu() if reporting else None
+        imu = physics_model.imu() if reporting else None
         if imu is not None:
             for i in reporting:
                 rate = np.array(imu.angular_velocity_rad_s[list(imu.link).index(i + 1)])
                 link_rates[tick, i + 1] = rate + GYRO_NOISE_RAD_S * noise(3)
-        state = np.stack((plant.angle_rad, plant.velocity_rad_s, body.motors.torque_nm * as_measured))
+        state = np.stack((physics_model.angle_rad, physics_model.velocity_rad_s, body.motors.torque_nm * as_measured))
         angle, velocity, torque = (state + sigma[:, None] * noise(state.shape)).tolist()
         joint_state = JointState(
             tick=tick,
-            stamp_ns=tick * config.period_ns,
+            timestamp_ns=tick * config.period_ns,
             angle_rad=angle,
             velocity_rad_s=velocity,
             torque_nm=torque,
@@ -265,7 +269,7 @@ def _shaken(
             age_ns=[0] * len(joints),
         )
         view = View(tick, tick * period_s, period_s, joint_state, None, None)
-        target = list(controller.update(view).set_points.target)
+        target = list(controller.update(view).setpoints.target)
         for name, values in zip(rows, (angle, velocity, torque, target), strict=True):
             rows[name].append(values)
         for i in range(len(joints)):
@@ -275,7 +279,7 @@ def _shaken(
                 motor, limits = joints[i].motor, joints[i].limits
                 gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, limits.speed_rad_s
                 body.drive(i, Mode.POSITION, target_rad, limits.torque_nm, *gains)
-            body.advance_to((step + 1) * plant.step_s * 1e6)
+            body.advance_to((step + 1) * physics_model.step_s * 1e6)
     return {name: np.array(values) for name, values in rows.items()}, link_rates
 
 

@@ -11,7 +11,7 @@ PROGRAMS = {
     "snakesim_hal.programs.host_program": "host",
     "snakesim_hal.programs.router_program": "router",
     "snakesim_operator.recording.process": "recorder",
-    "snakesim_can_backend.twin": "twins",
+    "snakesim_can_backend.emulator": "emulators",
 }
 
 

@@ -15,7 +15,7 @@ from snakesim_operator.features.lab.lab_file import EXAMPLE
 from tests.harness.command import call
 
 ROBOTS = {
-    "twin": 'can = ["vcan0"]',
+    "emulator": 'can = ["vcan0"]',
     "odrive": 'backend = "odrive"\ncan = ["can1"]',
     "moteus": 'backend = "moteus"\ncan = ["can2", "vcan1"]',
     "dynamixel": 'backend = "dynamixel"\nserial = ["/dev/ttyUSB0"]',

@@ -19,7 +19,7 @@ pytestmark = [
     pytest.mark.timeout(400),
     pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root"),
 ]
-SCENARIO = ("triplet", "--pace", "lockstep", "--duration", "1")
+SCENARIO = ("triplet", "--clock-mode", "lockstep", "--duration", "1")
 LIMIT_S = 120.0
 
 

@@ -1,7 +1,7 @@
 """Everything that docs/lab.md asks its reader to type is typed here, on four machines, as printed.
 
-Only the machine's `/etc/snakesim` is another folder here, the address of the hub is that of its namespace, and the pace
-is lockstep, because several robots in real time share a test machine.
+Only the machine's `/etc/snakesim` is another folder here, the address of the hub is that of its namespace, and the
+clock mode is lockstep, because several robots in real time share a test machine.
 """
 
 import os
@@ -66,7 +66,7 @@ def typed(machine: Machine, script: str, folder: Path) -> None:
 def here(script: str, folder: Path, machine: str) -> str:
     """The script with this machine's folder, in lockstep."""
     return script.replace("/etc/snakesim", f"{folder}/etc/{machine}").replace(
-        "--backend sim", "--backend sim --pace lockstep"
+        "--backend sim", "--backend sim --clock-mode lockstep"
     )
 
 

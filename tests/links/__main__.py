@@ -74,9 +74,9 @@ def held(condition: Condition, trials: int) -> str:
         time.sleep(WRITTEN_S)
         speed, latency = moved(Path(folder))
     names = ", ".join(f"{name} {ended.count(name)}" for name in dict.fromkeys(ended)) or "-"
-    median_s, least_s = statistics.median(armed_s), min(armed_s)
+    median_s, min_s = statistics.median(armed_s), min(armed_s)
     kept = sum(seconds >= ARMED_S for seconds in armed_s)
-    return f"| {condition.name} | {kept} of {trials} | {median_s:.1f} | {least_s:.2f} | {names} | {speed} | {latency} |"
+    return f"| {condition.name} | {kept} of {trials} | {median_s:.1f} | {min_s:.2f} | {names} | {speed} | {latency} |"
 
 
 def moved(folder: Path) -> tuple[str, str]:

@@ -17,7 +17,7 @@ from tests.e2e.command import SNAKESIM
 from tests.machines import Machine, Radio, radio, wire
 
 SCENARIO = "triplet"
-CHANGES = ("pace=realtime", "duration_s=86400")
+CHANGES = ("clock_mode=realtime", "duration_s=86400")
 START_LIMIT_S = 60.0
 
 

@@ -38,7 +38,7 @@ Change = Callable[[], object]  # makes one change, in place
 class Mutant:
     """One change of one file."""
 
-    file: str  # such as gate.py
+    file: str  # such as limiter.py
     where: str  # the function or class around it
     line: int
     change: str  # before -> after, and the statement that it is in

@@ -15,7 +15,7 @@ TESTS = Path("tests/unit/hal")
 # The tests of a file first, quick ones before thorough ones: most mutants die in the first second.
 AUTHORITY = ("test_authority_lease.py", "test_authority_arming.py", "test_authority_stops.py")
 TRIED_BY = {
-    "gate.py": ("test_gate.py", "test_gate_limits.py", *AUTHORITY, "test_authority_machine.py"),
+    "limiter.py": ("test_gate.py", "test_gate_limits.py", *AUTHORITY, "test_authority_machine.py"),
     "lease.py": ("test_lease.py", *AUTHORITY, "test_authority_machine.py"),
     "lifecycle.py": ("test_lifecycle.py", "test_arming.py", *AUTHORITY, "test_authority_machine.py"),
     "authority.py": (*AUTHORITY, "test_isolation.py", "test_authority_machine.py"),

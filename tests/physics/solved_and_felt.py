@@ -14,9 +14,9 @@ import numpy as np
 
 import snakesim
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.felt_force import FELT_OVER_S
+from snakesim_hal.model.measured_force import FELT_OVER_S
 from snakesim_hal.wire.messages import ControlState
-from snakesim_operator.results.came_true import ASKED_N, EMPTY_N
+from snakesim_operator.results.force_tracking import ASKED_N, EMPTY_N
 from snakesim_sim_backend.sensors.contacts import ContactReader
 
 SCENARIOS = ("triplet", "peg_row")
@@ -127,19 +127,19 @@ def causes(scenario: str, controller: str, **options: Any) -> str:
 
 
 def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
-    """Asked and felt forces, (n_states, n_obstacles) each; felt: mean over 50 ms, centred so long after asking."""
+    """Asked and felt forces, (n_states, n_obstacles) each; felt: mean over 50 ms, centered so long after asking."""
     names = sorted({*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)})
     window = round(FELT_OVER_S / STEP_S)
     asked, felt = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
     for j, name in enumerate(names):
         sums = np.concatenate(([0.0], np.cumsum(forces.get(name, np.zeros(1)))))
         for i, state in enumerate(states):
-            begin = round((1e-9 * state.stamp_ns + shift_s) / STEP_S) - window // 2
+            begin = round((1e-9 * state.timestamp_ns + shift_s) / STEP_S) - window // 2
             first, last = (min(max(k, 0), len(sums) - 1) for k in (begin, begin + window))
             felt[i, j] = (sums[last] - sums[first]) / window
     column = {name: j for j, name in enumerate(names)}
     for i, state in enumerate(states):
-        for point, force_n in zip(state.push_points, state.solved_force_n, strict=True):
+        for point, force_n in zip(state.push_points, state.desired_force_n, strict=True):
             if point.obstacle is not None:
                 asked[i, column[point.obstacle]] += force_n
     return asked, felt

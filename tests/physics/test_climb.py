@@ -17,5 +17,5 @@ def test_a_whole_snake_climbs_over_a_step(height_m: float) -> None:
 
 
 def test_a_step_that_it_may_not_climb_stops_it() -> None:
-    low = ("mission.largest_climb_m=0.04", "scene.step.0.position_m=[2.3,0.0]", "control.search_after_s=0.0")
+    low = ("mission.max_climb_m=0.04", "scene.step.0.position_m=[2.3,0.0]", "control.search_after_s=0.0")
     assert run(configure("mamba_step", *low), duration_s=6.0).moved_m < 1.0

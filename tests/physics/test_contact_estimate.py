@@ -52,7 +52,7 @@ class Score:
 def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
     """Of the estimates in a run of a scenario. settings: KEY=VALUE, or -KEY to leave it out."""
     result, (robot, seen) = Score(), watched(scenario, *settings)
-    nothing = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    nothing = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     for samples, true in seen:
         imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
         assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
@@ -73,8 +73,8 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
     class Watched(SimBackend):
         """The backend, with a look at what is true."""
 
-        def sample(self, tick: int, stamp_ns: int) -> Samples:
-            samples = super().sample(tick, stamp_ns)
+        def sample(self, tick: int, timestamp_ns: int) -> Samples:
+            samples = super().sample(tick, timestamp_ns)
             if tick >= FROM_TICK and tick % EVERY == 0:
                 seen.append((samples, true_pushes(self.describe(), self.true_state())))
             return samples
@@ -107,7 +107,7 @@ def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
 
 
 def together(found: list[Push]) -> list[Push]:
-    """Neighbours on one side are added up."""
+    """Neighbors on one side are added up."""
     merged: list[Any] = []
     for place, side, force in sorted(found):
         same = [push for push in merged if push[1] == side and place - push[0] < NEAR_M]

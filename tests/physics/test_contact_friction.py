@@ -40,7 +40,7 @@ class Pressed:
         return float(self.data.qvel[0])
 
     @property
-    def felt_w(self) -> Floats:
+    def measured_w(self) -> Floats:
         """The wall's force on the body."""
         return np.sum([touch.force_w for touch in self._touches.read()], axis=0)
 
@@ -53,7 +53,7 @@ def test_a_body_that_slides_along_a_wall_is_braked_by_mu_times_what_presses_it_o
     before, pushes = body.speed_m_s, []
     for _ in range(100):
         body.for_s(0.002)
-        pushes.append(body.felt_w)
+        pushes.append(body.measured_w)
     normal, rub = np.array(pushes)[:, 1], np.array(pushes)[:, 0]
     pressed_n = PRESS_N * body.links
     assert before - body.speed_m_s == pytest.approx(0.2 * MU * pressed_n / body.mass_kg, rel=0.01)
@@ -129,7 +129,7 @@ def test_rolled_up_a_snake_whose_links_rub_comes_to_rest(friction: float) -> Non
 def test_on_a_slope_it_stands_below_the_ground_s_friction_and_slides_above(slope: float, slides_m_s2: float) -> None:
     """The ground is level but for 10 um, and gravity is turned."""
     uneven = {"height_m": 1e-5, "wavelength_m": 0.8, "area_m": 6.0}
-    config = make_config(scene={"ground": {"friction": 0.4, "uneven": uneven}})
+    config = make_config(scene={"ground": {"friction": 0.4, "heightfield": uneven}})
     sim, data, physics = lie_down(config, SimSettings())
     physics.step(250)
     sim.model.opt.gravity[0] = slope * G

@@ -6,7 +6,7 @@ import pytest
 
 import snakesim
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.came_true import came_true
+from snakesim_operator.results.force_tracking import force_tracking
 
 ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.peg_friction": 0.3}
 FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
@@ -27,7 +27,7 @@ def test_what_is_asked_of_obstacles_comes_true_while_the_body_moves(
     scenario: str, also: dict[str, Any], correlation: float, error: float, empty: float
 ):
     result = snakesim.run(scenario, controller="obstacle_aided", duration=6, set=also)
-    found = came_true(result.record.control)
+    found = force_tracking(result.record.control)
     assert found is not None and found.correlation is not None
     assert found.correlation > correlation
     assert found.median_error < error

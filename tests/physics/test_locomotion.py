@@ -1,4 +1,4 @@
-"""Whole runs of the shipped scenarios in one process, with noise, gate and lockstep schedule: where the snake gets."""
+"""Whole runs of the shipped scenarios in one process, with noise, limiter and lockstep: where the snake gets."""
 
 from functools import cache
 from itertools import groupby, pairwise
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scene import Cylinder, route_of
-from snakesim_hal.safety.gate import bumpless_target
+from snakesim_hal.safety.limiter import bumpless_target
 from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import known
 from tests.whole_run import Run, configure, run
@@ -60,7 +60,7 @@ def test_without_a_world_or_a_trajectory_it_stands_still_and_then_goes_on(what: 
     assert held.max() < 0.5 * np.abs(whole.record.torque_nm[150:200]).max()
     steps = np.abs(np.diff(whole.record.target, axis=0))[190:460]
     angles = (whole.record.mode[1:] == Mode.POSITION)[190:460] & (whole.record.mode[:-1] == Mode.POSITION)[190:460]
-    assert steps[angles].max() < 0.03  # rad; the gate would allow 0.075
+    assert steps[angles].max() < 0.03  # rad; the limiter would allow 0.075
     assert set(whole.states[gap.start + 2 : gap.stop]) <= {"NotLocomoting", "Idle"}
 
 
@@ -68,7 +68,7 @@ def test_one_joint_is_in_torque_mode_and_all_others_in_position_mode():
     whole = triplet()
     pushing = np.array([report.propulsion_joint is not None for report in whole.reports])
     torque_joints = (whole.record.mode == Mode.TORQUE).sum(axis=1)
-    lag = whole.record.config.services["control"].lag_ticks - 1  # periods from a controller's word to its deed
+    lag = whole.record.config.services["control"].latency_ticks - 1  # periods from a controller's word to its deed
     assert (torque_joints[lag + 1 :] == pushing[1 : len(pushing) - lag]).all()
     assert np.isin(whole.record.mode, [Mode.TORQUE, Mode.POSITION]).all()
 
@@ -118,7 +118,7 @@ def test_no_command_jumps_at_a_hand_over():
     assert switches >= 8
 
 
-# --- triplets that are not neighbours -------------------------------------------------------------------------
+# --- triplets that are not neighbors -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("clearance_m", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
@@ -169,7 +169,7 @@ def test_what_contacts_carry_is_told_and_not_what_is_asked_for():
 
 def test_a_body_that_is_clear_of_every_peg_is_not_called_jammed():
     thin = ("robot.chain.modules=10", "robot.module.length_m=0.09", "robot.module.radius_m=0.025")
-    row = "scene.made_for={spacing_m = 0.09, radius_m = 0.025}"  # as it is, not in proportion
+    row = "scene.reference_robot={spacing_m = 0.09, radius_m = 0.025}"  # as it is, not in proportion
     whole = run(configure("peg_row", *thin, row), duration_s=4.0)
     assert not any(report.jammed for report in whole.reports)
     assert whole.states[-1] == "NotLocomoting"

@@ -58,19 +58,19 @@ def random_waves(count: int) -> list[Wave]:
 class Track:
     """Centre of mass and vector from tail to head at the end of every step, (steps, 2) in m."""
 
-    centre: Floats
+    center: Floats
     axis: Floats
     step_s: float
     period_s: float
 
     @property
     def drift_mm_s(self) -> float:
-        """Mean speed of the centre along the mean axis of each period."""
+        """Mean speed of the center along the mean axis of each period."""
         steps = round(self.period_s / self.step_s)
         found: list[float] = []
         for k in range(SKIPPED, PERIODS - 1):
             axis = self.axis[k * steps : (k + 1) * steps].mean(axis=0)
-            way = self.centre[(k + 1) * steps] - self.centre[k * steps]
+            way = self.center[(k + 1) * steps] - self.center[k * steps]
             found.append(float(way @ axis / np.linalg.norm(axis)) / self.period_s * 1e3)
         return float(np.mean(found))
 
@@ -91,15 +91,15 @@ def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0) -> Track:
     step_s, period_s = model.opt.timestep, 2 * np.pi / wave.rate
     tail, head = sim.soles.geoms[[0, -1]]
     steps = int(PERIODS * period_s / step_s) + 1
-    centre, axis = np.empty((steps, 2)), np.empty((steps, 2))
+    center, axis = np.empty((steps, 2)), np.empty((steps, 2))
     for k in range(steps):
         after_s = (k + 1) * step_s
         wanted = stiffness * (wave.at(after_s, count) - data.qpos[FREE_QPOS:])
         data.qfrc_applied[FREE_DOFS:] = wanted + damping * wave.rates_at(after_s, count)
         physics.step(1)
-        centre[k] = data.subtree_com[0, :2]
+        center[k] = data.subtree_com[0, :2]
         axis[k] = (data.geom_xpos[head] - data.geom_xpos[tail])[:2]
-    return Track(centre, axis, step_s, period_s)
+    return Track(center, axis, step_s, period_s)
 
 
 def momentum_balance(wave: Wave, step_s: float = 0.0005) -> Track:
@@ -116,7 +116,7 @@ def momentum_balance(wave: Wave, step_s: float = 0.0005) -> Track:
     pose, momentum = np.zeros(3), np.zeros(3)
     period_s = 2 * np.pi / wave.rate
     steps = int(PERIODS * period_s / step_s) + 1
-    centre, axis = np.empty((steps, 2)), np.empty((steps, 2))
+    center, axis = np.empty((steps, 2)), np.empty((steps, 2))
     for k in range(steps):
         time_s = k * step_s
         headings = pose[2] + np.append(0.0, np.cumsum(wave.at(time_s, count)))
@@ -137,9 +137,9 @@ def momentum_balance(wave: Wave, step_s: float = 0.0005) -> Track:
         rub = -MU * loads_n * velocities / np.sqrt(np.abs(velocities) ** 2 + 0.002**2)
         momentum += step_s * np.array([rub.sum().real, rub.sum().imag, np.sum((np.conj(feet - place) * rub).imag)])
         pose += step_s * np.array([speed.real, speed.imag, spin])
-        centre[k] = place.real, place.imag
+        center[k] = place.real, place.imag
         axis[k] = (feet[-1] - feet[0]).real, (feet[-1] - feet[0]).imag
-    return Track(centre, axis, step_s, period_s)
+    return Track(center, axis, step_s, period_s)
 
 
 @pytest.mark.parametrize("wave", random_waves(4))
@@ -169,11 +169,11 @@ def test_twenty_waves_drift_as_their_reverse_does_and_as_at_every_step(step_s: f
 def test_a_reflected_snake_goes_the_reflected_way_and_a_turned_one_the_turned_way() -> None:
     wave, yaw_rad = Wave(bend=0.04), 0.7
     reflected = Wave(-wave.amplitude, bend=-wave.bend)
-    plain = swim(wave).centre[-1]
+    plain = swim(wave).center[-1]
     assert np.linalg.norm(plain) > 0.02
-    assert swim(reflected).centre[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
+    assert swim(reflected).center[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
     turned = complex(*plain) * np.exp(1j * yaw_rad)
-    assert swim(wave, yaw_rad=yaw_rad).centre[-1] == pytest.approx([turned.real, turned.imag], abs=1e-6)
+    assert swim(wave, yaw_rad=yaw_rad).center[-1] == pytest.approx([turned.real, turned.imag], abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import pytest
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_sim_backend.model import build
-from snakesim_sim_backend.plant import MujocoPlant
-from snakesim_sim_backend.settings import PlantSettings, SimSettings
+from snakesim_sim_backend.physics_model import MujocoPhysicsModel
+from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from tests.unit.sim_backend.rig import G, lie_down, make_config
 from tests.whole_run import configure, run
 
@@ -100,13 +100,18 @@ def test_a_spring_that_the_step_cannot_follow_is_refused_with_what_would_do() ->
 
 def test_under_emulated_modules_obstacles_yield_as_well_and_are_none_of_the_robots_joints() -> None:
     loose = {"cylinder": [PEG | {"position_m": [0.5, 0.1], "mass_kg": 1.0, "stiffness_n_per_m": 5e5}]}
-    plant = MujocoPlant(make_config(scene=loose), PlantSettings(timestep_s=0.0005))
+    physics_model = MujocoPhysicsModel(make_config(scene=loose), PhysicsModelSettings(timestep_s=0.0005))
     bent = np.full(13, 3.0)
     for _ in range(400):
-        plant.advance(bent)
-    assert plant.angle_rad.shape == plant.velocity_rad_s.shape == plant.shaft_torque_nm().shape == (13,)
-    assert np.abs(plant.data.qpos[-3:-1]).max() > 1e-3  # it was pushed away
-    assert [load.link for load in plant.loads()] == sorted({load.link for load in plant.loads()})
+        physics_model.advance(bent)
+    assert (
+        physics_model.angle_rad.shape
+        == physics_model.velocity_rad_s.shape
+        == physics_model.shaft_torque_nm().shape
+        == (13,)
+    )
+    assert np.abs(physics_model.data.qpos[-3:-1]).max() > 1e-3  # it was pushed away
+    assert [load.link for load in physics_model.loads()] == sorted({load.link for load in physics_model.loads()})
 
 
 def test_a_leaning_peg_is_where_its_foot_is_and_leans_as_far_as_it_says() -> None:

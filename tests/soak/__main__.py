@@ -24,7 +24,7 @@ from tests.soak.health import Health
 from tests.soak.watch import Watch
 
 ROBOT = "planar13"
-RUN = ("triplet", "--pace", "realtime", "--duration", "86400", "--stay")
+RUN = ("triplet", "--clock-mode", "realtime", "--duration", "86400", "--stay")
 START_S = 120.0
 SETTLE_S = 1.0  # after a fault has ended, until what follows must have followed
 RECOVERY_S = 60.0  # back-off of a supervisor included

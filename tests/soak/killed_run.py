@@ -24,7 +24,7 @@ from snakesim_operator.results.summary import RunSummary
 from tests.harness.command import running
 from tests.harness.processes import parts_of, processes_with
 
-Moment = Literal["starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending"]
+Moment = Literal["starting", "arm_session", "armed", "stopping", "clearing", "interrupted", "ending"]
 MOMENTS: tuple[Moment, ...] = get_args(Moment)
 SUPERVISOR = "supervisor"
 ROBOT = "planar13"
@@ -59,7 +59,7 @@ class Trial:
 
     number: int
     backend: str
-    pace: str
+    clock_mode: str
     stay: bool
     router: bool
     asked_s: float
@@ -68,7 +68,7 @@ class Trial:
     hits: tuple[Hit, ...]
 
     def __str__(self) -> str:
-        kind = " ".join([self.backend, self.pace, *self._flags])
+        kind = " ".join([self.backend, self.clock_mode, *self._flags])
         return f"#{self.number} {kind}, {self.moment}: {', '.join(map(str, self.hits))}"
 
     @property
@@ -78,7 +78,16 @@ class Trial:
     def arguments(self) -> list[str]:
         """Of `snakesim run`."""
         fixed = ["triplet", "--controller", "hold", "--set", f"rate_hz={RATE_HZ}"]
-        return [*fixed, "--backend", self.backend, "--pace", self.pace, "--duration", str(self.asked_s), *self._flags]
+        return [
+            *fixed,
+            "--backend",
+            self.backend,
+            "--clock-mode",
+            self.clock_mode,
+            "--duration",
+            str(self.asked_s),
+            *self._flags,
+        ]
 
 
 @dataclass
@@ -142,7 +151,7 @@ class KilledRun:
             return True
         if not self._until(lambda: self._join(stack), MOMENT_LIMIT_S):
             return False
-        if self._trial.moment == "arming":
+        if self._trial.moment == "arm_session":
             return self._until(lambda: self._status is not None, MOMENT_LIMIT_S)
         if not self._until(lambda: bool(self._armed), MOMENT_LIMIT_S):
             return False

@@ -23,7 +23,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP, signal.SIGSTOP, signa
 VICTIMS = (SUPERVISOR, "host", "host", "guidance", "navigation", "control")
 WITHIN_S = {  # of the moment, the hits come
     "starting": 2.0,
-    "arming": 1.0,
+    "arm_session": 1.0,
     "armed": 0.8,
     "stopping": 0.06,
     "clearing": 0.06,
@@ -38,7 +38,7 @@ def draw(seed: int, *, backend: str | None = None) -> Iterator[Trial]:
     dice = random.Random(seed)
     for number in itertools.count():
         moment, router = MOMENTS[number % len(MOMENTS)], dice.random() < 0.25
-        pace = dice.choice(("realtime", "realtime", "lockstep"))
+        clock_mode = dice.choice(("realtime", "realtime", "lockstep"))
         victims = (*VICTIMS, "router") if router else VICTIMS
         hits: list[Hit] = []
         for _ in range(dice.choice((1, 1, 1, 2, 3))):
@@ -48,10 +48,14 @@ def draw(seed: int, *, backend: str | None = None) -> Iterator[Trial]:
         yield Trial(
             number=number,
             backend=backend or ("sim", "can")[number // len(MOMENTS) % 2],
-            pace=pace,
+            clock_mode=clock_mode,
             stay=dice.random() < 0.4,
             router=router,
-            asked_s=1.0 if moment == "ending" else 8.0 if pace == "realtime" else 60.0,  # which a lockstep run hurries
+            asked_s=1.0
+            if moment == "ending"
+            else 8.0
+            if clock_mode == "realtime"
+            else 60.0,  # which a lockstep run hurries
             moment=moment,
             by_datagram=dice.random() < 0.5,
             hits=tuple(hits),

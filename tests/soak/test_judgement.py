@@ -19,7 +19,7 @@ ROBOT = description()  # 5 rad/s at 100 Hz, and 0.3 rad from the measured angle 
 def applied(tick: int, target: float) -> AppliedCommand:
     return AppliedCommand(
         tick=tick,
-        stamp_ns=0,
+        timestamp_ns=0,
         sequence=tick,
         mode=[Mode.POSITION] * 3,
         target=[target] * 3,

@@ -1,4 +1,4 @@
-"""Watches a robot through faults and restarts: whether it explains itself, and whether set-points ever jump."""
+"""Watches a robot through faults and restarts: whether it explains itself, and whether setpoints ever jump."""
 
 import math
 from collections import Counter

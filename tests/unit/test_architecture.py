@@ -27,7 +27,7 @@ def test_from_the_readme_five_hops_lead_to_the_line_that_limits_a_torque() -> No
     readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
     assert "make demo" in readme and "](docs/architecture.md#walks-through-the-code)" in readme
     assert "snakesim run peg_row" in makefile.partition("\ndemo:")[2].partition("\n\n")[0]
-    assert len(HOPS) == 5 and HOPS[-1][1] == "snakesim_hal/safety/gate.py"
+    assert len(HOPS) == 5 and HOPS[-1][1] == "snakesim_hal/safety/limiter.py"
     for (name, path, line), following in zip(HOPS, [*HOPS[1:], None], strict=True):
         assert any(line in source for source in sources(path, name)), f"{line!r} is not in {name} of {path}"
         if following is not None:

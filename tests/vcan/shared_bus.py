@@ -14,13 +14,13 @@ import pytest
 from snakesim_can_backend.bus.bus import SocketCanWire
 from snakesim_can_backend.driver import modules as driver
 from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import TwinServer
-from snakesim_drivers.emulation.twin_body import make_plant
-from snakesim_hal.backend import SetPoints
-from snakesim_hal.physics.plant import Plant
+from snakesim_drivers.emulation.emulated_body import make_physics_model
+from snakesim_hal.backend import Setpoints
+from snakesim_hal.physics.physics_model import PhysicsModel
 from tests.unit.can_backend.loop import Loop, armed, config
 
 ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before
@@ -29,7 +29,7 @@ ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait befor
 class SharedWire(SocketCanWire):
     """The driver's end. Whenever it waits, the modules at the other end live on."""
 
-    def __init__(self, channel: str, server: TwinServer) -> None:
+    def __init__(self, channel: str, server: EmulatorServer) -> None:
         super().__init__(channel)
         self.server = server
         self.now_ns = 0
@@ -56,7 +56,7 @@ class SharedBus(Loop):
 
     true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])  # at ends of ticks
 
-    def run(self, ticks: int, wish: Callable[[int], SetPoints] | None = None) -> None:
+    def run(self, ticks: int, wish: Callable[[int], Setpoints] | None = None) -> None:
         """So many periods, each as long for the modules as for the driver."""
         for _ in range(ticks):
             self.wire.until_ns = self.wire.now_ns + self.config.period_ns
@@ -76,26 +76,26 @@ class SharedBus(Loop):
         return wire
 
     @property
-    def plant(self) -> Plant:
-        return self.wire.server.chain.plant
+    def physics_model(self) -> PhysicsModel:
+        return self.wire.server.chain.physics_model
 
     def true_states(self) -> list[ModuleState]:
         """What the modules are, whether or not they can tell."""
         return [slot.module.state for slot in self.wire.server.chain.slots]
 
     def at_rest(self) -> bool:
-        return bool((abs(self.plant.velocity_rad_s) < 0.05).all())
+        return bool((abs(self.physics_model.velocity_rad_s) < 0.05).all())
 
 
 @contextmanager
 def shared_bus(channel: str) -> Iterator[SharedBus]:
     """Open, all joints armed and swinging, and close at the end."""
-    run = config(pace="realtime")
-    settings = CanSettings(channels=[channel], plant="inertia")
+    run = config(clock_mode="realtime")
+    settings = CanSettings(channels=[channel], physics_model="inertia")
     modules_end = SocketCanWire(channel, FROM_HOST)
-    server = TwinServer(
+    server = EmulatorServer(
         [modules_end],
-        ModuleChain(run, settings, make_plant(run, settings, "can"), stepped=False),
+        ModuleChain(run, settings, make_physics_model(run, settings, "can"), stepped=False),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))

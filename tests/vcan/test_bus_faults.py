@@ -101,7 +101,7 @@ def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_s
         unclog(slow_channel)
         before = set_points_out(run)
         run.run(5)
-        assert set_points_out(run) == before, "no set-point of before goes out"
+        assert set_points_out(run) == before, "no setpoint of before goes out"
         moves_again(run)
 
 
@@ -146,7 +146,7 @@ def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_
         assert fault.what == "bus_off" and fault.cause.startswith(f"{channel}: transmit errors 130, receive errors 7; ")
         out = set_points_out(run)
         run.run(30, run.waving)
-        assert run.lifecycle == "fault" and set_points_out(run) == out, "not one set-point more"
+        assert run.lifecycle == "fault" and set_points_out(run) == out, "not one setpoint more"
         assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest() and len(run.faults) == 1
         moves_again(run)
 

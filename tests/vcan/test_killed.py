@@ -46,7 +46,7 @@ robot = "worm.toml"
 scene = "bend.toml"
 backend = "can"
 controller = "hold"
-pace = "realtime"
+clock_mode = "realtime"
 rate_hz = {RATE_HZ}
 [start]
 tail_s_m = 0.1
@@ -54,9 +54,9 @@ tail_s_m = 0.1
 [controllers.hold]
 [backends.can]
 channels = ["CHANNEL"]
-plant = "inertia"
+physics_model = "inertia"
 bring_up_limit_s = 60.0
-[backends.can.plant_settings]
+[backends.can.physics_model_settings]
 timestep_s = 0.01
 """
 
@@ -140,7 +140,7 @@ class Bench:
         return process
 
     def modules(self) -> None:
-        self.start("modules", "snakesim_can_backend.twin.command", self._saved, "--pose", "none")
+        self.start("modules", "snakesim_can_backend.emulator.command", self._saved, "--pose", "none")
         self.until(lambda: "modules ready" in self.said("modules"), "modules ready")
 
     def control(self) -> subprocess.Popen[bytes]:
@@ -187,7 +187,7 @@ class Bench:
         self.listener.forget()
         armed = [ModuleState.ARMED] * JOINTS
         self.until(lambda: self.listener.states() == armed, "every module armed")
-        self.until(lambda: len(self.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "set-points")
+        self.until(lambda: len(self.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "setpoints")
         return host, control
 
 
@@ -255,7 +255,7 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: Bench) -> 
     assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
     assert rest_ms <= 100 + period_ms + LATE_MS
     print(
-        f"| control, SIGKILL | last set-point {last_ms:.0f} ms after it, Stop {stop_ms:.0f} ms "
+        f"| control, SIGKILL | last setpoint {last_ms:.0f} ms after it, Stop {stop_ms:.0f} ms "
         f"(lease {lease_ms:.0f} ms, {RATE_HZ:g} Hz) | all modules DISARMED {rest_ms:.0f} ms after Stop "
         f"| kernel's clock{', emulated machine' if IN_GUEST else ''} |"
     )
@@ -293,7 +293,7 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, cha
     assert robot.listener.states() == [ModuleState.FAULT] * JOINTS
     print(
         f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
-        f"motor off, {max(took_ms):.0f} ms after their last set-point by the kernel's clock, "
+        f"motor off, {max(took_ms):.0f} ms after their last setpoint by the kernel's clock, "
         f"{min(own_ms):.0f} to {max(own_ms):.0f} ms by their own | watchdog 100 ms |"
     )
 

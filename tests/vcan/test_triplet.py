@@ -22,7 +22,7 @@ LIMIT_S = 400.0  # an emulated machine is slow
 def test_the_triplet_over_the_kernels_bus_is_the_triplet_over_the_virtual_one_to_the_bit(
     tmp_path: Path, channel: str
 ) -> None:
-    over_the_bus = (f'backend.channels=["{channel}"]', 'backend.twins="process"')
+    over_the_bus = (f'backend.channels=["{channel}"]', 'backend.emulators="process"')
     records: dict[str, RunRecord] = {}
     took_s: dict[str, float] = {}
     for name, sets in (("virtual", ()), (channel, over_the_bus)):

@@ -27,7 +27,7 @@ def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_comm
     class Pushes(Hold):
         def update(self, view):  # pyright: ignore
             action = super().update(view)
-            action.set_points.mode[1] = Mode.TORQUE
+            action.setpoints.mode[1] = Mode.TORQUE
             return action
 
     config = load("triplet", [parse_set(text) for text in SERVOS]).config

@@ -1,4 +1,4 @@
-"""Through clutter with the CAN backend: the same guidance, navigation and control, with module twins as the robot."""
+"""Through clutter with the CAN backend: the same guidance, navigation and control on emulated joint modules."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def over_can(*sets: str) -> Result:
 
 @pytest.mark.slow
 def test_it_goes_on_without_a_joint_that_was_lost_on_the_way() -> None:
-    reported = over_can("duration_s=6", "robot.safety.may_lose_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
+    reported = over_can("duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
     assert reported.summary.ended == "complete" and list(reported.record.host.isolated) == ["joint_7"]
     advance = Advance.of(reported.record)
     assert advance is not None

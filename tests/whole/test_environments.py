@@ -1,4 +1,4 @@
-"""Gymnasium environments: what the checker asks for, one seed one digest, the gate inside, rewards by name, errors."""
+"""Gymnasium environments: Gymnasium's checker, one seed one digest, the limiter inside, rewards by name, errors."""
 
 import importlib.util
 import os
@@ -64,7 +64,7 @@ def test_the_checker_of_gymnasium_has_nothing_to_say(name: str) -> None:
         warnings.simplefilter("always")
         check_env(gymnasium.make(name, duration=0.2).unwrapped, skip_render_check=True)
     other = [str(one.message) for one in said if "symmetric and normalized" not in str(one.message)]
-    assert not other, other  # of radians, bounds are what they are; RescaleAction normalises them
+    assert not other, other  # of radians, bounds are what they are; RescaleAction normalizes them
 
 
 @needs_sb3
@@ -96,7 +96,7 @@ def test_every_number_has_a_name_a_unit_and_bounds() -> None:
     ids=["simulator", "emulated modules", "with a camera"],
 )
 def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
-    """To the bit, behind the same gate and with the same latency."""
+    """To the bit, behind the same limiter and with the same latency."""
     info = episode(made(frame_skip=1, **more), action=lambda time_s: 8.0 * wave(time_s))
     run = snakesim.run("triplet", controller=lambda time_s, _: 8.0 * wave(time_s), duration=1, seed=1, **more)
     assert "limited" in info
@@ -305,7 +305,7 @@ WRONG = [
     ({"scenario": None}, r"needs scenario=\.\.\."),
     ({"action": "torqe"}, "action='torqe': did you mean `torque`"),
     ({"action": "residual:obstacle_aidd"}, "no controller called 'obstacle_aidd' is installed; did you mean"),
-    ({"action": "residual:hold", "safe": False}, "a controller commands through the gate"),
+    ({"action": "residual:hold", "safe": False}, "a controller commands through the limiter"),
     ({"observe": ["angle_rd"]}, "no part 'angle_rd'; did you mean `angle_rad`"),
     ({"observe": "angle_rad"}, "give a sequence of names"),
     ({"reward": {"advence": 1}}, "no term 'advence'; did you mean `advance`"),

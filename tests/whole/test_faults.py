@@ -10,7 +10,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import RunRecord
 from tests.whole.command import run_to_summary, snakesim
 
-MAY_LOSE_ONE = "robot.safety.may_lose_joints=1"
+MAY_LOSE_ONE = "robot.safety.max_isolated_joints=1"
 slow = partial(pytest.param, marks=pytest.mark.slow)
 
 

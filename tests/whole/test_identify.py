@@ -9,7 +9,7 @@ from tests.whole.command import run_to_summary, snakesim
 FIELDS = {"friction_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005, "response_time_s": 0.01}
 WITHIN = {"viscous_nm_s_per_rad": 0.2}  # of the truth; the others 0.1
 ROBOT = """extends = "planar13"
-name = "hung"
+name = "suspended"
 [chain]
 modules = 3
 [motor]
@@ -43,7 +43,7 @@ def test_hidden_parameters_are_found_and_written_down(tmp_path: Path) -> None:
 
 
 def test_a_robot_that_does_not_hang_is_not_identified(tmp_path: Path) -> None:
-    given = ("backends.sim.hung=false", "robot.chain.modules=3", "robot.motor.friction_nm=0.1")
+    given = ("backends.sim.suspended=false", "robot.chain.modules=3", "robot.motor.friction_nm=0.1")
     sets = [word for text in given for word in ("--set", text)]
     run_to_summary(tmp_path / "run", "identify", "--duration", "12", *sets)
     (tmp_path / "snake.toml").write_text(ROBOT)

@@ -119,7 +119,7 @@ def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch:
         return conclude(*arguments)
 
     monkeypatch.setattr("snakesim_operator.run.in_process.conclude", conclude_interrupted)
-    config = load("triplet", [parse_set("duration_s=0.1"), parse_set("pace=lockstep")]).config
+    config = load("triplet", [parse_set("duration_s=0.1"), parse_set("clock_mode=lockstep")]).config
     assert run_in_process(config, tmp_path / "run") == 0
     assert (tmp_path / "run" / REPORT).is_file()
 

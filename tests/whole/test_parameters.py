@@ -64,7 +64,7 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
     settings = find_plugin(CONTROLLERS, name).Settings
     in_force = ControlSettings(
         tick=0,
-        stamp_ns=0,
+        timestamp_ns=0,
         controller=name,
         settings=msgspec.json.encode(settings(**MUST_BE_SET.get(name, {}))).decode(),
         schema=msgspec.json.encode(msgspec.json.schema(settings)).decode(),

@@ -106,7 +106,7 @@ WRONG = [
     (("triplet",), {"controller": 5}, "controller=5: give a shipped name"),
     (("triplet",), {"controller": int}, r"controller=int: a controller class needs a method update\(view\)"),
     (("triplet",), {"controller": wave, "processes": True}, "controller=wave: processes .* save it in a file"),
-    (("triplet",), {"set": {"pace": "realtime"}}, "in one process the pace is lockstep"),
+    (("triplet",), {"set": {"clock_mode": "realtime"}}, "in one process the clock mode is lockstep"),
 ]
 
 

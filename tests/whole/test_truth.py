@@ -19,7 +19,7 @@ STILL = (
     "from snakesim_gnc.control.hold import Hold\n\n\n"
     "class Still(Hold):\n"
     "    def update(self, view):\n"
-    "        return Action(super().update(view).set_points)\n"
+    "        return Action(super().update(view).setpoints)\n"
 )
 
 

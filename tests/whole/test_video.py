@@ -67,4 +67,4 @@ def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
     drawing, nodes = draw(moment, Surroundings(record.config)), record.nodes_w(row)
     assert drawing is not None and nodes is not None
     assert drawing.hinges_w == pytest.approx(nodes[1:-1])
-    assert moment.control is not None and abs(moment.control.stamp_ns * 1e-9 - begin_s - 0.5) < 0.1
+    assert moment.control is not None and abs(moment.control.timestamp_ns * 1e-9 - begin_s - 0.5) < 0.1

@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from snakesim_can_backend.can_drives import backend as can_family
 from snakesim_can_backend.driver import modules
-from snakesim_can_backend.family import backend as can_family
 from snakesim_drivers.kit.buses import Bus, Buses
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_drivers.kit.readings import Readings
@@ -22,18 +22,23 @@ from tests.unit.hal.rig import run_config
 from tests.whole.command import run_to_summary
 
 MIXED_ROBOT = {
-    "robot__drive": {"family": "odrive"},
-    "robot__joints": {"joint_3": {"family": "dynamixel"}, "joint_4": {"family": "dynamixel"}},
+    "robot__drive": {"driver": "odrive"},
+    "robot__joints": {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}},
 }
 
 
 def configured(backend: str, **sections: Any) -> RunConfig:
     """Four joints; nothing but the body's inertia under emulated drives."""
     robot = MIXED_ROBOT if backend == "mixed" else {}
-    own = {backend: {"plant": "inertia"} | sections.pop(backend, {})}
-    pace = "lockstep" if not sections and len(own[backend]) == 1 else "realtime"
+    own = {backend: {"physics_model": "inertia"} | sections.pop(backend, {})}
+    clock_mode = "lockstep" if not sections and len(own[backend]) == 1 else "realtime"
     return run_config(
-        backend=backend, robot__chain__modules=4, rate_hz=100, pace=pace, backends={**own, **sections}, **robot
+        backend=backend,
+        robot__chain__modules=4,
+        rate_hz=100,
+        clock_mode=clock_mode,
+        backends={**own, **sections},
+        **robot,
     )
 
 
@@ -77,8 +82,8 @@ def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
     clock = Clock(config)
     opened_buses: list[Bus] = []
     for part in factory.parts(config, backend_settings(config, factory)):
-        opened_buses += part.family.buses(config, part.settings, part.joints, clock, None)
-    in_turn = msgspec.structs.replace(config, pace="lockstep")  # without threads
+        opened_buses += part.driver_type.buses(config, part.settings, part.joints, clock, None)
+    in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
     assert Buses(in_turn, Readings(config.robot.joint_table, clock.ns), opened_buses, clock.ns).emulated == emulated
 
 

@@ -17,7 +17,7 @@ BARE = [*SHORT, "--unset", "robot.sensors.imu"]  # and these servos have no cont
 
 
 def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is_estimated(tmp_path: Path) -> None:
-    watched = [*BARE, "--set", "mission.localisation=dead_reckoning", "--out", "watched"]
+    watched = [*BARE, "--set", "mission.localization=dead_reckoning", "--out", "watched"]
     blind = [*BARE, "--unset", "robot.sensors.pose", "--out", "blind"]
     ended = {name: snakesim("run", *words, cwd=tmp_path) for name, words in (("watched", watched), ("blind", blind))}
     said = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ended}
@@ -30,7 +30,7 @@ def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is
     for text in (ended["blind"].out, (tmp_path / "blind" / REPORT).read_text()):
         assert "pose is reckoned" in text and "contacts are estimated from joint torques" in text
     worlds = RunRecord.load(tmp_path / "blind").worlds
-    assert all(world.pose_stamp_ns is None and world.base_position_sd_m is not None for world in worlds)
+    assert all(world.pose_timestamp_ns is None and world.base_position_sd_m is not None for world in worlds)
     felt = [contact for world in worlds for contact in world.contacts]
     assert felt and all(contact.obstacle is not None and contact.confidence < 1.0 for contact in felt)
 

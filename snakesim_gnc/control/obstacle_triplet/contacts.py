@@ -53,10 +53,10 @@ def plan_contact(
     if obstacle.shape == "box":
         s, push, distance = _past_box(route, obstacle, near_s_m, window_m)
     else:
-        centre = np.array(obstacle.position_w[:2])
-        s = route.project(centre, near_s_m, window_m)
+        center = np.array(obstacle.position_w[:2])
+        s = route.project(center, near_s_m, window_m)
         x, y = route.at(s)
-        push = (x - float(centre[0]), y - float(centre[1]))
+        push = (x - float(center[0]), y - float(center[1]))
         distance = math.hypot(*push) - obstacle.radius_m
     heading = route.heading_rad(s)
     tangent = (math.cos(heading), math.sin(heading))

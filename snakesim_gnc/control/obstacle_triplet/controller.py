@@ -16,7 +16,7 @@ and others are tried.
 Nothing jumps at a hand-over. In the tick of a change of mode, a position target is within `fade` times the joint's
 angle from its reference, and a torque target within `fade` times (measured torque - propulsion torque), of the target
 with which the motor keeps its torque; `fade = period / blend_s + |speed| period / blend_m`, 0.07 with the defaults at
-100 Hz and 0.2 m/s. The gate of the HAL limits it once more: `speed_limit * period` and `torque_rate_limit * period`.
+100 Hz and 0.2 m/s. The limiter of the HAL limits it once more: `speed_limit * period` and `torque_rate_limit * period`.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ from snakesim_gnc.control.obstacle_triplet.telemetry import bending_nm, planned_
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
 
@@ -91,7 +91,7 @@ class ObstacleTriplet:
         self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
 
     def update(self, view: View) -> Action:
-        """Set-points for the next period."""
+        """Setpoints for the next period."""
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
@@ -115,12 +115,12 @@ class ObstacleTriplet:
         limits_nm = self._body.torque_limit_nm
         if choice is None or turn is None:
             self._asked_n = self._force_n = 0.0
-            return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located))
+            return Action(Setpoints(mode, targets, limits_nm), self._report_rest(located))
         push = self._push(view, located, choice, turn)
         self._force_n = push.force_n
         mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
         self._watch_progress(view, located, choice, push)
-        return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
+        return Action(Setpoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
 
     def _follow(self, view: View, located: Located) -> BodyPose:
         """Reference of the joints in position mode; starts, and continues from another place, without a jump."""
@@ -128,7 +128,7 @@ class ObstacleTriplet:
         if before is None or located.restarted:
             body_pose = located.on_path.at(s)
         else:
-            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
+            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_ratio * view.period_s
             followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + max_advance_m)
             body_pose = located.on_path.at(max(followed, s - set_.brake_m))
         lifted = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
@@ -142,7 +142,7 @@ class ObstacleTriplet:
 
     def _held_rad(self, view: View, body_pose: BodyPose) -> Floats:
         """How far targets are beyond the path's angles, so that its joints hold the planned forces on the path."""
-        share, choice = self._set.load_share, self._choice
+        share, choice = self._set.load_ratio, self._choice
         if share == 0.0:
             return np.zeros(len(self._held_nm))
         wanted = np.zeros(len(self._held_nm))
@@ -203,7 +203,7 @@ class ObstacleTriplet:
 
     def _choose(self, view: View, located: Located, body_pose: BodyPose) -> None:
         """Choose a triplet, or none."""
-        s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_share
+        s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_fraction
         self._banned = {names: at for names, at in self._banned.items() if abs(s - at) < blend_m}
         if self._stall is not None and abs(s - self._stall[1]) > blend_m:
             self._stall = None
@@ -217,8 +217,8 @@ class ObstacleTriplet:
             self._choice = None
             return
         present = None if self._choice is None else self._choice.triplet
-        self._choice = choose(choices, present, switch_share=share, banned=self._banned) or choose(
-            choices, present, switch_share=share
+        self._choice = choose(choices, present, switch_fraction=share, banned=self._banned) or choose(
+            choices, present, switch_fraction=share
         )
 
     # --- supervision -----------------------------------------------------------------------------------------
@@ -251,7 +251,7 @@ class ObstacleTriplet:
             saturated=name if push.saturated else None,
             swung=name if push.swung else None,
             jam_force_n=self._set.jam_force_n,
-            drag_share=self._set.drag_share,
+            drag_ratio=self._set.drag_ratio,
         )
         self._stall = (stall, located.tail_s_m)
         if stall.lets_go:
@@ -302,7 +302,7 @@ class ObstacleTriplet:
             propulsion_joint=push.turn,
             propulsion_n=push.force_n,
             push_points=planned_contacts(self._body, located.world, choice, forces_n),
-            solved_force_n=forces_n,
+            desired_force_n=forces_n,
             propulsion_torque_nm=push.torque_nm,
             bending_torque_nm=bending_nm(self._body, body_pose, choice, push.force_n).tolist(),
             reference_rad=self._reference.tolist(),

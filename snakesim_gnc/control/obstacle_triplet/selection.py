@@ -1,8 +1,8 @@
 """The choice of three push-points and a joint for propulsion. Pure.
 
 Any three on alternating sides are a triplet, with others between them or not: on a steep wave, and beside obstacles
-that brake, neighbours cannot push, and contacts further apart can. The best one needs the least torque for a newton of
-propulsion, so that a joint's limit allows the most. Neighbours mostly do: their levers are short.
+that brake, neighbors cannot push, and contacts further apart can. The best one needs the least torque for a newton of
+propulsion, so that a joint's limit allows the most. Neighbors mostly do: their levers are short.
 """
 
 from bisect import bisect_right
@@ -109,11 +109,11 @@ def propulsion_joint(
 
 
 def choose(
-    choices: Sequence[Choice], present: Triplet | None, *, switch_share: float, banned: Collection[Names] = ()
+    choices: Sequence[Choice], present: Triplet | None, *, switch_fraction: float, banned: Collection[Names] = ()
 ) -> Choice | None:
     """The triplet to push with, or None when there is none.
 
-    The present one stays as long as it can be used, unless another needs less than `switch_share` of its torque. Its
+    The present one stays as long as it can be used, unless another needs less than `switch_fraction` of its torque. Its
     successor shares as many push-points with it as possible, among those that need little more than the minimum torque;
     then the one with the minimum torque, and of equals the one nearest to the tail: then the short end of the body
     swings with the propulsion joint, and the long one stays in its corridor.
@@ -124,9 +124,9 @@ def choose(
     least = min(c.triplet.torque_per_n for c in free)
     names: frozenset[str] = frozenset() if present is None else frozenset(present.names)
     for choice in free:
-        if choice.triplet is present and least >= switch_share * choice.triplet.torque_per_n:
+        if choice.triplet is present and least >= switch_fraction * choice.triplet.torque_per_n:
             return choice
-    cheap = [c for c in free if switch_share * c.triplet.torque_per_n <= least]
+    cheap = [c for c in free if switch_fraction * c.triplet.torque_per_n <= least]
     return max(
         cheap,
         key=lambda c: (len(names.intersection(c.triplet.names)), -round(c.triplet.torque_per_n, 3), -c.body_s_m[1]),

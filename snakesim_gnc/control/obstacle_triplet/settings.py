@@ -19,7 +19,7 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
     propulsion_rate_n_s: Annotated[float, above(1e6, "N/s"), about("how fast the propulsion force changes")] = 700.0
 
     # A servo gives way under a load; with its target ahead by load / stiffness the joint stays where it was planned.
-    load_share: Annotated[
+    load_ratio: Annotated[
         float, from_zero(1, "1"), about("share of its planned load by which a servo's target leads; 0: it gives way")
     ] = 0.0
     load_filter_s: Annotated[float, above(60, "s"), about("time constant of the filter of that load")] = 0.3
@@ -42,7 +42,7 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
         from_zero(1, "1 (sine of the angle)"),
         about("joints whose lever is so nearly along the normal at o_3 are refused"),
     ] = 0.02
-    switch_share: Annotated[
+    switch_fraction: Annotated[
         float, from_zero(1, "1"), about("a triplet is left for one that needs less than this share of its torque")
     ] = 0.5
 
@@ -76,7 +76,7 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
         about("a triplet that stands with a larger contact force, as a mean over 50 ms, is let go of"),
     ] = 60.0
     # Hardly any ground holds a sliding snake so well. A joint at its torque limit, or far out, ends it, too.
-    drag_share: Annotated[
+    drag_ratio: Annotated[
         float,
         above(10, "1 (of the weight)"),
         about("a triplet that stands with a propulsion above this share of the robot's weight is let go of"),
@@ -90,7 +90,7 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
     slack_m: Annotated[
         float, from_zero(0.1, "m"), about("slack of the arc length that the joints in position mode follow")
     ] = 0.001
-    overspeed_share: Annotated[
+    overspeed_ratio: Annotated[
         float, bounded(1, 100, "1"), about("the largest speed of that arc length, as a share of the mission's")
     ] = 1.2
     brake_m: Annotated[float, from_zero(1, "m"), about("how far that arc length stays behind the body at most")] = 0.02

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_gnc.control.carried import Carried, what_holds
+from snakesim_gnc.control.carried import NetContactForce, what_holds
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class StallWatch:
     def __init__(self, *, stall_m: float, stall_s: float, propulsion_n: float) -> None:
         self._stall_m = stall_m
         self._stall_s = stall_s
-        self._least_n = propulsion_n / 2
+        self._min_n = propulsion_n / 2
         self._recent: deque[tuple[float, float, float]] = deque()
         self._pushed_n = 0.0  # sum over the window
 
@@ -40,20 +40,20 @@ class StallWatch:
             self._pushed_n -= recent.popleft()[2]
         if time_s - recent[0][0] < self._stall_s - 1e-9:
             return False
-        return abs(tail_s_m - recent[0][1]) < self._stall_m and self._pushed_n > self._least_n * len(recent)
+        return abs(tail_s_m - recent[0][1]) < self._stall_m and self._pushed_n > self._min_n * len(recent)
 
 
 def explain(
     *,
     wanted_n: float,
     force_n: float,
-    carried: Carried | None,
+    carried: NetContactForce | None,
     push_points: Sequence[str],
     weight_n: float,
     saturated: str | None,
     swung: str | None,
     jam_force_n: float,
-    drag_share: float,
+    drag_ratio: float,
 ) -> Stall:
     """The cause of a stall, as far as what is measured shows it.
 
@@ -62,7 +62,7 @@ def explain(
     it is at its torque limit, or has swung out so far that the propulsion was reduced.
     """
     strongest_n = None if carried is None else carried.strongest_n
-    strained = saturated is not None or swung is not None or wanted_n > drag_share * weight_n
+    strained = saturated is not None or swung is not None or wanted_n > drag_ratio * weight_n
     lets_go = strongest_n != 0.0 and (strained or (strongest_n is not None and strongest_n > jam_force_n))
     jammed, why = what_holds(force_n, carried, push_points)
     if swung is not None:

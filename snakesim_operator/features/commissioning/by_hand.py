@@ -94,7 +94,7 @@ class Hand:
                         joint.name for joint, ok in zip(self.joints, state.valid, strict=True) if not ok
                     )
                     raise RefusedError(f"{unknown}: the angle is not known; see `snakesim status`")
-                yield state.stamp_ns * 1e-9, np.array(state.angle_rad)
+                yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
             time.sleep(0.01)
 
 
@@ -240,7 +240,7 @@ def limits(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
 
 
 def _shown(joints: Sequence[Joint], travel: Travel, now_rad: Floats) -> list[str]:
-    rows = zip(joints, travel.least_rad, now_rad, travel.most_rad, strict=True)
+    rows = zip(joints, travel.lower_rad, now_rad, travel.upper_rad, strict=True)
     return [f"{joint.name:<10} {least:+7.3f}  now {now:+7.3f}  {most:+7.3f} rad" for joint, least, now, most in rows]
 
 

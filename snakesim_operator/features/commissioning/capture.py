@@ -110,16 +110,16 @@ class Travel:
     """The lowest and the highest angle at which each joint has been."""
 
     def __init__(self, at_rad: Floats) -> None:
-        self.least_rad, self.most_rad = at_rad.copy(), at_rad.copy()
+        self.lower_rad, self.upper_rad = at_rad.copy(), at_rad.copy()
 
     def take(self, at_rad: Floats) -> None:
         """One more sample."""
-        np.minimum(self.least_rad, at_rad, out=self.least_rad)
-        np.maximum(self.most_rad, at_rad, out=self.most_rad)
+        np.minimum(self.lower_rad, at_rad, out=self.lower_rad)
+        np.maximum(self.upper_rad, at_rad, out=self.upper_rad)
 
     def limits(self, joint: int) -> tuple[float, float] | None:
         """What to write as its limits; None when it was not moved from end to end."""
-        least, most = float(self.least_rad[joint]), float(self.most_rad[joint])
+        least, most = float(self.lower_rad[joint]), float(self.upper_rad[joint])
         if most - least < LEAST_TRAVEL_RAD:
             return None
         return least + MARGIN_RAD, most - MARGIN_RAD

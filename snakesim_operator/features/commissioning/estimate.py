@@ -341,7 +341,7 @@ def student_95(freedom: int) -> float:
 def _bell(derivative: int = 0) -> Floats:
     """The fourth power of a cosine over `2 HALF` ticks, of sum 1; its derivatives in closed form, by ticks.
 
-    Differences of neighbours instead would make accelerations too small, and so rotors too heavy.
+    Differences of neighbors instead would make accelerations too small, and so rotors too heavy.
     """
     turn = np.arange(-HALF, HALF + 1) * np.pi / (2 * HALF)
     cos, sin, size = np.cos(turn), np.sin(turn), np.pi / (2 * HALF)

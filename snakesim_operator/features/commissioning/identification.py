@@ -54,7 +54,7 @@ class Identified:
 
     @property
     def fails(self) -> bool:
-        """Whether it does not move as the model of a hanging robot does, so that its neighbours are not sure either."""
+        """Whether it does not move as the model of a hanging robot does, so that its neighbors are not sure either."""
         return self.fits is None or self.fits < FITS
 
     def withheld(self, why: str) -> "Identified":

@@ -14,7 +14,7 @@ def add_commands(commands: Any) -> None:
         help="friction, rotor inertia, torque constant and response of every joint, from `snakesim run identify`",
         epilog="Exit code: 0 every joint was found, 1 one was not, or does not move as it should, 2 wrong input.",
     )
-    command.add_argument("run", type=Path, help="folder of the run, in which the robot hung by its tail")
+    command.add_argument("run", type=Path, help="folder of the run, in which the robot suspended by its tail")
     command.add_argument("--write", type=Path, metavar="FILE", help="your robot file: the values are written into it")
     command.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: identified.html in the run)")
     command.set_defaults(act=_identify)

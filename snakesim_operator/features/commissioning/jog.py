@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ConfigError, RefusedError
 from snakesim_hal.base.process import SERVICE_PRIORITY, on_stop_signal, set_realtime_priority, user_name
 from snakesim_hal.base.terminal import say
@@ -69,8 +69,8 @@ class Jog:
 
     def __init__(self, request: JogRequest, joint: JointDescription, at_rad: float) -> None:
         self._request = request
-        self.least_rad = max(at_rad - request.travel_rad, joint.angle_min_rad)
-        self.most_rad = min(at_rad + request.travel_rad, joint.angle_max_rad)
+        self.lower_rad = max(at_rad - request.travel_rad, joint.angle_min_rad)
+        self.upper_rad = min(at_rad + request.travel_rad, joint.angle_max_rad)
         self.target_rad = at_rad
         self._way, self._left_s = 0, 0.0
 
@@ -92,7 +92,7 @@ class Jog:
             return self.target_rad
         target_rad = self.target_rad + self._way * self._request.speed_rad_s * period_s
         target_rad = float(np.clip(target_rad, measured_rad - AHEAD_RAD, measured_rad + AHEAD_RAD))
-        self.target_rad = float(np.clip(target_rad, self.least_rad, self.most_rad))
+        self.target_rad = float(np.clip(target_rad, self.lower_rad, self.upper_rad))
         return self.target_rad
 
 
@@ -124,7 +124,7 @@ class _Jogging:
         self._session, self._link, self._robot, self._joint = session, link, robot, joint
         self._request, self._status, self._over = request, status, False
         self._statuses = session.latched_reader(keys.STATUS, Status)
-        self._commanding = Commanding(session, robot, status.pace)
+        self._commanding = Commanding(session, robot, status.clock_mode)
         self._jog: Jog | None = None
 
     def go(self, keyboard: Keyboard) -> None:
@@ -132,11 +132,11 @@ class _Jogging:
         on_stop_signal(self._end)
         signal.signal(signal.SIGHUP, lambda *_: self._end())
         self._until(self._ready)
-        before, who = self._turn().arming, f"{user_name()[:40]}, joints jog"
+        before, who = self._turn().arm_session, f"{user_name()[:40]}, joints jog"
         # Checked or not: to find out how it is mounted is what this is for.
         self._ask(request_to_arm(self._robot, who, unchecked=True), "armed")
         try:
-            self._until(lambda: self._turn().arming > before)
+            self._until(lambda: self._turn().arm_session > before)
             self._follow(keyboard)
         finally:
             if self._turn().lifecycle == "armed":
@@ -146,7 +146,7 @@ class _Jogging:
         joint = self._robot.joints[self._joint]
         jog, moved = Jog(self._request, joint, self._angle_rad()), False
         self._jog = jog
-        say(f"{joint.name}: from {jog.least_rad:+.3f} to {jog.most_rad:+.3f} rad, at {jog.target_rad:+.3f}. {HELP}")
+        say(f"{joint.name}: from {jog.lower_rad:+.3f} to {jog.upper_rad:+.3f} rad, at {jog.target_rad:+.3f}. {HELP}")
         while not self._over and not keyboard.gone:
             for key in keyboard.keys(0.0):
                 self._over |= key == "q"
@@ -167,7 +167,7 @@ class _Jogging:
             modes[self._joint] = Mode.POSITION
             targets[self._joint] = at_rad if self._jog is None else self._jog.after(period_s, at_rad)
             limits_nm = [self._request.torque * joint.torque_limit_nm for joint in joints]
-            self._commanding.send(SetPoints(modes, targets, limits_nm))
+            self._commanding.send(Setpoints(modes, targets, limits_nm))
         return clock
 
     def _angle_rad(self) -> float:

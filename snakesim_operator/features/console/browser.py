@@ -36,9 +36,11 @@ class Browser(ServerConnection):
                 data = await super().recv(decode)
             except ConnectionClosed as closed:
                 if closed.sent is not None and closed.sent.code == TOO_BIG:
-                    self._admission.drop(self.viewer, "too long", f"more than {MOST_BYTES} bytes; it was hung up on")
+                    self._admission.drop(
+                        self.viewer, "too long", f"more than {MOST_BYTES} bytes; it was suspended up on"
+                    )
                 raise
-            await self._in_pace()
+            await self._in_clock_mode()
             try:
                 checked = self._admission.checked(self.viewer, data, self.age)
             except Exception as error:  # noqa: BLE001 - this connection's outermost loop: its next message may be a stop
@@ -51,7 +53,7 @@ class Browser(ServerConnection):
         """Refused: parts of messages cannot be checked."""
         raise NotImplementedError("messages of browsers are read whole")
 
-    async def _in_pace(self) -> None:
+    async def _in_clock_mode(self) -> None:
         now_s = time.monotonic()
         self._allowance = min(AT_ONCE, self._allowance + MOST_HZ * (now_s - self._since_s)) - 1.0
         self._since_s = now_s

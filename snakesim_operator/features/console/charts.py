@@ -12,7 +12,7 @@ from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.features.console.drawing import pushing_joint
 from snakesim_operator.features.console.snapshot import RobotSnapshot
 from snakesim_operator.features.console.stage import PROPELS
-from snakesim_operator.results.page.palette import joint_colours
+from snakesim_operator.results.page.palette import joint_colors
 
 HISTORY_S = 10.0
 SAMPLES_MOST = 400
@@ -120,10 +120,10 @@ def _range(most: Floats) -> Any:
 
 def over_time(gui: viser.GuiApi, names: Sequence[str], title: str, scale: Any = None, **more: Any) -> Any:
     """A chart with a line for each name, still empty. scale: of the values; None: as they come."""
-    colours = joint_colours(len(names), dark=True).values()
+    colors = joint_colors(len(names), dark=True).values()
     return gui.add_uplot(
         (np.zeros(1), *[np.full(1, np.nan)] * len(names)),
-        ({"label": "s"}, *(line(name, colour) for name, colour in zip(names, colours, strict=True))),
+        ({"label": "s"}, *(line(name, color) for name, color in zip(names, colors, strict=True))),
         title=title,
         height=190,
         scales={"x": {"time": False}, **(scale or {})},

@@ -52,7 +52,7 @@ def show_live(
         page = Page(server, around, operations, log, commission=commission)
         say(f"console: {address}")
         page.show(expected)
-        whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
+        whole = replace(link, max_bytes=MAX_IMAGE_BYTES)
         with open_session(whole, START_LIMIT_S) as session:
             operations.connect(session)
             watch, changes = Watch(session), Changes(log.write)

@@ -135,7 +135,7 @@ class Controls:
         self._show_unchecked(snapshot if mine else None)
         self._simulator.visible = mine and snapshot is not None and snapshot.robot.simulated_time
         self._time_speed.visible = (
-            snapshot is not None and snapshot.status is not None and snapshot.status.pace == "realtime"
+            snapshot is not None and snapshot.status is not None and snapshot.status.clock_mode == "realtime"
         )
         self._apply.disabled = not mine
         self._commissioning.show()

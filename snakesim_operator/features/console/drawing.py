@@ -11,9 +11,9 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.physics.hills import hills
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World, WorldContact
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.features.console.snapshot import RobotSnapshot
-from snakesim_operator.results.came_true import is_felt
+from snakesim_operator.results.force_tracking import is_measured
 
 M_PER_N, LONGEST_M = 0.02, 0.5  # of a force arrow
 ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts
@@ -45,8 +45,8 @@ class Surroundings:
 
     @cached_property
     def heights_m(self) -> tuple[Floats, Floats] | None:
-        """Uneven ground: coordinates of the samples along an edge (n,), heights (n, n) row by row along y."""
-        uneven = self.config.scene.ground.uneven
+        """Heightfield ground: coordinates of the samples along an edge (n,), heights (n, n) row by row along y."""
+        uneven = self.config.scene.ground.heightfield
         if uneven is None:
             return None
         heights = hills(uneven)
@@ -76,7 +76,7 @@ class Camera:
 class Drawing:
     """Everything that is drawn of one snapshot."""
 
-    centre_w: Floats  # of the body
+    center_w: Floats  # of the body
     links_w: Floats  # (links, 3) middle of each link
     links_wxyz: Floats  # (links, 4)
     hinges_w: Floats  # (joints, 3)
@@ -89,7 +89,7 @@ class Drawing:
     forces: Floats = field(default_factory=_no_arrows)  # measured, on the body
     solved: Floats = field(default_factory=_no_arrows)  # as the controller expects them where it feels its push-points
     asked: Floats = field(default_factory=_no_arrows)  # likewise, where no contact is felt
-    resultant: Floats = field(default_factory=_no_arrows)  # of the measured forces, at the centre
+    resultant: Floats = field(default_factory=_no_arrows)  # of the measured forces, at the center
     path_w: Floats = field(default_factory=_nothing)
     perceived: tuple[Obstacle, ...] = ()  # by guidance
     pushed: frozenset[str] = frozenset()  # obstacles that the body pushes off
@@ -109,7 +109,7 @@ def draw(snapshot: RobotSnapshot, around: Surroundings | None) -> Drawing | None
     trajectory, status = snapshot.trajectory, snapshot.status
     lost = set[str | None]() if status is None else {*status.isolated, *(fault.joint for fault in status.faults)}
     return Drawing(
-        centre_w=middles.mean(axis=0),
+        center_w=middles.mean(axis=0),
         links_w=middles,
         links_wxyz=quaternions_from_rotations(rotations),
         hinges_w=origins[1:],
@@ -151,10 +151,10 @@ def _felt(snapshot: RobotSnapshot) -> list[WorldContact]:
 
 def _pushed(snapshot: RobotSnapshot) -> frozenset[str]:
     points = snapshot.control.push_points if snapshot.control is not None else []
-    return frozenset(one.obstacle for one in points if one.obstacle and is_felt(one, _felt(snapshot)))
+    return frozenset(one.obstacle for one in points if one.obstacle and is_measured(one, _felt(snapshot)))
 
 
-def _forces(snapshot: RobotSnapshot, centre_w: Floats) -> dict[str, Floats]:
+def _forces(snapshot: RobotSnapshot, center_w: Floats) -> dict[str, Floats]:
     """Contacts and forces; at most as long as the body's contacts are known."""
     found: dict[str, Floats] = {}
     contacts = _felt(snapshot)
@@ -170,13 +170,13 @@ def _forces(snapshot: RobotSnapshot, centre_w: Floats) -> dict[str, Floats]:
         }
         total = force.sum(axis=0)
         if np.linalg.norm(total) > MIN_FORCE_N:
-            found["resultant"] = _forces_above(snapshot, centre_w[None], total[None])
+            found["resultant"] = _forces_above(snapshot, center_w[None], total[None])
     control = snapshot.control
-    if control is not None and control.push_points and len(control.push_points) == len(control.solved_force_n):
+    if control is not None and control.push_points and len(control.push_points) == len(control.desired_force_n):
         at = np.array([c.position_w for c in control.push_points])
         normal = np.array([c.normal_w for c in control.push_points])
-        solved = _forces_above(snapshot, at, np.array(control.solved_force_n)[:, None] * normal)
-        there = np.array([is_felt(point, contacts) for point in control.push_points])
+        solved = _forces_above(snapshot, at, np.array(control.desired_force_n)[:, None] * normal)
+        there = np.array([is_measured(point, contacts) for point in control.push_points])
         found |= {"solved": solved[there], "asked": solved[~there]}
     return found
 
@@ -199,7 +199,7 @@ def _on_ground(points_w: Floats, around: Surroundings | None) -> Floats:
     return np.column_stack([points_w, height + 0.006])
 
 
-def _camera(key: str, image: DepthImage | ColourImage, origins: Floats, rotations: Floats) -> Camera:
+def _camera(key: str, image: DepthImage | ColorImage, origins: Floats, rotations: Floats) -> Camera:
     link = rotations[image.link]
     looks = link @ rotation_from_quaternion(image.orientation_l_wxyz) @ LINK_FROM_FRUSTUM
     return Camera(

@@ -70,7 +70,7 @@ class StopPath(Protocol):
         ...
 
 
-class HandedOn(socket.socket):
+class HandoffListener(socket.socket):
     """What a server of asyncio takes for its listening socket: `accept` returns the connections that were put here."""
 
     def __init__(self, address: tuple[str, int]) -> None:
@@ -147,7 +147,7 @@ class Front:
     def __init__(
         self,
         listening: socket.socket,
-        handed_on: HandedOn,
+        handed_on: HandoffListener,
         stop: StopPath | None,
         refused: Callable[[str, str], None] = lambda _kind, _why: None,
         limits: ConnectionLimits | None = None,

@@ -61,7 +61,7 @@ def _drive(described: JointDescription, built: Joint | None) -> str:
     where: list[str] = []
     if built is not None:
         where = [f"id {built.id}", *([f"on {built.drive.port}"] if built.drive.port else [])]
-        where += [built.drive.family] if built.drive.family else []
+        where += [built.drive.driver] if built.drive.driver else []
     serial = f"serial {described.serial}" if described.serial else "no serial number"
     return ", ".join(
         [described.axis, *where, serial, *([f"firmware {described.firmware}"] if described.firmware else [])]

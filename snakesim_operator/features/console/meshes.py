@@ -12,7 +12,7 @@ ROUND = 32  # sides of what is round
 
 
 def capsule(length_m: float, radius_m: float) -> Mesh:
-    """Along x, from sphere's centre to sphere's centre `length_m`, about the origin."""
+    """Along x, from sphere's center to sphere's center `length_m`, about the origin."""
     angle = np.linspace(0.0, np.pi / 2, ROUND // 4)
     cap = np.column_stack([radius_m * np.sin(angle), length_m / 2 + radius_m * np.cos(angle)])
     vertices, faces = _turned(np.vstack([cap * [1.0, -1.0], cap[::-1]]))

@@ -93,7 +93,7 @@ class Operations:
         """Ask for a direction and a speed. acted_ns: robot time at which the viewer did; valid_ns: from then on."""
         if self._intents is not None:
             intent = Intent(
-                stamp_ns=acted_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=valid_ns
+                timestamp_ns=acted_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=valid_ns
             )
             self._intents.put(intent)
 

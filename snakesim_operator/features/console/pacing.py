@@ -18,7 +18,7 @@ ANSWER_LIMIT_S = 10.0  # a page that does not answer for so long gets one batch 
 KEY = "snakesim"  # of the browser's storage: never written, only asked for, because viser's page answers that in turn
 
 
-def pace(server: viser.ViserServer) -> None:
+def clock_mode(server: viser.ViserServer) -> None:
     """From now on, for each page that connects."""
     buffer = server._websock_server.get_message_buffer()
     windows = buffer.window_generator

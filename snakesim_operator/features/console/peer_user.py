@@ -15,7 +15,7 @@ SOCK_DIAG_BY_FAMILY, NLM_F_REQUEST = 20, 1
 ALL_STATES = 0xFFFFFFFF
 NO_COOKIE = b"\xff" * 8
 MESSAGE_HEADER = struct.Struct("=IHHII")  # struct nlmsghdr: length, type, flags, sequence, port
-REQUEST = struct.Struct("=BBBBI")  # struct inet_diag_req_v2 before its socket: family, protocol, ext, pad, states
+REQUEST = struct.Struct("=BBBBI")  # struct inet_diag_req_v2 before its socket: driver type, protocol, ext, pad, states
 PORTS = struct.Struct("!HH")  # struct inet_diag_sockid: source and destination, then both addresses, interface, cookie
 ADDRESS_BYTES = 16
 UID_OFFSET = MESSAGE_HEADER.size + 4 + 48 + 12  # of idiag_uid in struct inet_diag_msg

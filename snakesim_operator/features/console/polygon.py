@@ -45,20 +45,23 @@ def force_polygon(snapshot: RobotSnapshot) -> str:
 
 def push_point_table(control: ControlState | None) -> str:
     """Solved and measured force of each push-point, tail to head; empty when the controller solved for none."""
-    if control is None or not len(control.push_points) == len(control.solved_force_n) == len(control.felt_force_n) > 0:
+    if (
+        control is None
+        or not len(control.push_points) == len(control.desired_force_n) == len(control.measured_force_n) > 0
+    ):
         return ""
     rows = "".join(
-        f"<tr><td>{escape(point.obstacle or 'unnamed')}</td><td>{solved_n:.1f}</td>"
-        f"<td>{'unknown' if felt_n is None else f'{felt_n:.1f}'}</td></tr>"
-        for point, solved_n, felt_n in zip(
-            control.push_points, control.solved_force_n, control.felt_force_n, strict=True
+        f"<tr><td>{escape(point.obstacle or 'unnamed')}</td><td>{desired_force_n:.1f}</td>"
+        f"<td>{'unknown' if measured_force_n is None else f'{measured_force_n:.1f}'}</td></tr>"
+        for point, desired_force_n, measured_force_n in zip(
+            control.push_points, control.desired_force_n, control.measured_force_n, strict=True
         )
     )
     head = "<tr><th>push-point</th><th>solved, N</th><th>measured, N</th></tr>"
     return f"<table style='padding:.2em .6em;font-size:.85em;text-align:left;width:100%'>{head}{rows}</table>"
 
 
-def _arrow(a: stage.Floats, b: stage.Floats, colour: stage.Colour, px_per_n: float) -> str:
+def _arrow(a: stage.Floats, b: stage.Floats, color: stage.Color, px_per_n: float) -> str:
     """From a to b in pixels, with its size in newtons."""
     length = float(np.linalg.norm(b - a))
     if length < 1.0:
@@ -72,9 +75,9 @@ def _arrow(a: stage.Floats, b: stage.Floats, colour: stage.Colour, px_per_n: flo
     name_at = (a + b) / 2 + 20 * side
     name = (
         f"<text x='{name_at[0]:.1f}' y='{name_at[1] + 4:.1f}' font-size='11' text-anchor='middle' "
-        f"fill='rgb{colour}'>{length / px_per_n:.1f} N</text>"
+        f"fill='rgb{color}'>{length / px_per_n:.1f} N</text>"
     )
     return (
-        f"<path d='M{a[0]:.1f} {a[1]:.1f} L{neck[0]:.1f} {neck[1]:.1f}' stroke='rgb{colour}' stroke-width='3'/>"
-        f"<polygon points='{points}' fill='rgb{colour}'/>{name if length > NAMED_PX else ''}"
+        f"<path d='M{a[0]:.1f} {a[1]:.1f} L{neck[0]:.1f} {neck[1]:.1f}' stroke='rgb{color}' stroke-width='3'/>"
+        f"<polygon points='{points}' fill='rgb{color}'/>{name if length > NAMED_PX else ''}"
     )

@@ -31,7 +31,7 @@ class RecordedRun:
         self.record = RunRecord.load(kept, hear=self.heard.take)
         self.heard.robot = self.record.description
         outputs = (self.record.control, self.record.worlds, self.record.trajectories)
-        self._stamps = {id(messages): [_stamp_s(m) for m in messages] for messages in outputs}
+        self._stamps = {id(messages): [_timestamp_s(m) for m in messages] for messages in outputs}
         self._log = self._written()
 
     @property
@@ -76,7 +76,7 @@ class RecordedRun:
         """The log that a live page would have had, by robot time; times in it since the first tick."""
         lines: list[tuple[float, str]] = []
         told = [*self.heard.every(keys.STATUS), *self.heard.every(keys.SETTINGS_IN_FORCE)]
-        told += [(_stamp_s(state), state) for state in self.record.control]
+        told += [(_timestamp_s(state), state) for state in self.record.control]
         fresh: list[str] = []
         changes = Changes(fresh.append)
         for time_s, message in sorted(told, key=lambda one: one[0]):
@@ -98,7 +98,7 @@ class RecordedRun:
         count = len(angles)
         return JointState(
             tick=0,
-            stamp_ns=round(record.time_s[row] * 1e9),
+            timestamp_ns=round(record.time_s[row] * 1e9),
             angle_rad=np.where(known, angles, 0.0).tolist(),
             velocity_rad_s=_filled(record.velocity_rad_s[row]),
             torque_nm=_filled(record.torque_nm[row]),
@@ -110,7 +110,7 @@ class RecordedRun:
         record = self.record
         return AppliedCommand(
             tick=0,
-            stamp_ns=round(record.time_s[row] * 1e9),
+            timestamp_ns=round(record.time_s[row] * 1e9),
             sequence=None,
             mode=[Mode(mode) for mode in record.mode[row].tolist()],
             target=_filled(record.target[row]),
@@ -126,8 +126,8 @@ class RecordedRun:
         return (x, y, z), (w, i, j, k)
 
 
-def _stamp_s(message: ControlState | World | Trajectory) -> float:
-    return (message.stamp_ns or 0) * 1e-9
+def _timestamp_s(message: ControlState | World | Trajectory) -> float:
+    return (message.timestamp_ns or 0) * 1e-9
 
 
 def _filled(values: NDArray[np.float64]) -> list[float]:

@@ -23,7 +23,7 @@ class RecordedSignals:
         self._units = {name: unit_of(name, record) for name in self._columns}
         self._heard: dict[str, list[tuple[float, dict[str, float]]]] = {}
         told: dict[str, list[tuple[float, Any]]] = {
-            keys.CONTROL_STATE: [((one.stamp_ns or 0) * 1e-9, one) for one in record.control],
+            keys.CONTROL_STATE: [((one.timestamp_ns or 0) * 1e-9, one) for one in record.control],
             keys.POWER: list(run.heard.every(keys.POWER)),
             keys.IMU: list(run.heard.every(keys.IMU)),
         }

@@ -26,8 +26,8 @@ from snakesim_operator.base.console_port import LOOPBACK, address_of
 from snakesim_operator.base.page_origin import why_refused
 from snakesim_operator.features.console.admission import Admission
 from snakesim_operator.features.console.browser import MOST_BYTES, Browser
-from snakesim_operator.features.console.front import Front, HandedOn, StopPath
-from snakesim_operator.features.console.pacing import ask_page, pace
+from snakesim_operator.features.console.front import Front, HandoffListener, StopPath
+from snakesim_operator.features.console.pacing import ask_page, clock_mode
 
 MOST_VIEWERS = 64
 PAGES = ("/", "/index.html")
@@ -125,11 +125,11 @@ def page_server(
         stop: Stops the robot for the pages' backup stop; None for a recording.
         more: Answers requests for pages beside the console's; returns None for one that it does not have.
     """
-    admission, handed_on = Admission(report), HandedOn(listening.getsockname())
+    admission, handed_on = Admission(report), HandoffListener(listening.getsockname())
     with _on_our_terms(handed_on, admission, stop is not None, more), contextlib.redirect_stdout(io.StringIO()):
         server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)  # prints a banner
     server.admission = admission
-    pace(server)
+    clock_mode(server)
     with Front(listening, handed_on, stop, lambda kind, why: admission.drop(None, kind, why)):
         try:
             yield server, address_of(listening)
@@ -139,7 +139,7 @@ def page_server(
 
 
 @contextlib.contextmanager
-def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool, more: More) -> Iterator[None]:
+def _on_our_terms(handed_on: HandoffListener, admission: Admission, stops: bool, more: More) -> Iterator[None]:
     """Have viser's server take connections from the front, with our checks; viser has no option for either."""
     serve = websockets.asyncio.server.serve
     quiet = logging.getLogger(f"{__name__}.websockets")  # a stranger's bytes are counted, and are no errors of ours

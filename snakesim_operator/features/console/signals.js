@@ -17,7 +17,7 @@
     return answer;
   };
   const shown = (value) => value === null || value === undefined ? "–" : String(Number(value.toPrecision(4)));
-  const colour = (name) => getComputedStyle(root).getPropertyValue(name).trim();
+  const color = (name) => getComputedStyle(root).getPropertyValue(name).trim();
   const literal = (text) => text.replace(/[&<>]/g, (sign) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[sign]);
   const window_ = () => span === null ? [] : [["from_s", span[0]], ["to_s", span[1]]];
   const every = (plot) => [...plot.sides[0].names, ...plot.sides[1].names];
@@ -92,13 +92,13 @@
     draw(plot);
   };
   const figure = (plot) => {
-    const small = { size: 11.5, color: colour("--soft") };
-    const axis = { gridcolor: colour("--grid"), linecolor: colour("--faint"), zerolinecolor: colour("--rule"), tickfont: small };
+    const small = { size: 11.5, color: color("--soft") };
+    const axis = { gridcolor: color("--grid"), linecolor: color("--faint"), zerolinecolor: color("--rule"), tickfont: small };
     const names = every(plot).filter((name) => plot.data[name]);
     const known = names.flatMap((name) => plot.data[name].time_s);
     const layout = {
       height: PLOT_PX, margin: { l: WIDE, r: plots.some((one) => one.sides[1].names.length) ? WIDE : EDGE, t: 8, b: 34 }, showlegend: false, hovermode: false,
-      dragmode: "zoom", paper_bgcolor: colour("--card"), plot_bgcolor: colour("--card"), font: { size: 12, color: colour("--ink") },
+      dragmode: "zoom", paper_bgcolor: color("--card"), plot_bgcolor: color("--card"), font: { size: 12, color: color("--ink") },
       xaxis: { ...axis, title: { text: "time, s", font: small, standoff: 4 }, range: span ?? [known.reduce((a, b) => Math.min(a, b), Infinity), known.reduce((a, b) => Math.max(a, b), -Infinity)] },
     };
     plot.sides.forEach((side, i) => {
@@ -109,7 +109,7 @@
     const traces = names.map((name) => ({
       type: "scatter", mode: "lines", name: literal(`${name}, ${units[name]}`), x: plot.data[name].time_s, y: plot.data[name].values,
       yaxis: plot.sides[1].names.includes(name) ? "y2" : "y",
-      line: { color: colour(look(plot, name)), width: 1.5, dash: plot.sides[1].names.includes(name) ? "dash" : "solid" },
+      line: { color: color(look(plot, name)), width: 1.5, dash: plot.sides[1].names.includes(name) ? "dash" : "solid" },
     }));
     return [traces, layout];
   };

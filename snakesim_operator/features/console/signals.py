@@ -98,7 +98,7 @@ def numbers(message: Message, robot: Description) -> dict[str, float]:
 def units(kind: type[Message]) -> dict[str, str]:
     """Of each field that holds numbers with a unit."""
     fields = msgspec.json.schema(kind)["$defs"][kind.__name__]["properties"]
-    found = {name: _unit(about) for name, about in fields.items() if name != "stamp_ns"}
+    found = {name: _unit(about) for name, about in fields.items() if name != "timestamp_ns"}
     return {name: unit for name, unit in found.items() if unit is not None}
 
 

@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.console.signals import Signals
 from snakesim_operator.results.page.charts import LIBRARY, rounded, thinned
-from snakesim_operator.results.page.palette import DARK, LIGHT, joint_colours, variables
+from snakesim_operator.results.page.palette import DARK, LIGHT, joint_colors, variables
 
 HERE = Path(__file__).parent
 PATH = "/signals"
@@ -148,8 +148,8 @@ def _json(value: object) -> tuple[str, bytes]:
 
 def _themes() -> str:
     """Both, for a page that is told which one it has."""
-    light = variables(LIGHT | joint_colours(COLOURS, dark=False))
-    dark = variables(DARK | joint_colours(COLOURS, dark=True))
+    light = variables(LIGHT | joint_colors(COLOURS, dark=False))
+    dark = variables(DARK | joint_colors(COLOURS, dark=True))
     return f":root{{{light}}}:root.dark{{{dark}color-scheme:dark}}"
 
 

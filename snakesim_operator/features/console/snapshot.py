@@ -8,7 +8,7 @@ from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash, start_of
 from snakesim_hal.wire.messages import (
     AppliedCommand,
-    ColourImage,
+    ColorImage,
     Configuration,
     Contacts,
     ControlSettings,
@@ -55,7 +55,7 @@ class RobotSnapshot:
     configuration: Configuration | None = None
     power: Power | None = None
     imu: Imu | None = None
-    images: dict[str, DepthImage | ColourImage] = field(default_factory=dict)  # by key
+    images: dict[str, DepthImage | ColorImage] = field(default_factory=dict)  # by key
     own: dict[str, OwnSample] = field(default_factory=dict[str, OwnSample])  # of own sensors, by key
     streams: dict[str, Stream] = field(default_factory=dict)  # by key
     log: Sequence[str] = ()  # of a recording: what had become of the robot by then, newest first
@@ -75,7 +75,7 @@ def expected_of(config: RunConfig) -> RobotSnapshot:
     zero = [0.0] * len(robot.joints)
     joints = JointState(
         tick=0,
-        stamp_ns=0,
+        timestamp_ns=0,
         angle_rad=start.angles_rad.tolist(),
         velocity_rad_s=zero,
         torque_nm=zero,

@@ -20,10 +20,10 @@ from snakesim_operator.features.console.drawing import Camera, Drawing, Surround
 from snakesim_operator.features.console.meshes import Mesh, box, capsule, circle, cylinder, hoops, sphere
 from snakesim_operator.results.page.palette import LIGHT
 
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
 TRAIL_STEP_M, TRAIL_MOST = 0.02, 1000
-FOLLOW_SHARE = 0.08  # of the way to the snake's centre, in a frame
+FOLLOW_SHARE = 0.08  # of the way to the snake's center, in a frame
 FURTHEST_M = 0.5  # from the view's middle
 MAX_ROWS = 200  # of hills along an edge
 SEE_THROUGH = 0.5  # so that no obstacle hides the snake, or a force
@@ -39,18 +39,18 @@ SHAPES: dict[str, dict[str, Mesh]] = {
 }
 
 
-def colour(name: str) -> Colour:
-    """A colour of the palette that reports use."""
+def color(name: str) -> Color:
+    """A color of the palette that reports use."""
     text = LIGHT[name]
     return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
 
 
 LINK, LINK_EDGE, HEAD = (52, 92, 138), (70, 112, 160), (22, 46, 84)
-HINGE, LOST = (52, 58, 66), colour("bad")
-PROPELS = (64, 190, 255)  # against PUSHED: blue and orange, for any kind of colour vision
+HINGE, LOST = (52, 58, 66), color("bad")
+PROPELS = (64, 190, 255)  # against PUSHED: blue and orange, for any kind of color vision
 PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 200, 170)
 DASHES = np.arange(10.0).reshape(5, 2) / 9  # shares of a dashed line: from, to
-FELT, SOLVED, RESULTANT = colour("measured"), colour("commanded"), (20, 160, 90)
+FELT, SOLVED, RESULTANT = color("measured"), color("commanded"), (20, 160, 90)
 
 
 class Stage:
@@ -73,10 +73,10 @@ class Stage:
         hinge = cylinder(0.5 * self._thick, 2.12 * self._thick)
         self._hinges = self._batch("snake/hinges", hinge, len(robot.joints), HINGE)
         self._contacts = scene.add_point_cloud(
-            "/world/contacts/points", np.zeros((1, 3)), colour("ink"), point_size=0.4 * self._thick, visible=False
+            "/world/contacts/points", np.zeros((1, 3)), color("ink"), point_size=0.4 * self._thick, visible=False
         )
         self._trail_line = scene.add_line_segments(
-            "/world/trail", np.zeros((1, 2, 3)), colour("measured"), thickness=2.5, thickness_units="screen"
+            "/world/trail", np.zeros((1, 2, 3)), color("measured"), thickness=2.5, thickness_units="screen"
         )
         self._asked = scene.add_line_segments(
             "/world/forces/asked", np.zeros((1, 2, 3)), SOLVED, thickness=3.0, thickness_units="screen", visible=False
@@ -96,13 +96,13 @@ class Stage:
         last = len(self._robot.links) - 1
         for k, ((length_m, radius_m), numbers) in enumerate(alike.items()):
             batch = self._batch(f"snake/links_{k}", capsule(length_m, radius_m), len(numbers), LINK)
-            # Neighbours share a sphere at their joint: drawn a little thinner, they do not flicker.
+            # Neighbors share a sphere at their joint: drawn a little thinner, they do not flicker.
             batch.batched_scales = _single([[1.0, thin, thin] for thin in (1.0 - 0.012 * (i % 2) for i in numbers)])
             batch.batched_colors = _shades([HEAD if i == last else (LINK, LINK_EDGE)[i % 2] for i in numbers])
             found.append((batch, numbers))
         return found
 
-    def _batch(self, name: str, mesh: Mesh, count: int, of: Colour, **more: Any) -> viser.BatchedMeshHandle:
+    def _batch(self, name: str, mesh: Mesh, count: int, of: Color, **more: Any) -> viser.BatchedMeshHandle:
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}",
             *mesh,
@@ -171,10 +171,10 @@ class Stage:
         hoop = {"opacity": 1.0, "grown": 1.05, "side": "double", "cast_shadow": False}
         self._show_obstacles("perceived", drawing.perceived, SEEN, **hoop)
         if self._around is not None:
-            self._colour_obstacles(self._around.obstacles, drawing)
+            self._color_obstacles(self._around.obstacles, drawing)
         self._show_cameras(drawing.cameras)
-        self._extend_trail(drawing.centre_w)
-        self._follow(drawing.centre_w)
+        self._extend_trail(drawing.center_w)
+        self._follow(drawing.center_w)
 
     def forget(self) -> None:
         """Another place in time: the trail starts over."""
@@ -183,15 +183,15 @@ class Stage:
 
     def _mark_joints(self, drawing: Drawing) -> None:
         count = len(drawing.hinges_w)
-        colours = [HINGE] * count
+        colors = [HINGE] * count
         scales = np.ones((count, 3), dtype=np.float32)
         for i in drawing.failed:
-            colours[i], scales[i] = LOST, 1.25
+            colors[i], scales[i] = LOST, 1.25
         if drawing.pushing is not None:
-            colours[drawing.pushing], scales[drawing.pushing] = PROPELS, (1.9, 1.9, 1.25)
-        self._hinges.batched_colors, self._hinges.batched_scales = _shades(colours), scales
+            colors[drawing.pushing], scales[drawing.pushing] = PROPELS, (1.9, 1.9, 1.25)
+        self._hinges.batched_colors, self._hinges.batched_scales = _shades(colors), scales
 
-    def _show_arrows(self, name: str, points: Floats, of: Colour, thick: float) -> None:
+    def _show_arrows(self, name: str, points: Floats, of: Color, thick: float) -> None:
         arrows = self._arrows.get(name)
         if arrows is None:
             if not len(points):
@@ -230,7 +230,7 @@ class Stage:
             self._path.points = _single(pieces)
 
     def _show_obstacles(
-        self, name: str, obstacles: Sequence[Obstacle], of: Colour, *, opacity: float, grown: float = 1.0, **more: Any
+        self, name: str, obstacles: Sequence[Obstacle], of: Color, *, opacity: float, grown: float = 1.0, **more: Any
     ) -> None:
         for shape in SHAPES[name]:
             these = [obstacle for obstacle in obstacles if obstacle.shape == shape]
@@ -252,7 +252,7 @@ class Stage:
             if name == "perceived":
                 batch.batched_opacities = _single([0.4 + 0.6 * o.confidence for o in these])
 
-    def _colour_obstacles(self, obstacles: Sequence[Obstacle], drawing: Drawing) -> None:
+    def _color_obstacles(self, obstacles: Sequence[Obstacle], drawing: Drawing) -> None:
         """What the body pushes off, and what navigation expects it to."""
         for shape in SHAPES["true"]:
             batch = self._shapes.get(f"true/{shape}")
@@ -276,8 +276,8 @@ class Stage:
                 )
             frustum.position, frustum.wxyz = camera.position_w, camera.wxyz
 
-    def _extend_trail(self, centre_w: Floats) -> None:
-        on_ground = np.array([centre_w[0], centre_w[1], centre_w[2] - 0.8 * self._thick])
+    def _extend_trail(self, center_w: Floats) -> None:
+        on_ground = np.array([center_w[0], center_w[1], center_w[2] - 0.8 * self._thick])
         if self._trail and np.linalg.norm(on_ground - self._trail[-1]) < TRAIL_STEP_M:
             return
         self._trail.append(on_ground)
@@ -285,10 +285,10 @@ class Stage:
             line = np.array(self._trail, dtype=np.float32)
             self._trail_line.points = np.stack([line[:-1], line[1:]], axis=1)
 
-    def _follow(self, centre_w: Floats) -> None:
-        middle = centre_w if self._middle_w is None else self._middle_w + FOLLOW_SHARE * (centre_w - self._middle_w)
-        if np.linalg.norm(centre_w - middle) > FURTHEST_M:
-            middle = centre_w
+    def _follow(self, center_w: Floats) -> None:
+        middle = center_w if self._middle_w is None else self._middle_w + FOLLOW_SHARE * (center_w - self._middle_w)
+        if np.linalg.norm(center_w - middle) > FURTHEST_M:
+            middle = center_w
         self._middle_w = middle
         self._world.position = (-float(middle[0]), -float(middle[1]), 0.0)
 
@@ -298,9 +298,9 @@ def _single(values: ArrayLike) -> NDArray[np.float32]:
     return np.asarray(values, dtype=np.float32)
 
 
-def _shades(colours: Sequence[Colour]) -> NDArray[np.uint8]:
+def _shades(colors: Sequence[Color]) -> NDArray[np.uint8]:
     """Colours of instances, (n, 3): these viser takes as linear light, and all others as sRGB."""
-    srgb = np.array(colours) / 255
+    srgb = np.array(colors) / 255
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(255 * linear).astype(np.uint8)
 

@@ -25,7 +25,7 @@ def plain(text: object) -> str:
 
 
 def backend_in_words(robot: Description) -> tuple[str, str]:
-    """Returns what moves, in large letters, and its colour."""
+    """Returns what moves, in large letters, and its color."""
     kind = robot.backend.upper()[:12]
     if not robot.emulated:  # whatever the backend is called
         return f"REAL ROBOT ON {kind}", REAL
@@ -42,12 +42,12 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
         return _bar(
             "WAITING FOR THE ROBOT", RECORDED, f"{plain(snapshot.robot.robot)}, drawn as its scenario places it"
         )
-    words, colour = backend_in_words(snapshot.robot)
+    words, color = backend_in_words(snapshot.robot)
     where = f"{plain(snapshot.robot.robot)}{' · ' + plain(snapshot.robot.hardware) if snapshot.robot.hardware else ''}"
     status = snapshot.status
     if recorded:
-        words, colour, where = f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}"
-    lines = [_bar(words, colour, where)]
+        words, color, where = f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}"
+    lines = [_bar(words, color, where)]
     if status is not None and status.paused_by is not None:
         lines.append(_bar("PAUSED", RECORDED, f"by {plain(status.paused_by)}; robot time stands"))
     if len(snapshot.hosts) > 1:
@@ -63,18 +63,18 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
 
 
-def _state(word: str, colour: str, why: str, above: str) -> str:
-    """A word on a colour, and why."""
+def _state(word: str, color: str, why: str, above: str) -> str:
+    """A word on a color, and why."""
     return (
         f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{above}'>"
-        f"<span style='background:{colour};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
+        f"<span style='background:{color};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
         f"white-space:nowrap'>{plain(word)}</span><span>{plain(why)}</span></div>"
     )
 
 
-def _bar(words: str, colour: str, below: str) -> str:
+def _bar(words: str, color: str, below: str) -> str:
     return (
-        f"<div style='background:{colour};color:#fff;border-radius:6px;padding:.35em .6em;margin:.3em .6em .3em .3em'>"
+        f"<div style='background:{color};color:#fff;border-radius:6px;padding:.35em .6em;margin:.3em .6em .3em .3em'>"
         f"<div style='font-size:1.3em;font-weight:700;letter-spacing:.03em'>{plain(words)}</div>"
         f"<div style='opacity:.9'>{below}</div></div>"
     )
@@ -94,7 +94,7 @@ def state_table(snapshot: RobotSnapshot) -> str:
     if status is not None:
         time_s = "" if snapshot.time_s is None else f"{snapshot.time_s:.2f} s · "
         rows = [
-            ("robot time", f"{time_s}tick {status.tick}, {status.pace} at {status.rate_hz:g} Hz"),
+            ("robot time", f"{time_s}tick {status.tick}, {status.clock_mode} at {status.rate_hz:g} Hz"),
             ("lease", f"{plain(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
             ("alive", plain(", ".join(status.alive) or "none")),
             ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed"),
@@ -160,10 +160,10 @@ def log(lines: Iterable[str]) -> str:
 
 
 def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
-    """What the colours of the scene mean."""
+    """What the colors of the scene mean."""
     marks = "".join(
-        f"<span style='white-space:nowrap'><span style='color:rgb{colour}'>&#9632;</span> {plain(what)}</span> "
-        for what, colour in entries
+        f"<span style='white-space:nowrap'><span style='color:rgb{color}'>&#9632;</span> {plain(what)}</span> "
+        for what, color in entries
     )
     return f"<div style='padding:.2em .6em .9em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
 

@@ -15,7 +15,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (
     Clock,
-    ColourImage,
+    ColorImage,
     Configuration,
     DepthImage,
     Description,
@@ -115,7 +115,7 @@ class Watch:
         body, base = self._body(world)
         return RobotSnapshot(
             robot=robot,
-            time_s=None if clock is None else clock.stamp_ns * 1e-9,
+            time_s=None if clock is None else clock.timestamp_ns * 1e-9,
             silent_s=now_s - self._heard_s,
             status=newest(keys.STATUS),
             joints=newest(keys.JOINTS),
@@ -130,7 +130,7 @@ class Watch:
             configuration=self._configuration(robot),
             power=newest(keys.POWER),
             imu=newest(keys.IMU),
-            images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColourImage)},
+            images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColorImage)},
             own={key: found for key, found in self._newest.items() if isinstance(found, OwnSample)},
             streams=self._streams(clock),
             hosts=frozenset(host for host, at_s in self._hosts.items() if now_s - at_s < STATUS_LIMIT_S),
@@ -181,13 +181,17 @@ class Watch:
         """The joint state of the instant of the pose, and the pose: by guidance, else by motion capture."""
         pose: Pose | None = self._newest.get(keys.POSE)
         if world is not None:
-            of_ns = world.stamp_ns if world.base_position_sd_m is not None else world.pose_stamp_ns or world.stamp_ns
+            of_ns = (
+                world.timestamp_ns
+                if world.base_position_sd_m is not None
+                else world.pose_timestamp_ns or world.timestamp_ns
+            )
             base = (world.base_position_w, world.base_orientation_wxyz)
         elif pose is not None:
-            of_ns, base = pose.stamp_ns, (pose.position_w, pose.orientation_wxyz)
+            of_ns, base = pose.timestamp_ns, (pose.position_w, pose.orientation_wxyz)
         else:
             return (self._bodies[-1] if self._bodies else None), None
-        return min(self._bodies, key=lambda joints: abs(joints.stamp_ns - of_ns), default=None), base
+        return min(self._bodies, key=lambda joints: abs(joints.timestamp_ns - of_ns), default=None), base
 
     def _count(self) -> None:
         now_s, (since_s, before) = time.monotonic(), self._counted
@@ -206,5 +210,5 @@ class Watch:
 
 
 def _age_s(message: Any, clock: Clock | None) -> float | None:
-    stamp_ns = getattr(message, "stamp_ns", None)
-    return None if clock is None or stamp_ns is None else (clock.stamp_ns - stamp_ns) * 1e-9
+    timestamp_ns = getattr(message, "timestamp_ns", None)
+    return None if clock is None or timestamp_ns is None else (clock.timestamp_ns - timestamp_ns) * 1e-9

@@ -1,4 +1,4 @@
-"""Arguments of `snakesim evaluate`, `sweep` and `optimise`. Importable without the extra that they need."""
+"""Arguments of `snakesim evaluate`, `sweep` and `optimize`. Importable without the extra that they need."""
 
 import argparse
 import dataclasses
@@ -52,7 +52,7 @@ def add_commands(commands: Any) -> None:
     _add_shared(swept)
     swept.set_defaults(act=_sweep)
 
-    searched = commands.add_parser("optimise", help="search settings for the best mean of a number of the summary")
+    searched = commands.add_parser("optimize", help="search settings for the best mean of a number of the summary")
     searched.add_argument("scenario", help="name of a shipped scenario or path of its file; with --rows, of a suite")
     searched.add_argument("--rows", metavar="1,2,...", help="on these rows of a suite, with what it draws")
     searched.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
@@ -73,7 +73,7 @@ def add_commands(commands: Any) -> None:
     )
     _add_set(searched)
     _add_workers(searched)
-    searched.set_defaults(act=_optimise)
+    searched.set_defaults(act=_optimize)
 
 
 def _add_set(parser: argparse.ArgumentParser) -> None:
@@ -168,21 +168,21 @@ def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
     return {"again": shlex.join(["snakesim", *again]), **{name: getattr(arguments, name) for name in names}}
 
 
-def _optimise(arguments: argparse.Namespace) -> int:
+def _optimize(arguments: argparse.Namespace) -> int:
     _check_extra()
     from snakesim_hal.base.process import stop_signals_raise
     from snakesim_hal.base.terminal import say
-    from snakesim_operator.features.evaluate.optimise import Request, optimise
+    from snakesim_operator.features.evaluate.optimize import Request, optimize
     from snakesim_operator.run.conclusion import INTERRUPTED
     from snakesim_operator.run.folder import named_after
 
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}
     given["rows"] = _numbers(arguments.rows or "", "--rows")
     given["seed"] = 1 if arguments.seed is None else arguments.seed
-    storage = arguments.storage or named_after("optimise").with_suffix(".db")
+    storage = arguments.storage or named_after("optimize").with_suffix(".db")
     with stop_signals_raise():
         try:
-            return optimise(Request(**{**given, "storage": storage}))
+            return optimize(Request(**{**given, "storage": storage}))
         except KeyboardInterrupt:  # no trial that is done is lost
             if storage.is_file():
                 say(f"stopped: {storage} keeps the trials that are done; the same command goes on with")

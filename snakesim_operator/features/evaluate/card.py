@@ -32,9 +32,9 @@ METRICS = {  # number of the summary -> its name, digits, and of which runs the 
     "impulse_n_s_per_m": ("contact impulse, N·s/m", 1, OF_CROSSED),
     "torque_headroom": ("torque headroom", 2, OF_ALL),
     "form_closure": ("form closure, share of time", 3, OF_ALL),
-    "planning_share": ("planning, share of turns", 2, OF_ALL),
-    "solved_force_correlation": ("solved forces: correlation with measured", 2, OF_ALL),
-    "solved_force_error": ("solved forces: median error", 2, OF_ALL),
+    "planning_fraction": ("planning, share of turns", 2, OF_ALL),
+    "desired_force_correlation": ("solved forces: correlation with measured", 2, OF_ALL),
+    "desired_force_error": ("solved forces: median error", 2, OF_ALL),
     "empty_push_points": ("solved forces: push-points that carried nothing", 2, OF_ALL),
 }
 

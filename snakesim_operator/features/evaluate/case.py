@@ -48,7 +48,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     error: str | None = None  # why there was no run
 
 
-class TookTooLongError(BaseException):
+class TimeLimitError(BaseException):
     """Raised in a run whose wall time is over. No `Exception`: a controller's guard must not catch it."""
 
 
@@ -74,12 +74,12 @@ def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Outc
         try:
             asked = msgspec.json.decode(config, type=RunConfig)
             check(asked)
-            with closing(StepLimit(limit_s, error=TookTooLongError)) as limit, limit:
+            with closing(StepLimit(limit_s, error=TimeLimitError)) as limit, limit:
                 result = simulate(asked, until_goal=True, give_up_s=give_up_s, turn_limit_s=limit_s)
             return Outcome(
                 numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up and not result.summary.crossed}
             )
-        except TookTooLongError:
+        except TimeLimitError:
             return took_too_long(limit_s)
         except SnakesimError as error:
             return Outcome(error=str(error))

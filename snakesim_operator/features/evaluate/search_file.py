@@ -49,7 +49,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
 
     def in_words(self, storage: Path) -> str:
         """Returns the command that goes on with the search, as a user types it."""
-        words = ["snakesim", "optimise", self.scenario]
+        words = ["snakesim", "optimize", self.scenario]
         if self.rows:
             words += ["--rows", ",".join(map(str, self.rows))]
         for key, limits in self.vary.items():

@@ -139,8 +139,8 @@ def cases_of(suite: Suite, source: str, controllers: Sequence[str], fields: int,
     for number, setting in enumerate(settings, 1):
         for controller in controllers or [None]:
             chosen = [Override("controller", controller, f"--controllers {controller}")] if controller else []
-            pace = Override("pace", "lockstep", "--pace lockstep")
-            table = compose(suite.scenario, [pace, *chosen, *setting.overrides])
+            clock_mode = Override("clock_mode", "lockstep", "--clock-mode lockstep")
+            table = compose(suite.scenario, [clock_mode, *chosen, *setting.overrides])
             for field in range(seed, seed + fields):
                 config = _on_field(table, field, setting.draws)
                 if field == seed:

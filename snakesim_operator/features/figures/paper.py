@@ -175,10 +175,10 @@ def _forces(axes: Axes, balance: Balance) -> None:
     ]
     tether = f"$f_s$ {balance.commanded_n:.1f} N"
     drawn.append((balance.contacts[0].position_w[:2], balance.tether_n, tether, COMMANDED))
-    for at, force, name, colour in drawn:
+    for at, force, name, color in drawn:
         tip = np.array(at) + scale * np.asarray(force)
-        _arrow(axes, at, tip, colour)
-        axes.annotate(name, (tip[0], tip[1]), (3, 3), textcoords="offset points", fontsize=6.5, color=colour)
+        _arrow(axes, at, tip, color)
+        axes.annotate(name, (tip[0], tip[1]), (3, 3), textcoords="offset points", fontsize=6.5, color=color)
 
 
 def _polygon(axes: Axes, balance: Balance) -> None:
@@ -195,8 +195,8 @@ def _polygon(axes: Axes, balance: Balance) -> None:
     axes.set_aspect("equal")
 
 
-def _arrow(axes: Axes, start: Floats | tuple[float, ...], end: Floats | tuple[float, ...], colour: str) -> None:
-    look = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 7}
+def _arrow(axes: Axes, start: Floats | tuple[float, ...], end: Floats | tuple[float, ...], color: str) -> None:
+    look = {"arrowstyle": "-|>", "color": color, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 7}
     axes.annotate("", xy=tuple(end), xytext=tuple(start), arrowprops=look)
 
 

@@ -71,7 +71,7 @@ def _scenario(robot: Robot) -> tuple[str, ...]:
     """Returns the scenario and what changes it: the same for the host and for its services, which compare it."""
     words = [robot.scenario, "--backend", robot.backend]
     if uses_bus(robot):
-        words += ["--pace", "realtime"]  # the only one of drives on a bus, whatever the scenario says
+        words += ["--clock-mode", "realtime"]  # the only one of drives on a bus, whatever the scenario says
     for setting in (*host_settings(robot), *robot.set):
         words += ["--set", setting]
     return tuple(words)

@@ -268,10 +268,10 @@ def _put_links(table: Table, links: list[dict[str, Any]], axes: list[str], radiu
     table.put("chain", {"modules": len(axes), "axes": axes[:period]}, source)
     table.put("module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source)
     shares = [0.5] + [1.0] * len(middle) + [0.5]
-    if not all(_is_share(link, share, length_m, mass_kg) for link, share in zip(links, shares, strict=True)):
+    if not all(_is_fraction(link, share, length_m, mass_kg) for link, share in zip(links, shares, strict=True)):
         table.put("links", links, source)
 
 
-def _is_share(link: dict[str, Any], share: float, length_m: float, mass_kg: float) -> bool:
+def _is_fraction(link: dict[str, Any], share: float, length_m: float, mass_kg: float) -> bool:
     same = np.allclose([link["length_m"], link["mass_kg"]], [share * length_m, share * mass_kg], rtol=1e-9)
     return same and len(link) == 2

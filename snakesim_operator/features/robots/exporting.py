@@ -64,7 +64,7 @@ def _joint(robot: RobotFile, number: int, from_rear_m: float) -> list[str]:
         f'    <child link="link_{number}"/>',
         f'    <origin xyz="{from_rear_m!r} 0 0" rpy="0 0 0"/>',
         f'    <axis xyz="{AXES[joint.axis]}"/>',
-        f'    <limit lower="{limits.least_rad!r}" upper="{limits.most_rad!r}" effort="{limits.torque_nm!r}" '
+        f'    <limit lower="{limits.lower_rad!r}" upper="{limits.upper_rad!r}" effort="{limits.torque_nm!r}" '
         f'velocity="{limits.speed_rad_s!r}"/>',
         f'    <dynamics damping="{motor.viscous_nm_s_per_rad!r}" friction="{motor.friction_nm!r}"/>',
         "  </joint>",

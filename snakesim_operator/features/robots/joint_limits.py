@@ -47,8 +47,8 @@ NUMBERS = (
 class Turning:
     """How far a joint turns, by our sign."""
 
-    least_rad: float
-    most_rad: float
+    lower_rad: float
+    upper_rad: float
 
 
 def put_limits(found: Imported, joints: list[Joint], source: str, *, own: bool) -> None:
@@ -186,11 +186,11 @@ def _put_common_angles(found: Imported, angles: list[Turning], source: str) -> N
     limits = table.values.get("limits", {})
     for side in ("angle_min_rad", "angle_max_rad"):
         limits.pop(side, None)
-    table.put("limits.angle_rad", max(-common.least_rad, common.most_rad), source)
-    if -common.least_rad < common.most_rad:
-        table.put("limits.angle_min_rad", common.least_rad, source)
-    if -common.least_rad > common.most_rad:
-        table.put("limits.angle_max_rad", common.most_rad, source)
+    table.put("limits.angle_rad", max(-common.lower_rad, common.upper_rad), source)
+    if -common.lower_rad < common.upper_rad:
+        table.put("limits.angle_min_rad", common.lower_rad, source)
+    if -common.lower_rad > common.upper_rad:
+        table.put("limits.angle_max_rad", common.upper_rad, source)
 
 
 def _put_exceptions(
@@ -200,8 +200,8 @@ def _put_exceptions(
     differ: dict[str, list[str]] = {}
     for i, built in enumerate(decode(found.table, RobotFile).joint_table):
         wanted = [
-            ("angle_min_rad", angles[i].least_rad, built.limits.least_rad, "rad"),
-            ("angle_max_rad", angles[i].most_rad, built.limits.most_rad, "rad"),
+            ("angle_min_rad", angles[i].lower_rad, built.limits.lower_rad, "rad"),
+            ("angle_max_rad", angles[i].upper_rad, built.limits.upper_rad, "rad"),
         ]
         for number in NUMBERS:
             section = built.limits if number.is_limit else built.motor

@@ -136,12 +136,12 @@ def _place(found: Imported, link_from_sensor: Floats, sensor: Element) -> dict[s
 
 
 def _camera(found: Imported, sensor: Element) -> dict[str, Any]:
-    values: dict[str, Any] = {"colour": sensor.attributes["type"] == "rgbd_camera"}
+    values: dict[str, Any] = {"color": sensor.attributes["type"] == "rgbd_camera"}
     camera = sensor.first("camera")
     if camera is None:
         sensor.note_absent("<camera>", "160 x 120 pixels over 1.5708 rad, from 0.1 to 5 m")
         return values
-    values["view_rad"] = camera.text_number("horizontal_fov", 1.5708)
+    values["fov_rad"] = camera.text_number("horizontal_fov", 1.5708)
     image = camera.first("image")
     if image is None:
         camera.note_absent("<image>", "160 x 120 pixels")
@@ -168,7 +168,7 @@ def _lidar(found: Imported, sensor: Element, placed: dict[str, Any]) -> dict[str
         last_rad = horizontal.text_number("max_angle", 0.0)
         middle_rad = (first_rad + last_rad) / 2
         values["beams"] = beams
-        values["view_rad"] = last_rad - first_rad if beams > 1 else 0.0
+        values["fov_rad"] = last_rad - first_rad if beams > 1 else 0.0
         if abs(middle_rad) > 1e-9:
             values["yaw_rad"] = round(placed["yaw_rad"] + middle_rad, 9)
             found.changes.add(
@@ -230,14 +230,14 @@ def gazebo_lines(robot: RobotFile) -> list[str]:
         ends = f"{sensor.range_min_m!r}", f"{sensor.range_max_m!r}"
         noise = f"<noise><type>gaussian</type><stddev>{sensor.noise_m!r}</stddev></noise>"
         if isinstance(sensor, DepthCamera):
-            kind = "rgbd_camera" if sensor.colour else "depth_camera"
+            kind = "rgbd_camera" if sensor.color else "depth_camera"
             body.append(
-                f"<camera><horizontal_fov>{sensor.view_rad!r}</horizontal_fov>"
+                f"<camera><horizontal_fov>{sensor.fov_rad!r}</horizontal_fov>"
                 f"<image><width>{sensor.width}</width><height>{sensor.height}</height></image>"
                 f"<clip><near>{ends[0]}</near><far>{ends[1]}</far></clip>{noise}</camera>"
             )
         else:
-            kind, half = "gpu_lidar", sensor.view_rad / 2
+            kind, half = "gpu_lidar", sensor.fov_rad / 2
             body.append(
                 f"<lidar><scan><horizontal><samples>{sensor.beams}</samples><min_angle>{-half!r}</min_angle>"
                 f"<max_angle>{half!r}</max_angle></horizontal></scan>"

@@ -29,7 +29,7 @@ class Body:
     links: list[str] = field(default_factory=list[str])
     places: list[str] = field(default_factory=list[str])  # of these links, for a report
     mass_kg: float = 0.0
-    moment: Floats = field(default_factory=lambda: np.zeros(3))  # mass x centre
+    moment: Floats = field(default_factory=lambda: np.zeros(3))  # mass x center
     second: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # inertia about the root's origin
     points: list[Floats] = field(default_factory=list[Floats])  # of the outline, each (n, 3)
     shapes: list[Element] = field(default_factory=list[Element])  # that have these points
@@ -38,7 +38,7 @@ class Body:
     frames: dict[str, Floats] = field(default_factory=dict[str, Floats])  # root_from_link of each link, (4, 4)
 
     def add_mass(self, mass_kg: float, center: Floats, inertia: Floats) -> None:
-        """inertia: about the centre, (3, 3)."""
+        """inertia: about the center, (3, 3)."""
         self.mass_kg += mass_kg
         self.moment += mass_kg * center
         self.second += inertia + mass_kg * (center @ center * np.eye(3) - np.outer(center, center))
@@ -50,7 +50,7 @@ class Body:
 
     @property
     def inertia(self) -> Floats:
-        """About the centre of mass, (3, 3)."""
+        """About the center of mass, (3, 3)."""
         c = self.center
         return self.second - self.mass_kg * (c @ c * np.eye(3) - np.outer(c, c))
 

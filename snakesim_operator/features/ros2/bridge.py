@@ -102,7 +102,7 @@ class Bridge:
 
     def _put_static(self) -> None:
         fixed = [*self._frames.fixed, *(one for some in self._sensors.values() for one in some)]
-        now_ns = self._ros_time.of(0 if self._clock is None else self._clock.stamp_ns)
+        now_ns = self._ros_time.of(0 if self._clock is None else self._clock.timestamp_ns)
         self._tf_static.put(ros.transforms(now_ns, fixed))
 
     def _make_relays(self, robot: m.Description) -> list[Relay[Any]]:
@@ -122,9 +122,9 @@ class Bridge:
             if key == keys.depth(name):
                 translated = (robot_in_ros.depth_image, robot_in_ros.compressed_depth)
                 made.append(self._camera(key, name, "depth", m.DepthImage, translated, images))
-            elif key == keys.colour(name):
-                translated = (robot_in_ros.colour_image, robot_in_ros.compressed_colour)
-                made.append(self._camera(key, name, "color", m.ColourImage, translated, images))
+            elif key == keys.color(name):
+                translated = (robot_in_ros.color_image, robot_in_ros.compressed_color)
+                made.append(self._camera(key, name, "color", m.ColorImage, translated, images))
             elif key == keys.ranges(name):
                 made.append(self._mounted(key, name, "scan", ros.LASER_SCAN, robot_in_ros.laser_scan))
         for key, kind in own_kinds(robot).items():
@@ -152,13 +152,13 @@ class Bridge:
         )
         infos = self._publisher(f"{topic}/camera_info", ros.CAMERA_INFO, depth=1)
 
-        def pass_on(seen: m.DepthImage | m.ColourImage) -> None:
-            frame, stamp_ns = self._frames.optical(kind, name), self._ros_time.of(seen.stamp_ns)
+        def pass_on(seen: m.DepthImage | m.ColorImage) -> None:
+            frame, timestamp_ns = self._frames.optical(kind, name), self._ros_time.of(seen.timestamp_ns)
             self._place(key, self._frames.of_camera(kind, name, seen))
-            infos.put(robot_in_ros.camera_info(stamp_ns, frame, seen))
+            infos.put(robot_in_ros.camera_info(timestamp_ns, frame, seen))
             for publisher, translate in zip(images, translated, strict=True):
                 if publisher.heard():
-                    publisher.put(translate(stamp_ns, frame, seen))
+                    publisher.put(translate(timestamp_ns, frame, seen))
 
         def wanted() -> bool:
             return infos.heard() or any(publisher.heard() for publisher in images)
@@ -174,7 +174,7 @@ class Bridge:
 
         def pass_on(seen: m.MountedSample) -> None:
             self._place(key, self._frames.of_mount(name, seen))
-            publisher.put(translate(self._ros_time.of(seen.stamp_ns), self._frames.mount(name), seen))
+            publisher.put(translate(self._ros_time.of(seen.timestamp_ns), self._frames.mount(name), seen))
 
         return Relay(self._session, key, message, 1, pass_on, publisher.heard)
 
@@ -188,9 +188,9 @@ class Bridge:
 
     def _on_joints(self, joints: m.JointState) -> None:
         self._joints = joints
-        stamp_ns = self._ros_time.of(joints.stamp_ns)
-        self._joint_states.put(robot_in_ros.joint_state(stamp_ns, self._names, joints))
-        self._tf.put(ros.transforms(stamp_ns, self._frames.of_joints(joints)))
+        timestamp_ns = self._ros_time.of(joints.timestamp_ns)
+        self._joint_states.put(robot_in_ros.joint_state(timestamp_ns, self._names, joints))
+        self._tf.put(ros.transforms(timestamp_ns, self._frames.of_joints(joints)))
 
     def _on_imu(self, seen: m.Imu) -> None:
         for entry, link in enumerate(seen.link):
@@ -199,23 +199,23 @@ class Bridge:
                 self._imus[link] = self._publisher(f"{name}/imu", ros.IMU)
             self._place(f"{keys.IMU}/{link}", [self._frames.of_imu(link)])
             if self._imus[link].heard():
-                stamp_ns = self._ros_time.of(seen.stamp_ns)
-                self._imus[link].put(robot_in_ros.imu(stamp_ns, self._frames.imu(link), seen, entry))
+                timestamp_ns = self._ros_time.of(seen.timestamp_ns)
+                self._imus[link].put(robot_in_ros.imu(timestamp_ns, self._frames.imu(link), seen, entry))
 
     def _on_world(self, world: m.World) -> None:
         self._world = self._placed = world
         self._world_s = time.monotonic()
-        reckoned = world.base_position_sd_m is not None or world.pose_stamp_ns is None
-        at_ns = world.stamp_ns if reckoned else world.pose_stamp_ns or world.stamp_ns
+        reckoned = world.base_position_sd_m is not None or world.pose_timestamp_ns is None
+        at_ns = world.timestamp_ns if reckoned else world.pose_timestamp_ns or world.timestamp_ns
         self._tf.put(ros.transforms(self._ros_time.of(at_ns), [self._frames.of_base(world)]))
 
     def _on_pose(self, pose: m.Pose) -> None:
         """Where the base is, while no guidance says it."""
         if time.monotonic() - self._world_s > SILENT_S:
-            self._tf.put(ros.transforms(self._ros_time.of(pose.stamp_ns), [self._frames.of_base(pose)]))
+            self._tf.put(ros.transforms(self._ros_time.of(pose.timestamp_ns), [self._frames.of_base(pose)]))
 
     def _on_status(self, status: m.Status) -> None:
-        self._diagnostics.put(robot_in_ros.diagnostics(self._ros_time.of(status.stamp_ns), status))
+        self._diagnostics.put(robot_in_ros.diagnostics(self._ros_time.of(status.timestamp_ns), status))
 
     # --- the loop
 
@@ -242,10 +242,10 @@ class Bridge:
             if self._clock is not None and clock.tick < self._clock.tick:
                 self._ros_time.start_over()
                 say("the robot's host has restarted: its time starts over")
-            self._ros_time.heard(clock.stamp_ns)
+            self._ros_time.heard(clock.timestamp_ns)
             self._clock = clock
             if self._ros_clock is not None:
-                self._ros_clock.put(ros.clock(clock.stamp_ns))
+                self._ros_clock.put(ros.clock(clock.timestamp_ns))
             if self._heard_s is None:
                 say("the robot is back")
             self._heard_s = now_s
@@ -257,11 +257,11 @@ class Bridge:
             self._meet(described)
 
     def _draw(self, world: m.World) -> None:
-        at_ns = world.stamp_ns if world.contacts_stamp_ns is None else world.contacts_stamp_ns
+        at_ns = world.timestamp_ns if world.contacts_timestamp_ns is None else world.contacts_timestamp_ns
         contacts = robot_in_ros.contact_markers(world.contacts)
         self._contacts.put(ros.markers(self._ros_time.of(at_ns), self._frames.odom, contacts))
         obstacles = robot_in_ros.obstacle_markers(world)
-        self._obstacles.put(ros.markers(self._ros_time.of(world.stamp_ns), self._frames.odom, obstacles))
+        self._obstacles.put(ros.markers(self._ros_time.of(world.timestamp_ns), self._frames.odom, obstacles))
 
     def _steer(self) -> None:
         """What ROS asks for; nothing while the robot is silent, because an intent needs its time."""
@@ -269,7 +269,7 @@ class Bridge:
         if twist is None or self._clock is None or self._heard_s is None:
             return
         age_ns = self._senders.age_ns(twist, time.time_ns(), time.monotonic_ns())
-        intent = self._steering.intent(twist.payload, self._clock.stamp_ns, self._heading_w_rad(), age_ns)
+        intent = self._steering.intent(twist.payload, self._clock.timestamp_ns, self._heading_w_rad(), age_ns)
         if intent is not None:
             self._intents.put(intent)
         elif self._steering.why != self._said:

@@ -1,7 +1,7 @@
 """Joint commands from ROS, as the robot's control service: a client with a lease, like any other, in a thread.
 
 Without the lease nothing is sent. Whatever ends the bridge ends the lease within 50 to 100 ms, and an armed robot goes
-into its safe action.
+into its stop mode.
 """
 
 import contextlib
@@ -62,7 +62,7 @@ class Driving:
         status = session.latest(keys.STATUS, Status, PRESENT_S)
         if robot is None or status is None:
             raise NotConnectedError("the robot does not describe itself; is its HAL host running?")
-        commanding, targets = Commanding(session, robot, status.pace), JointTargets(robot)
+        commanding, targets = Commanding(session, robot, status.clock_mode), JointTargets(robot)
         self._tell(f"joint commands from ROS move {robot.robot} once it is armed")
         while not self._ended.is_set():
             clock = commanding.wait()
@@ -71,12 +71,12 @@ class Driving:
             for message in self._messages.drain():
                 wall_ns = time.time_ns()
                 age_ns = self._senders.age_ns(message, wall_ns, time.monotonic_ns())
-                ros_now_ns = wall_ns if self._wall_time else clock.stamp_ns
-                if not targets.take(message.payload, clock.stamp_ns, ros_now_ns, age_ns):
+                ros_now_ns = wall_ns if self._wall_time else clock.timestamp_ns
+                if not targets.take(message.payload, clock.timestamp_ns, ros_now_ns, age_ns):
                     self._tell(f"a message on joint_commands {targets.why}; it is dropped, with all that are alike")
             joints = commanding.read(keys.JOINTS)
             if isinstance(joints, JointState) and (commanding.mine or clock.lifecycle != "armed"):
-                points = targets.set_points(clock, joints)
+                points = targets.setpoints(clock, joints)
                 if commanding.mine:
                     commanding.send(points)
 

@@ -10,7 +10,7 @@ Links are named as in the robot's description. An optical frame has z forward, x
 import math
 import re
 
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, JointState, MountedSample, Pose, World
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, JointState, MountedSample, Pose, World
 from snakesim_operator.features.ros2.messages import Transform, Triple, Wxyz
 
 MAP = "map"
@@ -71,7 +71,7 @@ class Frames:
                 found.append(Transform(self.link(i), self.link(i + 1), position, turn))
         return found
 
-    def of_camera(self, kind: str, camera: str, seen: DepthImage | ColourImage) -> list[Transform]:
+    def of_camera(self, kind: str, camera: str, seen: DepthImage | ColorImage) -> list[Transform]:
         """A camera on its link, and its optical frame in it."""
         optical = self.optical(kind, camera)
         body = optical.replace("_optical_frame", "_frame")

@@ -76,9 +76,9 @@ class NodeName:
     namespace: str = "/"
 
 
-def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """Of one sample. stamp_ns: wall clock of the sender; gid: of the publisher, GID_BYTES long."""
-    return ATTACHED.pack(sequence, stamp_ns, GID_BYTES, gid)
+def attachment(sequence: int, timestamp_ns: int, gid: bytes) -> bytes:
+    """Of one sample. timestamp_ns: wall clock of the sender; gid: of the publisher, GID_BYTES long."""
+    return ATTACHED.pack(sequence, timestamp_ns, GID_BYTES, gid)
 
 
 def answering(request: bytes) -> bytes | None:

@@ -34,7 +34,7 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
             f"let into its network. On one computer give the robot another port: --endpoint tcp/127.0.0.1:7448 behind "
             "`snakesim run`; this command finds it there"
         )
-    with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
+    with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, STARTING_S, is_consistent)
         if robot is None:
             raise NotConnectedError(f"{link.namespace} does not describe itself within {STARTING_S:g} s")
@@ -48,7 +48,7 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
         )
         with contextlib.ExitStack() as opened:
             try:
-                network = opened.enter_context(open_foreign_network(arguments.ros_router, largest_bytes=MAX_IN_BYTES))
+                network = opened.enter_context(open_foreign_network(arguments.ros_router, max_bytes=MAX_IN_BYTES))
             except NotConnectedError:
                 raise NotConnectedError(
                     f"no router of ROS nodes on {arguments.ros_router}; start it by "

@@ -1,4 +1,4 @@
-"""From sensor_msgs/JointState on joint_commands to set-points for every joint. Pure except for its own state.
+"""From sensor_msgs/JointState on joint_commands to setpoints for every joint. Pure except for its own state.
 
 A message names any joints. Each of them follows what it was told for half a second of robot time, from when the message
 was sent on, then stays where it is; so does every joint of which nothing was said since arming. What is said while the
@@ -11,7 +11,7 @@ from typing import Any
 
 from rosbags.serde import SerdeError
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.wire.messages import Clock, Description, JointState, Mode
 from snakesim_operator.features.ros2.message_age import why_too_old
 from snakesim_operator.features.ros2.messages import JOINT_STATE, STORE
@@ -26,7 +26,7 @@ class _Commanded:
 
     mode: Mode
     targets: dict[int, float]  # by joint
-    stamp_ns: int  # of its header, in ROS time; 0: none
+    timestamp_ns: int  # of its header, in ROS time; 0: none
 
 
 class JointTargets:
@@ -54,8 +54,8 @@ class JointTargets:
         if isinstance(commanded, str):
             return self._reject(commanded)
         by = "the times of its sender's messages"
-        if commanded.stamp_ns:
-            age_ns = (now_ns if ros_now_ns is None else ros_now_ns) - commanded.stamp_ns
+        if commanded.timestamp_ns:
+            age_ns = (now_ns if ros_now_ns is None else ros_now_ns) - commanded.timestamp_ns
             by = "the stamp of its header"
         if why := why_too_old(age_ns, by):
             return self._reject(why)
@@ -70,7 +70,7 @@ class JointTargets:
         self.why = why
         return False
 
-    def set_points(self, clock: Clock, joints: JointState) -> SetPoints:
+    def setpoints(self, clock: Clock, joints: JointState) -> Setpoints:
         """For this tick. An arming begins with staying."""
         count = len(self._robot.joints)
         if clock.lifecycle != "armed":
@@ -78,7 +78,7 @@ class JointTargets:
         modes, targets = [Mode.POSITION] * count, [0.0] * count
         for i in range(count):
             told = self._told[i]
-            if told is not None and clock.stamp_ns <= told[2]:
+            if told is not None and clock.timestamp_ns <= told[2]:
                 modes[i], targets[i] = told[0], told[1]
                 continue
             self._told[i] = None
@@ -86,7 +86,7 @@ class JointTargets:
             if stays_rad is None:  # where it is now, not where it sinks to
                 self._stays_rad[i] = stays_rad = joints.angle_rad[i]
             targets[i] = stays_rad
-        return SetPoints(modes, targets, self._limits_nm)
+        return Setpoints(modes, targets, self._limits_nm)
 
     def _read(self, payload: bytes) -> "_Commanded | str":
         """What a message commands; a text: what is wrong with it."""
@@ -110,5 +110,5 @@ class JointTargets:
             if not joint.has(mode):
                 return f"has {word} for {name}, whose drive takes {', '.join(one.name.lower() for one in joint.modes)}"
             targets[self._index[name]] = value
-        stamp_ns = found.header.stamp.sec * 1_000_000_000 + found.header.stamp.nanosec
-        return _Commanded(mode, targets, stamp_ns)
+        timestamp_ns = found.header.stamp.sec * 1_000_000_000 + found.header.stamp.nanosec
+        return _Commanded(mode, targets, timestamp_ns)

@@ -35,7 +35,7 @@ class _Quickest:
             self._parts.append((part, offset_in_part_ns))
         else:
             self._parts.append((part, offset_ns))
-        return offset_ns - min(least_ns for _, least_ns in self._parts)
+        return offset_ns - min(min_ns for _, min_ns in self._parts)
 
 
 class SenderClocks:

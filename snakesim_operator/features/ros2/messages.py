@@ -77,13 +77,13 @@ def made(name: str, *fields: Any) -> Any:
     return known[name](*fields)
 
 
-def _time(stamp_ns: int) -> Any:
-    return made("builtin_interfaces/msg/Time", min(stamp_ns // 10**9, LAST_SECOND), stamp_ns % 10**9)
+def _time(timestamp_ns: int) -> Any:
+    return made("builtin_interfaces/msg/Time", min(timestamp_ns // 10**9, LAST_SECOND), timestamp_ns % 10**9)
 
 
-def header(stamp_ns: int, frame: str) -> Any:
+def header(timestamp_ns: int, frame: str) -> Any:
     """Of a message. frame: empty for one that has none."""
-    return made("std_msgs/msg/Header", _time(stamp_ns), frame)
+    return made("std_msgs/msg/Header", _time(timestamp_ns), frame)
 
 
 def vector(xyz: Triple) -> Any:
@@ -104,9 +104,9 @@ def _octets(raw: bytes) -> np.ndarray:
     return np.frombuffer(raw, dtype=np.uint8)
 
 
-def clock(stamp_ns: int) -> bytes:
+def clock(timestamp_ns: int) -> bytes:
     """rosgraph_msgs/Clock."""
-    return sent(CLOCK, _time(stamp_ns))
+    return sent(CLOCK, _time(timestamp_ns))
 
 
 def string(text: str) -> bytes:
@@ -114,43 +114,43 @@ def string(text: str) -> bytes:
     return sent(STRING, text)
 
 
-def transforms(stamp_ns: int, all_of_them: Sequence[Transform]) -> bytes:
+def transforms(timestamp_ns: int, all_of_them: Sequence[Transform]) -> bytes:
     """tf2_msgs/TFMessage."""
-    return sent(TRANSFORMS, [_transform(stamp_ns, one) for one in all_of_them])
+    return sent(TRANSFORMS, [_transform(timestamp_ns, one) for one in all_of_them])
 
 
-def _transform(stamp_ns: int, one: Transform) -> Any:
+def _transform(timestamp_ns: int, one: Transform) -> Any:
     pose = made("geometry_msgs/msg/Transform", vector(one.position_m), quaternion(one.orientation_wxyz))
-    return made("geometry_msgs/msg/TransformStamped", header(stamp_ns, one.parent), one.child, pose)
+    return made("geometry_msgs/msg/TransformStamped", header(timestamp_ns, one.parent), one.child, pose)
 
 
-def markers(stamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
+def markers(timestamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
     """visualization_msgs/MarkerArray that replaces everything on its topic."""
-    head = header(stamp_ns, frame)
+    head = header(timestamp_ns, frame)
     cleared = _marker(head, 0, DELETE_ALL, Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
     return sent(MARKERS, [cleared, *(_marker(head, number, ADD, shape) for number, shape in enumerate(shapes))])
 
 
 def _marker(head: Any, number: int, action: int, shape: Marker) -> Any:
     pose = made("geometry_msgs/msg/Pose", _point(shape.position_m), quaternion(shape.orientation_wxyz))
-    colour = made("std_msgs/msg/ColorRGBA", *shape.rgba)
+    color = made("std_msgs/msg/ColorRGBA", *shape.rgba)
     until_replaced = made("builtin_interfaces/msg/Duration", 0, 0)
-    drawn = (pose, vector(shape.size_m), colour, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
+    drawn = (pose, vector(shape.size_m), color, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
     no_texture = ("", made("sensor_msgs/msg/CompressedImage", header(0, ""), "", _octets(b"")), [])
     no_mesh = ("", made("visualization_msgs/msg/MeshFile", "", _octets(b"")), False)
     what = (shape.group, number, shape.shape, action)
     return made("visualization_msgs/msg/Marker", head, *what, *drawn, *no_texture, "", *no_mesh)
 
 
-def image(stamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
+def image(timestamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
     """sensor_msgs/Image. encoding: 16UC1 (mm), 32FC1 (m) or rgb8; rows without padding, little endian."""
     size = (height, width, encoding, 0, len(pixels) // height)
-    return sent(IMAGE, header(stamp_ns, frame), *size, _octets(pixels))
+    return sent(IMAGE, header(timestamp_ns, frame), *size, _octets(pixels))
 
 
-def compressed_image(stamp_ns: int, frame: str, described: str, data: bytes) -> bytes:
+def compressed_image(timestamp_ns: int, frame: str, described: str, data: bytes) -> bytes:
     """sensor_msgs/CompressedImage. described: its `format`, as the plug-ins of image_transport read it."""
-    return sent(COMPRESSED_IMAGE, header(stamp_ns, frame), described, _octets(data))
+    return sent(COMPRESSED_IMAGE, header(timestamp_ns, frame), described, _octets(data))
 
 
 def six_doubles(twist: bytes) -> tuple[float, ...] | None:

@@ -48,7 +48,7 @@ class Steering:
         speed_m_s, turn_rad_s = numbers[0], numbers[5]
         self._turn(turn_rad_s, now_ns, body_w_rad)
         return Intent(
-            stamp_ns=max(now_ns - age_ns, 0),
+            timestamp_ns=max(now_ns - age_ns, 0),
             who=WHO,
             speed_m_s=speed_m_s,
             go=speed_m_s != 0.0,

@@ -36,7 +36,7 @@ class Aligned:
 def align(a: RunRecord, b: RunRecord) -> Aligned:
     """Tick by tick where the ticks coincide; else both at the ticks of the one that has fewer.
 
-    What is measured is interpolated between ticks; a set-point holds until the next one.
+    What is measured is interpolated between ticks; a setpoint holds until the next one.
     """
     time_a, time_b = a.time_s - zero_s(a), b.time_s - zero_s(b)
     until_s = min(float(time_a[-1]), float(time_b[-1])) + SAME_INSTANT_S

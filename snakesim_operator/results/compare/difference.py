@@ -29,7 +29,7 @@ TARGETS = (
 
 
 @dataclass(frozen=True)
-class LargestDifference:
+class MaxDifference:
     """The largest difference, and where and when it was."""
 
     joint: int
@@ -51,16 +51,16 @@ class Gap:
     unit: str
     difference: Floats  # (n, joints), B - A; NaN where it is unknown
     joint_rms: Floats  # (joints,)
-    joint_worst: list[LargestDifference | None]
+    joint_worst: list[MaxDifference | None]
     rms: float | None  # over all joints
-    worst: LargestDifference | None
+    worst: MaxDifference | None
     correlation: float | None  # over all joints and instants; None when one of them never changes
-    unknown_share: float  # share of what is compared that is not a number in one of the runs, or in both
+    unknown_fraction: float  # share of what is compared that is not a number in one of the runs, or in both
 
     @property
     def same(self) -> bool:
         """Whether every value is known in both runs, and is the same."""
-        return self.unknown_share == 0 and self.worst is not None and not self.worst.difference
+        return self.unknown_fraction == 0 and self.worst is not None and not self.worst.difference
 
 
 @dataclass(frozen=True)
@@ -232,19 +232,19 @@ def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: N
         difference = b - a
     known = np.isfinite(difference)
     wanted = known.size if compared is None else int(compared.sum())
-    unknown_share = 1 - known.sum() / wanted if wanted else 0.0
+    unknown_fraction = 1 - known.sum() / wanted if wanted else 0.0
     squares = np.where(known, difference, 0.0) ** 2
     count = known.sum(axis=0)
     joint_rms = np.sqrt(np.where(count > 0, squares.sum(axis=0) / np.maximum(count, 1), np.nan))
-    joint_worst: list[LargestDifference | None] = []
+    joint_worst: list[MaxDifference | None] = []
     for joint in range(difference.shape[1]):
         row = int(np.argmax(np.where(known[:, joint], squares[:, joint], -1.0)))
-        worst = LargestDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
+        worst = MaxDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
         joint_worst.append(worst if count[joint] else None)
     worst = max((one for one in joint_worst if one is not None), key=lambda one: abs(one.difference), default=None)
     rms = float(np.sqrt(squares.sum() / known.sum())) if known.any() else None
     correlation = _correlation(a[known], b[known])
-    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, correlation, float(unknown_share))
+    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, correlation, float(unknown_fraction))
 
 
 def _correlation(a: Floats, b: Floats) -> float | None:

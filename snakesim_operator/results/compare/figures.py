@@ -48,8 +48,8 @@ def hand_overs(difference: Difference) -> Figure:
     intervals = {run: propulsion_intervals(record) for run, (record, _) in runs.items()}
     joints = sorted({one.joint for run in intervals.values() for one in run}, reverse=True)
     drawn = [
-        Bar(f"{difference.joints[one.joint]} {run}", one.start_s, one.end_s, f"{run} {one.length_s:.1f} s", colour)
-        for run, (_, colour) in runs.items()
+        Bar(f"{difference.joints[one.joint]} {run}", one.start_s, one.end_s, f"{run} {one.length_s:.1f} s", color)
+        for run, (_, color) in runs.items()
         for one in intervals[run]
     ]
     rows = [f"{difference.joints[joint]} {run}" for joint in joints for run in runs]

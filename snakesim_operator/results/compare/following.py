@@ -24,8 +24,8 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
     """Of one joint; None where it did not move, or is not known throughout. All are (n,)."""
     if len(time_s) < LEAST_INSTANTS or not (np.isfinite(a).all() and np.isfinite(b).all()):
         return None
-    most_s = min(MOST_S, float(time_s[-1] - time_s[0]) / 4)
-    within = (time_s >= time_s[0] + most_s) & (time_s <= time_s[-1] - most_s)
+    max_s = min(MOST_S, float(time_s[-1] - time_s[0]) / 4)
+    within = (time_s >= time_s[0] + max_s) & (time_s <= time_s[-1] - max_s)
     if within.sum() < LEAST_INSTANTS or np.std(a[within]) < LEAST_MOTION:
         return None
     at_s, wanted = time_s[within], b[within] - b[within].mean()
@@ -39,7 +39,7 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
         return float(np.sqrt(left @ left / len(left))), lag_s, gain
 
     step_s = float(np.median(np.diff(time_s)))
-    count = max(int(most_s / step_s), 1)
+    count = max(int(max_s / step_s), 1)
     left, lag_s, gain = min(fit(lag * step_s) for lag in range(-count, count + 1))
     while step_s > 1e-5:
         step_s /= 2

@@ -26,7 +26,7 @@ class Setting:
 def identity(a: RunRecord, b: RunRecord) -> list[Setting]:
     """What was compared: the values by which people tell runs apart, whether they differ or not."""
     rows = [("scenario", "name"), ("robot", "robot.name"), ("scene", "scene.name")]
-    rows += [(key, key) for key in ("backend", "pace", "rate_hz", "duration_s", "controller", "seed")]
+    rows += [(key, key) for key in ("backend", "clock_mode", "rate_hz", "duration_s", "controller", "seed")]
     of_a, of_b = (dict(leaves(msgspec.to_builtins(record.config))) for record in (a, b))
     return [Setting(name, _value_text(of_a, key), _value_text(of_b, key)) for name, key in rows]
 

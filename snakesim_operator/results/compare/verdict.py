@@ -36,7 +36,7 @@ def sentences(difference: Difference) -> list[str]:
         how_long = "in what both records hold:" if partial else "for all of their"
         return [*partial, f"The runs are the same, joint by joint, {how_long} {_common(difference)}."]
     advance = difference.advance
-    said = [*partial, *_unknown_shares(difference)]
+    said = [*partial, *_unknown_fractions(difference)]
     for run, record in (("A", difference.a), ("B", difference.b)):
         if record.replay_of:
             said.append(
@@ -71,8 +71,8 @@ def _partial(difference: Difference) -> list[str]:
     return [f"Only a part of the runs is compared, because the record of {who} is incomplete."]
 
 
-def _unknown_shares(difference: Difference) -> list[str]:
-    unknown = [f"{gap.what} {100 * gap.unknown_share:.2g} %" for gap in difference.gaps if gap.unknown_share]
+def _unknown_fractions(difference: Difference) -> list[str]:
+    unknown = [f"{gap.what} {100 * gap.unknown_fraction:.2g} %" for gap in difference.gaps if gap.unknown_fraction]
     if not unknown:
         return []
     return [f"Not a number in one run or in both, so it cannot be compared: {', '.join(unknown)}."]

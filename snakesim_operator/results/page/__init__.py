@@ -1,5 +1,5 @@
-"""What the report and the comparison share: charts, templates, colours, and the plotting library itself.
+"""What the report and the comparison share: charts, templates, colors, and the plotting library itself.
 
 `charts`   figures over time, as plain data for Plotly     `html`      templates and numbers for people
-`palette`  colours of both themes, one for each joint      `vendor/`   the library, copied into every page
+`palette`  colors of both themes, one for each joint      `vendor/`   the library, copied into every page
 """

@@ -1,15 +1,15 @@
-// Draws every chart of the page in the colours of the theme. One time cursor and one zoom go through all of them.
+// Draws every chart of the page in the colors of the theme. One time cursor and one zoom go through all of them.
 (() => {
   const charts = [...document.querySelectorAll(".chart")];
   const theme = matchMedia("(prefers-color-scheme: dark)");
   const touch = matchMedia("(pointer: coarse)").matches;
   const look = getComputedStyle(document.documentElement);
 
-  const coloured = (value) => {
+  const colored = (value) => {
     if (typeof value === "string") return value.startsWith("--") ? look.getPropertyValue(value).trim() : value;
-    if (Array.isArray(value)) return value.map(coloured);
+    if (Array.isArray(value)) return value.map(colored);
     if (value === null || typeof value !== "object") return value;
-    return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, coloured(item)]));
+    return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, colored(item)]));
   };
   const axis = {
     gridcolor: "--grid", zerolinecolor: "--rule", linecolor: "--faint", tickcolor: "--faint", zerolinewidth: 1,
@@ -18,7 +18,7 @@
   const base = {
     autosize: true, dragmode: touch ? false : "zoom", margin: { l: 70, r: 14, t: 26, b: 40 },
     paper_bgcolor: "--card", plot_bgcolor: "--card",
-    font: { family: "system-ui, -apple-system, 'Segoe UI', Roboto, Arial, sans-serif", size: 12, color: "--ink" },
+    font: { driver type: "system-ui, -apple-system, 'Segoe UI', Roboto, Arial, sans-serif", size: 12, color: "--ink" },
     legend: { orientation: "h", x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: small, bgcolor: "rgba(0,0,0,0)" },
     hoverlabel: { bgcolor: "--page", bordercolor: "--rule", font: { color: "--ink", size: 12 }, namelength: -1 },
     modebar: { bgcolor: "rgba(0,0,0,0)", color: "--faint", activecolor: "--ink" },
@@ -45,7 +45,7 @@
       yaxis: { ...axis, fixedrange: true, hoverformat: ".4g", automargin: yaxis.type === "category", ...yaxis,
         title: { ...yaxis.title, font: small, standoff: 6 } },
     };
-    return Plotly.react(chart.querySelector(".plot"), coloured(figure.data), coloured(layout), config);
+    return Plotly.react(chart.querySelector(".plot"), colored(figure.data), colored(layout), config);
   };
 
   const seek = (time) => document.dispatchEvent(new CustomEvent("seek", { detail: time }));

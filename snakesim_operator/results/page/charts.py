@@ -1,6 +1,6 @@
 """Charts over time as figures of Plotly: lines, bars, and a map of all joints. Pure data, as JSON will have it.
 
-A colour is the name of one in the palette (`--measured`): `charts.js` looks it up, so that a chart follows the theme.
+A color is the name of one in the palette (`--measured`): `charts.js` looks it up, so that a chart follows the theme.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Line:
     name: str
     time_s: Floats
     values: Floats
-    colour: str = "--ink"
+    color: str = "--ink"
     dash: str = "solid"
     width: float = 1.6
     shape: str = "linear"  # hv: a value holds until the next one
@@ -44,7 +44,7 @@ class Line:
             "name": self.name,
             "x": np.round(self.time_s[rows], 4).tolist(),
             "y": rounded(self.values[rows]),
-            "line": {"color": self.colour, "dash": self.dash, "width": self.width, "shape": self.shape},
+            "line": {"color": self.color, "dash": self.dash, "width": self.width, "shape": self.shape},
         }
 
 
@@ -56,7 +56,7 @@ class Bar:
     start_s: float
     end_s: float
     words: str
-    colour: str
+    color: str
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Mark:
 
     time_s: float
     words: str = ""
-    colour: str = "--soft"
+    color: str = "--soft"
 
 
 def lines(
@@ -80,8 +80,8 @@ def lines(
     height: int = 220,
     from_zero: bool = False,
 ) -> Figure:
-    """Lines over time. levels: values with a name, dotted; shades: stretches of time in a colour."""
-    shapes = [_box(bar.start_s, bar.end_s, 0, 1, "paper", fillcolor=bar.colour, opacity=0.16) for bar in shades]
+    """Lines over time. levels: values with a name, dotted; shades: stretches of time in a color."""
+    shapes = [_box(bar.start_s, bar.end_s, 0, 1, "paper", fillcolor=bar.color, opacity=0.16) for bar in shades]
     shapes += [
         {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "line": _stroke("--soft", "dot")}
         for y, _ in levels
@@ -111,7 +111,7 @@ def bars(label: str, rows: Sequence[str], drawn: Sequence[Bar], until_s: float, 
         "constraintext": "both",
         "hovertext": [f"{bar.words}, {bar.start_s:.2f} to {bar.end_s:.2f} s" for bar in drawn],
         "hoverinfo": "text",
-        "marker": {"color": [bar.colour for bar in drawn], "line": {"width": 0}},
+        "marker": {"color": [bar.color for bar in drawn], "line": {"width": 0}},
     }
     layout = {
         "barmode": "overlay",
@@ -133,7 +133,7 @@ def joint_map(
     frames: Sequence[tuple[float, float, int]] = (),
     marks: Sequence[Mark] = (),
 ) -> Figure:
-    """Values (n, joints) over time, a row a joint, head on top; `full` is drawn in full colour.
+    """Values (n, joints) over time, a row a joint, head on top; `full` is drawn in full color.
 
     frames: from when to when a joint is framed.
     """
@@ -200,7 +200,7 @@ def _figure(
 ) -> Figure:
     for mark in marks:
         at = {"x0": mark.time_s, "x1": mark.time_s, "yref": "paper", "y0": 0, "y1": 1}
-        shapes.append({"type": "line", "line": _stroke(mark.colour, "dash"), **at})
+        shapes.append({"type": "line", "line": _stroke(mark.color, "dash"), **at})
         if mark.words:
             note = {"x": mark.time_s, "yref": "paper", "y": 1, "yanchor": "top", "showarrow": False, "text": mark.words}
             right_of_it = mark.time_s < until_s / 2
@@ -216,5 +216,5 @@ def _box(x0: float, x1: float, y0: float, y1: float, yref: str, **look: Any) -> 
     return {"type": "rect", "layer": layer, "line": {"width": 0}, **at, **look}
 
 
-def _stroke(colour: str, dash: str) -> Figure:
-    return {"color": colour, "dash": dash, "width": 1.2}
+def _stroke(color: str, dash: str) -> Figure:
+    return {"color": color, "dash": dash, "width": 1.2}

@@ -21,19 +21,19 @@ MINUS = str.maketrans({"-": "−"})
 
 def render(
     template: Path,
-    coloured_joints: int,
+    colored_joints: int,
     *,
     styles: Sequence[Path] = (),
     scripts: Sequence[Path] = (),
     charts: bool = True,
     **values: Any,
 ) -> str:
-    """A whole page that needs no other file. coloured_joints: how many need a colour; charts: whether it has any."""
+    """A whole page that needs no other file. colored_joints: how many need a color; charts: whether it has any."""
     return (
         _pages(template.parent)
         .get_template(template.name)
         .render(
-            style=Markup(themes(coloured_joints) + _text(HERE / "page.css", *styles)),
+            style=Markup(themes(colored_joints) + _text(HERE / "page.css", *styles)),
             library=Markup(_text(LIBRARY) if charts else ""),
             script=Markup(_text(*([HERE / "charts.js"] if charts else []), *scripts)),
             **values,

@@ -1,6 +1,6 @@
-"""Colours, light and dark, told apart by people with any kind of colour vision (after Okabe and Ito).
+"""Colours, light and dark, told apart by people with any kind of color vision (after Okabe and Ito).
 
-A joint has one colour of its own, the same in every figure of every report.
+A joint has one color of its own, the same in every figure of every report.
 """
 
 import colorsys
@@ -61,11 +61,11 @@ DARK: dict[str, str] = {
     "positive": "#f39a4d",
 }
 
-GOLDEN = 0.381966  # of a turn of hue: neighbours are far apart, and no hue comes twice
+GOLDEN = 0.381966  # of a turn of hue: neighbors are far apart, and no hue comes twice
 
 
-def joint_colours(count: int, *, dark: bool) -> dict[str, str]:
-    """A colour for every joint, tail to head."""
+def joint_colors(count: int, *, dark: bool) -> dict[str, str]:
+    """A color for every joint, tail to head."""
     found: dict[str, str] = {}
     for joint in range(count):
         light = (0.66, 0.76)[joint % 2] if dark else (0.45, 0.34)[joint % 2]
@@ -75,14 +75,14 @@ def joint_colours(count: int, *, dark: bool) -> dict[str, str]:
 
 
 def themes(joints: int) -> str:
-    """The colours of both themes as CSS variables. Paper is always light."""
-    light, dark = LIGHT | joint_colours(joints, dark=False), DARK | joint_colours(joints, dark=True)
+    """The colors of both themes as CSS variables. Paper is always light."""
+    light, dark = LIGHT | joint_colors(joints, dark=False), DARK | joint_colors(joints, dark=True)
     return (
         f":root{{{variables(light)}}}@media screen and (prefers-color-scheme:dark)"
         f"{{:root:not(.paper){{{variables(dark)}}}}}"
     )
 
 
-def variables(colours: dict[str, str]) -> str:
+def variables(colors: dict[str, str]) -> str:
     """Colours as CSS has them."""
-    return "".join(f"--{name}:{value};" for name, value in colours.items())
+    return "".join(f"--{name}:{value};" for name, value in colors.items())

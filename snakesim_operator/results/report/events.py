@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_operator.results.motion import motion_of
 from snakesim_operator.results.propulsion import propulsion_periods
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unfelt
+from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unmeasured
 from snakesim_operator.results.report.timeline import jam_bands
 from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
@@ -87,7 +87,7 @@ def _instant_of(record: RunRecord, event: Event) -> Instant | None:
     near = balanced_instants(record, event.time_s - before_s, event.time_s + after_s)
     return min(
         [one for one in near if event.joint in (None, one.propulsion_joint)],
-        key=lambda one: (unfelt(one), abs(one.time_s - event.time_s)),
+        key=lambda one: (unmeasured(one), abs(one.time_s - event.time_s)),
         default=instant_at(record, event.time_s),
     )
 

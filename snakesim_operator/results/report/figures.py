@@ -1,4 +1,4 @@
-"""The charts of the report: what is drawn over time, and in which colour."""
+"""The charts of the report: what is drawn over time, and in which color."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def faults(record: RunRecord) -> list[Mark]:
     return [Mark(time_s, "", "--bad") for time_s in times_s]
 
 
-def colour(joint: int) -> str:
+def color(joint: int) -> str:
     """The joint's own."""
     return f"--joint-{joint}"
 
@@ -52,7 +52,7 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
     ]
     drawn += [Bar("jam", band.start_s, band.end_s, "jammed", "--bad") for band in jam_bands(record)]
     names = [joint.name for joint in record.description.joints]
-    drawn += [Bar(names[i.joint], i.start_s, i.end_s, f"{i.length_s:.1f} s", colour(i.joint)) for i in intervals]
+    drawn += [Bar(names[i.joint], i.start_s, i.end_s, f"{i.length_s:.1f} s", color(i.joint)) for i in intervals]
     propelled = [names[joint] for joint in sorted({one.joint for one in intervals}, reverse=True)]
     rows = [row for row in ("motion", "control", "jam") if any(bar.row == row for bar in drawn)] + propelled
     return bars("States and propulsion joint over time", rows, drawn, end_s(record), faults(record))
@@ -61,7 +61,7 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
 def joint_angle(record: RunRecord, joint: int, intervals: list[Propulsion]) -> Figure:
     """Measured angle against its reference (paper, Fig. 12)."""
     drawn = [
-        _line(record, "measured", record.angle_rad[:, joint], colour(joint)),
+        _line(record, "measured", record.angle_rad[:, joint], color(joint)),
         _line(record, "reference", reference_rad(record, joint), "--ink", "dot"),
     ]
     label = f"Angle of {record.description.joints[joint].name} over time"
@@ -74,7 +74,7 @@ def joint_torque(record: RunRecord, joint: int, intervals: list[Propulsion]) -> 
     lowered = record.torque_limit_nm[:, joint]
     lowered = np.where(lowered < LOWERED * limit, lowered, np.nan)
     drawn = [
-        _line(record, "measured", record.torque_nm[:, joint], colour(joint)),
+        _line(record, "measured", record.torque_nm[:, joint], color(joint)),
         _line(record, "commanded", commanded_torque_nm(record, joint), "--ink", "dot"),
     ]
     if np.isfinite(lowered).any():
@@ -89,14 +89,14 @@ def torque_map(record: RunRecord, intervals: list[Propulsion]) -> Figure:
     """Every joint's torque (paper, Fig. 11); propulsion is framed."""
     names = [joint.name for joint in record.description.joints]
     frames = [(one.start_s, one.end_s, one.joint) for one in intervals]
-    full_nm = full_colour_nm(record)
+    full_nm = full_color_nm(record)
     return joint_map(
         "Torque of every joint over time", names, record.torque_nm, "N·m", full_nm, end_s(record), frames=frames
     )
 
 
-def full_colour_nm(record: RunRecord) -> float:
-    """The torque that is drawn in full colour: the run's largest, unless that is next to nothing."""
+def full_color_nm(record: RunRecord) -> float:
+    """The torque that is drawn in full color: the run's largest, unless that is next to nothing."""
     least = 0.05 * max(joint.torque_limit_nm for joint in record.description.joints)
     return max(largest(np.abs(record.torque_nm)) or 0.0, least, 1e-9)
 
@@ -132,4 +132,4 @@ def _lines(record: RunRecord, label: str, axis: str, drawn: list[Line], **more: 
 
 
 def _shades(intervals: list[Propulsion], joint: int) -> list[Bar]:
-    return [Bar("", one.start_s, one.end_s, "", colour(joint)) for one in intervals if one.joint == joint]
+    return [Bar("", one.start_s, one.end_s, "", color(joint)) for one in intervals if one.joint == joint]

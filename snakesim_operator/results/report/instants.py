@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.came_true import is_felt
+from snakesim_operator.results.force_tracking import is_measured
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.time_axis import reported_at_s
 
@@ -44,14 +44,14 @@ class Balance:
         """How far the polygon is from closing."""
         return float(np.hypot(*(self.resultant_n + self.tether_n)))
 
-    def felt_n(self, felt: list[WorldContact], index: int) -> float | None:
+    def measured_force_n(self, felt: list[WorldContact], index: int) -> float | None:
         """The measured force at a push-point; None when none was felt there."""
-        there = [np.hypot(*one.force_w[:2]) for one in felt if is_felt(self.contacts[index], [one])]
+        there = [np.hypot(*one.force_w[:2]) for one in felt if is_measured(self.contacts[index], [one])]
         return float(sum(there)) if there else None
 
     def kinds(self, felt: list[WorldContact]) -> list[str]:
         """How each contact force and last the resultant is drawn: as asked for unless felt, the sum if all are felt."""
-        there = [is_felt(contact, felt) for contact in self.contacts]
+        there = [is_measured(contact, felt) for contact in self.contacts]
         asked = ["" if one else " asked" for one in (*there, all(there))]
         return [*(f"solved{one}" for one in asked[:-1]), f"resultant{asked[-1]}"]
 
@@ -75,7 +75,7 @@ class Instant:
 
 def balance_of(state: ControlState) -> Balance | None:
     """The solved forces; None when the controller solved for none."""
-    pairs = list(zip(state.push_points, state.solved_force_n, strict=False))
+    pairs = list(zip(state.push_points, state.desired_force_n, strict=False))
     if len(pairs) < NEEDED or not state.propulsion_n:
         return None
     pairs.sort(key=lambda pair: pair[0].body_s_m)
@@ -115,7 +115,7 @@ def instant_at(record: RunRecord, time_s: float) -> Instant | None:
     return _instant(record, time_s, earlier[-1] if earlier else None, None)
 
 
-def felt_along_n(instant: Instant, direction_w: Floats) -> float:
+def measured_along_n(instant: Instant, direction_w: Floats) -> float:
     """How much the measured contact forces push along a direction, (2,) of any length."""
     unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
     return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.felt)
@@ -137,12 +137,12 @@ def _instant(record: RunRecord, time_s: float, state: ControlState | None, balan
 
 
 def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None:
-    near = min(record.worlds, key=lambda world: abs(world.stamp_ns * 1e-9 - at_s), default=None)
-    return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= within_s else None
+    near = min(record.worlds, key=lambda world: abs(world.timestamp_ns * 1e-9 - at_s), default=None)
+    return near if near is not None and abs(near.timestamp_ns * 1e-9 - at_s) <= within_s else None
 
 
-def unfelt(instant: Instant) -> int:
+def unmeasured(instant: Instant) -> int:
     """How many solved contacts no sensor felt."""
     if instant.balance is None:
         return 0
-    return sum(not is_felt(contact, instant.felt) for contact in instant.balance.contacts)
+    return sum(not is_measured(contact, instant.felt) for contact in instant.balance.contacts)

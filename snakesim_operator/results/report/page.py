@@ -13,7 +13,7 @@ from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
-from snakesim_operator.results.report.instants import felt_along_n
+from snakesim_operator.results.report.instants import measured_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
 from snakesim_operator.results.report.pushing import pushing
@@ -101,7 +101,7 @@ def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
             scale = units_per_n(balances, *POLYGON, upright=view.upright)
             polygon = Markup(force_polygon(instant.balance, instant.felt, *POLYGON, scale, upright=view.upright))
             ahead = instant.balance.resultant_n
-        pushed_n = felt_along_n(instant, ahead)
+        pushed_n = measured_along_n(instant, ahead)
         drawn = Markup(top_view(record, instant, view))
         cards.append({"event": event, "instant": instant, "view": drawn, "polygon": polygon, "pushed_n": pushed_n})
     return cards

@@ -40,8 +40,8 @@ class Playback:
 
     picture: Markup
     data: dict[str, Any]
-    with_solved: bool
-    with_felt: bool
+    with_desired: bool
+    with_measured: bool
 
 
 def playback(record: RunRecord) -> Playback | None:
@@ -82,8 +82,8 @@ def playback(record: RunRecord) -> Playback | None:
     )
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
     data |= {"maps": maps, "paths": paths}
-    with_solved, with_felt = (any(frame[k] for frame in frames) for k in (4, 5))
-    return Playback(Markup(picture), data, with_solved, with_felt)
+    with_desired, with_measured = (any(frame[k] for frame in frames) for k in (4, 5))
+    return Playback(Markup(picture), data, with_desired, with_measured)
 
 
 def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -> str:
@@ -107,34 +107,34 @@ def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[l
         return [], [-1] * len(rows)
     some = record.worlds[:: max(len(record.worlds) // MAPS, 1)]
     outlines = [[_flat(view, outline_w(one)) for one in world.obstacles if view.shows(one)] for world in some]
-    return outlines, _last_before(record, rows, [world.stamp_ns for world in some])
+    return outlines, _last_before(record, rows, [world.timestamp_ns for world in some])
 
 
 def _planned(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[float]], list[int]]:
     """The paths that navigation planned, and for each row which one, or -1. Without them a scene's route is drawn."""
-    planned = [one for one in record.trajectories if one.stamp_ns is not None]
+    planned = [one for one in record.trajectories if one.timestamp_ns is not None]
     if len({one.path_id for one in planned}) < 2:
         return [], [-1] * len(rows)
     paths = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
-    return paths, _last_before(record, rows, [one.stamp_ns or 0 for one in planned])
+    return paths, _last_before(record, rows, [one.timestamp_ns or 0 for one in planned])
 
 
 def _flat(view: View, points_w: Floats) -> list[float]:
     return [round(part, 1) for point in points_w for part in view.at(point)]
 
 
-def _last_before(record: RunRecord, rows: NDArray[np.intp], stamps_ns: Sequence[int]) -> list[int]:
-    stamps_s = np.array(stamps_ns) * 1e-9
-    return (np.searchsorted(stamps_s, record.time_s[rows] + SAME_TICK_S, side="right") - 1).tolist()
+def _last_before(record: RunRecord, rows: NDArray[np.intp], timestamps_ns: Sequence[int]) -> list[int]:
+    timestamps_s = np.array(timestamps_ns) * 1e-9
+    return (np.searchsorted(timestamps_s, record.time_s[rows] + SAME_TICK_S, side="right") - 1).tolist()
 
 
 def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[MessageT]) -> list[MessageT | None]:
     """What was said last before each row, unless that is long ago."""
-    before = _last_before(record, rows, [one.stamp_ns for one in messages])
+    before = _last_before(record, rows, [one.timestamp_ns for one in messages])
     newest = [messages[i] if i >= 0 else None for i in before]
     times_s = record.time_s[rows].tolist()
     return [
-        one if one is not None and time_s - one.stamp_ns * 1e-9 < SHOWN_FOR_S else None
+        one if one is not None and time_s - one.timestamp_ns * 1e-9 < SHOWN_FOR_S else None
         for one, time_s in zip(newest, times_s, strict=True)
     ]
 

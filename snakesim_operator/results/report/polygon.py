@@ -73,8 +73,8 @@ def _resultant(corners: list[Point], kind: str, labels: Labels) -> str:
     if length < 1e-6:
         return ""
     normal = (-(end[1] - start[1]) / length, (end[0] - start[0]) / length)
-    centre = (sum(x for x, _ in corners) / len(corners), sum(y for _, y in corners) / len(corners))
-    inward = (centre[0] - start[0]) * normal[0] + (centre[1] - start[1]) * normal[1]
+    center = (sum(x for x, _ in corners) / len(corners), sum(y for _, y in corners) / len(corners))
+    inward = (center[0] - start[0]) * normal[0] + (center[1] - start[1]) * normal[1]
     off = -11.0 if inward > 0 else 11.0
     a = (start[0] + off * normal[0], start[1] + off * normal[1])
     b = (end[0] + off * normal[0], end[1] + off * normal[1])

@@ -66,8 +66,8 @@ def pushing(record: RunRecord) -> Pushing | None:
 
 def _forces(record: RunRecord) -> Figure:
     """Wanted and measured contact forces in the direction from tail to head, and the drag that they work against."""
-    wanted = [(reported_at_s(record, one), one.stamp_ns, _sum_w(one.push_points)) for one in record.control]
-    felt = [(one.stamp_ns * 1e-9 - zero_s(record), one.stamp_ns, _sum_w(one.contacts)) for one in record.worlds]
+    wanted = [(reported_at_s(record, one), one.timestamp_ns, _sum_w(one.push_points)) for one in record.control]
+    felt = [(one.timestamp_ns * 1e-9 - zero_s(record), one.timestamp_ns, _sum_w(one.contacts)) for one in record.worlds]
     drawn = [
         Line("wanted of all push-points", np.array([t for t, _, _ in wanted]), _ahead_n(record, wanted), "--reference"),
         Line("measured contacts", np.array([t for t, _, _ in felt]), _ahead_n(record, felt), "--measured"),
@@ -81,8 +81,8 @@ def _forces(record: RunRecord) -> Figure:
 def _ahead_n(record: RunRecord, forces: list[tuple[float, int, Floats]]) -> Floats:
     """The part of each force in the direction from tail to head at its time; NaN when the pose is unknown."""
     found = np.full(len(forces), np.nan)
-    for i, (_, stamp_ns, force_w) in enumerate(forces):
-        nodes = record.nodes_w(record.row_at(stamp_ns * 1e-9))
+    for i, (_, timestamp_ns, force_w) in enumerate(forces):
+        nodes = record.nodes_w(record.row_at(timestamp_ns * 1e-9))
         if nodes is not None:
             ahead = nodes[-1, :2] - nodes[0, :2]
             found[i] = float(force_w @ ahead) / max(float(np.hypot(*ahead)), 1e-9)
@@ -140,13 +140,13 @@ def _scored(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
     total, time_s = MapScore(), list[float]()
     counts: list[tuple[float, int, int]] = []
     for world in record.worlds[:: max(len(record.worlds) // MAPS_SCORED, 1)]:
-        nodes = record.nodes_w(record.row_at(world.stamp_ns * 1e-9))
+        nodes = record.nodes_w(record.row_at(world.timestamp_ns * 1e-9))
         if nodes is None:
             continue
         x, y = nodes[-1, :2] - nodes[-2, :2]
         one = score(world.obstacles, truth, nodes[-1], math.atan2(y, x))
         total.add(one)
-        time_s.append(world.stamp_ns * 1e-9 - zero_s(record))
+        time_s.append(world.timestamp_ns * 1e-9 - zero_s(record))
         counts.append((1e3 * float(np.median(one.position_m)) if one.position_m else math.nan, one.misses, one.ghosts))
     if not counts:
         return None, None

@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.results.came_true import EMPTY_N, Pair, pairs
+from snakesim_operator.results.force_tracking import EMPTY_N, Pair, pairs
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.summary import SATURATED_FROM, RunSummary
@@ -19,14 +19,16 @@ TOUCHING_M = 0.0005  # a smaller gap is a touch: the body's outline is that of i
 
 def why_empty(record: RunRecord) -> str:
     """Push-points that carried nothing: whether an obstacle stands there, and the body was at it."""
-    empty = [pair for pair in pairs(record.control) if pair.felt_n < EMPTY_N]
+    empty = [pair for pair in pairs(record.control) if pair.measured_force_n < EMPTY_N]
     at_w = {
-        (state.stamp_ns, point.obstacle): np.array(point.position_w[:2])
+        (state.timestamp_ns, point.obstacle): np.array(point.position_w[:2])
         for state in record.control
         for point in state.push_points
     }
     outlines = [_outline(one.obstacle) for one in record.placed]
-    gaps = [_gap_m(record, pair, at_w[pair.stamp_ns, pair.obstacle], outlines) for pair in empty] if outlines else []
+    gaps = (
+        [_gap_m(record, pair, at_w[pair.timestamp_ns, pair.obstacle], outlines) for pair in empty] if outlines else []
+    )
     known = [gap for gap in gaps if gap is not None]
     if not known:
         return UNKNOWN
@@ -63,13 +65,13 @@ def why_late(summary: RunSummary) -> str:
 
 
 def why_refused(summary: RunSummary) -> str:
-    """Commands that were refused: the gate's own words."""
+    """Commands that were refused: the limiter's own words."""
     return ", ".join(f"{why} {count}" for why, count in sorted(summary.rejected_commands.items()) if count)
 
 
 def _gap_m(record: RunRecord, pair: Pair, at_w: Floats, outlines: Sequence[Floats]) -> float | None:
     """From above, between the body and the obstacle at a push-point; infinite: none is near; None: no pose."""
-    nodes_w = record.nodes_w(record.row_at(pair.stamp_ns * 1e-9)) if len(record.time_s) else None
+    nodes_w = record.nodes_w(record.row_at(pair.timestamp_ns * 1e-9)) if len(record.time_s) else None
     if nodes_w is None:
         return None
     near_m, outline = min(((float(np.hypot(*(one - at_w).T).min()), one) for one in outlines), key=lambda two: two[0])

@@ -107,7 +107,7 @@ def reference_rad(record: RunRecord, joint: int) -> Floats:
     reference = np.full(len(record.time_s), np.nan)
     states = [state for state in record.control if len(state.reference_rad) > joint]
     if states:
-        stamps = np.array([state.stamp_ns * 1e-9 for state in states])
+        stamps = np.array([state.timestamp_ns * 1e-9 for state in states])
         angles = np.array([state.reference_rad[joint] for state in states])
         reference = np.interp(record.time_s, stamps, angles, left=np.nan, right=angles[-1])
     in_position = record.mode[:, joint] == Mode.POSITION

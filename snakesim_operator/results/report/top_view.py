@@ -90,13 +90,13 @@ def _about(item: Placed) -> str:
 
 def outline_w(obstacle: Obstacle) -> Floats:
     """Points around an obstacle, (n, 2)."""
-    centre = np.array(obstacle.position_w[:2])
+    center = np.array(obstacle.position_w[:2])
     if obstacle.shape != "box":
         around = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
-        return centre + obstacle.radius_m * np.stack([np.cos(around), np.sin(around)], axis=-1)
+        return center + obstacle.radius_m * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
     a, b = obstacle.half_size_m[:2]
-    return centre + np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([(c, s), (-s, c)])
+    return center + np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([(c, s), (-s, c)])
 
 
 def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:

@@ -107,7 +107,7 @@ def _pushed_off(record: RunRecord) -> str:
     """How many obstacles it pushed off, of those that its controller chose and where a contact was measured."""
     obstacles: set[str] = set()
     for state in record.control:
-        for point, measured_n in zip(state.push_points, state.felt_force_n, strict=False):
+        for point, measured_n in zip(state.push_points, state.measured_force_n, strict=False):
             if point.obstacle is not None and measured_n is not None and measured_n >= MIN_PUSH_N:
                 obstacles.add(point.obstacle)
     if not obstacles:

@@ -187,12 +187,12 @@ class Teleop:
         """An intent for each new robot time, once the operator has asked for something, and while he is there."""
         clock = self._clock
         nothing_asked = self._stopping is not None or self._steering.touched_s is None
-        if nothing_asked or clock is None or clock.stamp_ns == self._sent_ns:
+        if nothing_asked or clock is None or clock.timestamp_ns == self._sent_ns:
             return
         if self._is_left():
             self._steering.speed_m_s = 0.0
-        self._sent_ns = clock.stamp_ns
-        self._intents.put(self._steering.intent(clock.stamp_ns))
+        self._sent_ns = clock.timestamp_ns
+        self._intents.put(self._steering.intent(clock.timestamp_ns))
 
     def _screen_lines(self) -> list[str]:
         status, control, steering = self._status, self._control, self._steering

@@ -40,7 +40,7 @@ class Steering:
     def intent(self, robot_ns: int) -> Intent:
         """At a robot time."""
         return Intent(
-            stamp_ns=robot_ns,
+            timestamp_ns=robot_ns,
             who=self._who,
             speed_m_s=self.speed_m_s,
             go=self.speed_m_s != 0.0,

@@ -69,7 +69,7 @@ def garbage(endpoint: str, amount: int) -> Iterator[str]:
     payloads = [
         *(dice.randbytes(dice.choice((1, 30, 300, 3000))) for _ in range(50)),
         *(wire.deep(levels) for levels in (10, 1000, 100_000)),
-        *(wire.encode({"tick": tick, "stamp_ns": 0}) for tick in (0, 2**62)),
+        *(wire.encode({"tick": tick, "timestamp_ns": 0}) for tick in (0, 2**62)),
         wire.encode({str(i): i for i in range(1000)}),
     ]
     sent, began = 0, time.monotonic()

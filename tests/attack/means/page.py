@@ -79,7 +79,7 @@ class Page:
         self.change(self.find(label), {"value": True})
 
     def ended(self) -> int | None:
-        """The code with which the console hung up, if it has."""
+        """The code with which the console suspended up, if it has."""
         self._reader.join(10.0)
         return self.closed_by
 

@@ -38,7 +38,7 @@ FLOODS: dict[str, Flood] = {
 
 
 def stopped_under(name: str, request: Request) -> Iterator[Trial]:
-    """The value: from the stop that is asked for to the set-points of the stop, by the host's private channel."""
+    """The value: from the stop that is asked for to the setpoints of the stop, by the host's private channel."""
     with robot(request, **STANDING) as (made, observer), FLOODS[name](made):
         for number in range(request.trials):
             yield _stopped(request, made, observer, by_datagram=number % 2 == 1)
@@ -57,7 +57,7 @@ def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
 def _explain(request: Request) -> None:
     request.note(
         "asked for in turn by a query on a session that was there before, and by a datagram; 50 Hz, controller `hold`; "
-        "told over the host's private channel, and a period (20 ms) added, in which the set-points go out"
+        "told over the host's private channel, and a period (20 ms) added, in which the setpoints go out"
     )
 
 
@@ -98,8 +98,18 @@ def _stopped(
 
 
 def second_run(request: Request) -> Iterator[Trial]:
-    """A person disarmed the robot; a second `snakesim run` starts on its network. The value: set-points that move."""
-    command = [sys.executable, "-m", "snakesim_operator", "run", "triplet", "--pace", "realtime", "--duration", "1"]
+    """A person disarmed the robot; a second `snakesim run` starts on its network. The value: setpoints that move."""
+    command = [
+        sys.executable,
+        "-m",
+        "snakesim_operator",
+        "run",
+        "triplet",
+        "--clock-mode",
+        "realtime",
+        "--duration",
+        "1",
+    ]
     with robot(request) as (made, observer):
         for number in range(request.trials):
             if observer.state() != "armed":

@@ -36,7 +36,7 @@ def out_of_time(request: Request) -> Iterator[Trial]:
             "reordered": (partial(stranger.again, 2), "replayed"),
             "duplicated": (partial(stranger.again, 1), "replayed"),
             "future": (partial(stranger.out_of_time, 50), "from_the_future"),
-            "without an arming": (stranger.without_arming, "before_arming"),
+            "without an arm_session": (stranger.without_arming, "before_arming"),
         }
 
     yield from _among_good_ones(request, kinds)
@@ -95,7 +95,7 @@ def _bombarded(observer: Observer, stranger: Stranger, kinds: Kinds) -> Trial:
 
 
 def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], failures: list[str]) -> Trial:
-    """How many set-points got through; a failure besides `failures` when not all are counted, or the robot stopped."""
+    """How many setpoints got through; a failure besides `failures` when not all are counted, or the robot stopped."""
     try:
         observer.until(lambda: not uncounted(), "all counted", COUNTED_S)
     except TrialError:
@@ -112,7 +112,7 @@ def _counts(observer: Observer) -> Counter[str]:
 
 
 def applied_of_others(observer: Observer) -> int:
-    """Applied set-points that were not the controller's own, each newer than the one before."""
+    """Applied setpoints that were not the controller's own, each newer than the one before."""
     sequences = [h.message.sequence for h in observer.applied]
     forged = sum(s is None or s >= FORGED for s in sequences)
     back = sum(1 for a, b in itertools.pairwise(sequences) if a is not None and b is not None and b < a)
@@ -128,7 +128,7 @@ def second_controller(request: Request) -> Iterator[Trial]:
             yield _second(observer, stranger, answered_ms)
         request.note(f"the lease request was answered within {max(answered_ms):.0f} ms")
         request.note(
-            "who reads the epoch from hal/clock and forges the next sequence is not kept out by the gate: nothing "
+            "who reads the epoch from hal/clock and forges the next sequence is not kept out by the limiter: nothing "
             "authenticates here, a router's access control does"
         )
 
@@ -156,7 +156,7 @@ def interleaved(request: Request) -> Iterator[Trial]:
         writers = TwoWriters(random.Random(number))
         yield Trial(value=float(sum(writers.interleave() for _ in range(each))))
     request.note(
-        f"{each * request.trials} interleavings of {MOVES} moves each, by seed, at the gate that stands before both "
+        f"{each * request.trials} interleavings of {MOVES} moves each, by seed, at the limiter that stands before both "
         f"backends"
     )
 
@@ -173,7 +173,7 @@ class TwoWriters:
         self.epoch, self.holder = self.authority.lease.epoch, self.authority.lease.holder
 
     def interleave(self) -> int:
-        """Some moves of both within a lease term; how many set-points or rights the second one got by them."""
+        """Some moves of both within a lease term; how many setpoints or rights the second one got by them."""
         got = 0
         moves = [self.first, self.second_commands, self.second_asks, self.rng.choice((self.second_commands, self.ends))]
         for move in self.rng.sample(moves, MOVES):
@@ -214,6 +214,6 @@ class TwoWriters:
         return False
 
     def _offer(self, given: JointCommand, sequence: int, epoch: int) -> str | None:
-        tick, now_ns, arming = self.rig.tick, self.rig.now_ns, self.authority.arming
-        made = msgspec.structs.replace(given, sequence=sequence, tick=tick, lease_epoch=epoch, arming=arming)
+        tick, now_ns, arm_session = self.rig.tick, self.rig.now_ns, self.authority.arm_session
+        made = msgspec.structs.replace(given, sequence=sequence, tick=tick, lease_epoch=epoch, arm_session=arm_session)
         return self.authority.offer(made, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS))

@@ -26,7 +26,7 @@ FROZEN_HZ = {"sim": 200.0, "can": 100.0}  # what one bus carries
 def cannot_keep_up(kind: str, request: Request) -> Iterator[Trial]:
     """kind: `sleep` in the callback, or `disk` that is full.
 
-    A cycle is missed when the set-points of a tick are those of the tick before: no command had come for it. The value:
+    A cycle is missed when the setpoints of a tick are those of the tick before: no command had come for it. The value:
     how many more are missed in half a second than in the worst such window before the consumer came.
     """
     with robot(request) as (made, observer):

@@ -58,13 +58,13 @@ killed = partial(_failing, lambda made, _: made.signal("control", SIGKILL), lamb
 frozen = partial(
     _failing, lambda made, _: made.signal("control", SIGSTOP), lambda made: made.signal("control", SIGCONT)
 )
-hung = partial(_failing, _hang, lambda _: None)
+suspended = partial(_failing, _hang, lambda _: None)
 
 
 def host_restarts(request: Request) -> Iterator[Trial]:
     """The host is killed while moving and started again; what was streamed before is sent to the new one.
 
-    The value: set-points of the new host that were not passive, before somebody armed it.
+    The value: setpoints of the new host that were not passive, before somebody armed it.
     """
     with robot(request) as (made, observer):
         for _ in range(request.trials):
@@ -77,7 +77,7 @@ def host_restarts(request: Request) -> Iterator[Trial]:
             observer.forget()
             made.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
-            observer.until(lambda: observer.applied, "the new host's set-points")
+            observer.until(lambda: observer.applied, "the new host's setpoints")
             failures = _objections(observer, streamed)
             if observer.status is None or 0 < observer.status.lease_epoch <= epoch:
                 failures.append(f"the lease's epoch did not grow from {epoch}: {observer.in_words()}")

@@ -28,7 +28,7 @@ RATE_HZ = 50.0
 PERIOD_MS = 1000.0 / RATE_HZ
 FROZEN_S = 1.0
 WATCHED_S = 1.0  # for drives that are enabled again
-OFF_MS = 100.0 + 3 * PERIOD_MS  # a watchdog, the period that a set-point may be old, and a busy computer
+OFF_MS = 100.0 + 3 * PERIOD_MS  # a watchdog, the period that a setpoint may be old, and a busy computer
 COOLS_IN_S = 2.0  # time constant of the windings, so that a trial need not wait for minutes
 MAX_RETRIES = 10  # of one trial
 BUS = "udp_multicast:239.74.163.9"
@@ -173,7 +173,7 @@ def _use_loopback() -> None:
 def at_host(kind: str, expected: dict[str, Sequence[str]], request: Request) -> Iterator[Trial]:
     """A fault of joint_N or bus_1, asked of the host whose process emulates the drives.
 
-    expected: names that the driver of each type gives it. The value: from its beginning to the safe action.
+    expected: names that the driver of each type gives it. The value: from its beginning to the stop mode.
     """
     rng = random.Random(9)
     config = robot_of(request.backend, robot__heat__time_constant_s=COOLS_IN_S)

@@ -1,7 +1,7 @@
 """What needs a machine of its own: modules on a kernel's CAN bus outlive the host, and the wall clock is set.
 
-The modules are twins in a process that lives through all trials, at 25 Hz; the listener has the kernel's time of every
-frame. Host and control are the product's own processes.
+The modules are emulators in a process that lives through all trials, at 25 Hz; the listener has the kernel's time of
+every frame. Host and control are the product's own processes.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from snakesim_hal.programs import host_program as host_process
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, robot
 from tests.faults.row import Request, Trial
-from tests.unit.can_backend.twin.rig import BOOTED, MS, QUIET, Module, armed, set_point
+from tests.unit.can_backend.emulator.rig import BOOTED, MS, QUIET, Module, armed, setpoint
 from tests.unit.hal.rig import write_files
 from tests.vcan.test_killed import (
     JOINTS,
@@ -50,7 +50,7 @@ ATTEMPTS = 3
 
 
 def host_gone(number: signal.Signals, request: Request) -> Iterator[Trial]:
-    """SIGKILL or SIGSTOP for the host. The value: from the last set-point to the fault, in the module's own time."""
+    """SIGKILL or SIGSTOP for the host. The value: from the last setpoint to the fault, in the module's own time."""
     rng, by_kernel_ms, done = random.Random(7), list[float](), 0
     with bench(request.folder, CHANNEL) as robot:
         robot.modules()
@@ -106,7 +106,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
 
 
 def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
-    """Whether every module had a set-point within the last three periods, and nobody had been told to stop."""
+    """Whether every module had a setpoint within the last three periods, and nobody had been told to stop."""
     recent_ns = now_ns - round(3e9 / RATE_HZ)
     driven = {node_of(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
     return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
@@ -162,7 +162,7 @@ def watchdog(request: Request) -> Iterator[Trial]:
             now_us += 10 * MS
             module.sync(count, QUIET)
             module.poll(now_us)
-            module.receive_set_point(set_point(count), now_us)
+            module.receive_setpoint(setpoint(count), now_us)
         assert module.state == ModuleState.ARMED, module.state
         last_us = now_us
         while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:
@@ -207,7 +207,7 @@ def _stepped(made: Robot, observer: Observer, by_s: float) -> Trial:
     stops = sum(h.message.sequence is None for h in observer.applied)
     failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
     if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
-        failure = failure or f"only {len(observer.applied)} set-points heard of in {AFTER_STEP_S:g} s"
+        failure = failure or f"only {len(observer.applied)} setpoints heard of in {AFTER_STEP_S:g} s"
     return Trial(value=float(faults + stops), failure=failure)
 
 

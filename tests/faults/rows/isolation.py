@@ -13,11 +13,11 @@ from tests.faults.row import Request, Trial
 
 ASKED_FOR_S = 0.3
 MORE_S = 0.1  # that the others are watched for, when the joint is sound again
-MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__may_lose_joints": 1}
+MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__max_isolated_joints": 1}
 
 
 def set_aside(kind: str, request: Request) -> Iterator[Trial]:
-    """The value: from the request to the injector to the first set-points that leave the joint passive."""
+    """The value: from the request to the injector to the first setpoints that leave the joint passive."""
     rng = random.Random(7)
     with robot(request, **MAY_LOSE_ONE) as (made, observer):
         names = [joint.name for joint in observer.description().joints]
@@ -34,7 +34,7 @@ def set_aside(kind: str, request: Request) -> Iterator[Trial]:
 
 
 def _let_go(observer: Observer, joint: int, since_ns: int) -> Heard[AppliedCommand]:
-    """The first set-points without the joint; by the controller, not by the host alone."""
+    """The first setpoints without the joint; by the controller, not by the host alone."""
 
     def found() -> list[Heard[AppliedCommand]]:
         passive = (h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint] is Mode.PASSIVE)

@@ -30,7 +30,7 @@ SAID_AT = re.compile(r"at ([0-9.]+) s of robot time")
 def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
     """A fault of joint_N or bus_1 on CAN, asked of the host. what: the name that the driver gives it.
 
-    The value: from its beginning, which is just before a Sync, to the safe action, which goes out where the set-points
+    The value: from its beginning, which is just before a Sync, to the stop mode, which goes out where the setpoints
     of that period would have; for a module from its last good answer, a period earlier.
     """
     rng, log = random.Random(5), request.folder / BUS_LOG
@@ -73,7 +73,7 @@ def _begun_tick(answer: Answer, period_ms: float) -> int:
 
 
 def _objections(observer: Observer, injection: Injection, what: Sequence[str], asked_ns: int) -> list[str]:
-    """What is not as it must be after the safe action."""
+    """What is not as it must be after the stop mode."""
     failures: list[str] = []
     reported: list[Status] = [heard.message for heard in observer.statuses if heard.at_ns >= asked_ns]
     words = {fault.what for status in reported for fault in status.faults}
@@ -107,14 +107,14 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
             words = "\n".join(host.words.last())
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
-        yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.set_points(frames)), failure=failure)
+        yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.setpoints(frames)), failure=failure)
     request.note("the real host process, which says why it refuses; enabled is what its bus log shows")
 
 
 def through_robot(kind: str, request: Request) -> Iterator[Trial]:
     """A joint's sensor fails while the robot moves.
 
-    The value: from the request to the injector to the first safe set-points that were heard of.
+    The value: from the request to the injector to the first safe setpoints that were heard of.
     """
     rng = random.Random(6)
     with robot(request) as (made, observer):

@@ -19,7 +19,7 @@ MAX_STEP_RAD = 0.2  # of a joint within one period; a diverged one is further of
 
 def slow(request: Request) -> Iterator[Trial]:
     """Lockstep at a tenth of real time. The value: stops and faults in a window of it."""
-    with robot(request, pace="lockstep") as (_, observer):
+    with robot(request, clock_mode="lockstep") as (_, observer):
         observer.inject("hal", "slow", "simulator", amount=SHARE)
         period_s, shares = observer.description().period_ns * 1e-9, list[float]()
         for _ in range(request.trials):

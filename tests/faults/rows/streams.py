@@ -18,7 +18,7 @@ DEPTH = 4096
 
 
 def no_joints(request: Request) -> Iterator[Trial]:
-    """The value: until the safe action. Somebody clears and arms when the stream is back."""
+    """The value: until the stop mode. Somebody clears and arms when the stream is back."""
     with robot(request) as (made, observer):
         for _ in range(request.trials):
             made.set_in_motion(observer)
@@ -35,7 +35,7 @@ def no_joints(request: Request) -> Iterator[Trial]:
 
 
 def withheld(key: str, request: Request) -> Iterator[Trial]:
-    """The value: from the request to the injector to the last set-points with which a joint pushed."""
+    """The value: from the request to the injector to the last setpoints with which a joint pushed."""
     with robot(request, **ALONG_PEGS) as (made, observer):
         states = observer.session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
         back_ms: list[float] = []
@@ -48,7 +48,7 @@ def withheld(key: str, request: Request) -> Iterator[Trial]:
             value, failures = _held(observer, asked_ns)
             yield _back(observer, key, value, failures, back_ms)
         request.note(
-            "along `peg_row` at 0.2 m/s; until the first set-points with which no joint pushes, nor does again "
+            "along `peg_row` at 0.2 m/s; until the first setpoints with which no joint pushes, nor does again "
             f"while the stream is away, for {AWAY_S:g} s more"
         )
         request.note(

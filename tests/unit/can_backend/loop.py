@@ -1,4 +1,4 @@
-"""A driver and module twins on a virtual bus, stepped, with the robot's lifecycle as the HAL host would have it."""
+"""A driver and emulated joint modules on a virtual bus, stepped, with the lifecycle as the HAL host would have it."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,13 +9,13 @@ import numpy as np
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.server import InProcessEmulators
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import InProcessTwins
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.plant import Plant
+from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 from tests.unit.hal.rig import run_config
 
@@ -37,15 +37,15 @@ class Loop:
     tick: int = 0
     samples: list[Samples] = field(default_factory=list[Samples])
     faults: list[Fault] = field(default_factory=list[Fault])
-    wanted: SetPoints | None = None
+    wanted: Setpoints | None = None
     true_speed_rad_s: list[float] = field(default_factory=list[float])  # of the fastest joint, at every tick
 
-    def run(self, ticks: int, wish: Callable[[int], SetPoints] | None = None) -> None:
+    def run(self, ticks: int, wish: Callable[[int], Setpoints] | None = None) -> None:
         """So many periods; a fault takes the robot out of `armed`, as the authority does."""
         for _ in range(ticks):
             samples = self.backend.sample(self.tick, self.tick * self.config.period_ns)
             self.samples.append(samples)
-            self.true_speed_rad_s.append(float(np.abs(self.plant.velocity_rad_s).max()))
+            self.true_speed_rad_s.append(float(np.abs(self.physics_model.velocity_rad_s).max()))
             if wish is not None:
                 self.wanted = wish(self.tick)
             self.backend.enact(self.wanted or self.staying(samples), self.lifecycle)
@@ -62,31 +62,31 @@ class Loop:
         self.run(ticks)
         assert self.states() == [ModuleState.ARMED] * len(self.states()), self.faults
 
-    def staying(self, samples: Samples) -> SetPoints:
+    def staying(self, samples: Samples) -> Setpoints:
         """Every joint stays where it is."""
         angles = list(samples.joints.angle_rad)
-        return SetPoints([Mode.POSITION] * len(angles), angles, [4.0] * len(angles))
+        return Setpoints([Mode.POSITION] * len(angles), angles, [4.0] * len(angles))
 
-    def waving(self, tick: int) -> SetPoints:
+    def waving(self, tick: int) -> Setpoints:
         """Every joint swings by 0.3 rad at 1 Hz."""
         swing = 0.3 * np.sin(2 * np.pi * tick / 100)
         count = len(self.samples[-1].joints.angle_rad)
-        return SetPoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
+        return Setpoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
 
     def states(self) -> list[ModuleState]:
         """What the modules last said."""
         return [module.state for module in self.backend.modules.reading.modules]
 
     @property
-    def plant(self) -> Plant:
-        """What the twins' motors move."""
-        return chain_of(self.backend).plant
+    def physics_model(self) -> PhysicsModel:
+        """What the emulators' motors move."""
+        return chain_of(self.backend).physics_model
 
 
 def chain_of(backend: CanBackend) -> ModuleChain:
-    """The twins at the other end of its virtual buses."""
+    """The emulators at the other end of its virtual buses."""
     wire = backend.modules.wires[0]
-    assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
+    assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessEmulators)
     return wire.peer.server.chain
 
 
@@ -94,7 +94,7 @@ def chain_of(backend: CanBackend) -> ModuleChain:
 def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[Loop]:
     """Open, and close at the end."""
     run = run or config()
-    backend = CanBackend(run, CanSettings(plant=settings.pop("plant", "inertia"), **settings))
+    backend = CanBackend(run, CanSettings(physics_model=settings.pop("physics_model", "inertia"), **settings))
     try:
         yield Loop(backend, run)
     finally:

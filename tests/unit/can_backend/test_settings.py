@@ -19,12 +19,12 @@ def read(section: dict[str, Any]) -> CanSettings:
     [
         ({}, "here"),
         ({"channels": ["can0"]}, "none"),
-        ({"twins": "none"}, "none"),
-        ({"channels": ["can0"], "twins": "process"}, "process"),
+        ({"emulators": "none"}, "none"),
+        ({"channels": ["can0"], "emulators": "process"}, "process"),
     ],
 )
 def test_where_twins_run(section: dict[str, Any], where: str) -> None:
-    assert read(section).twins_run == where
+    assert read(section).emulators_run == where
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Running, running
 from tests.unit.hal.rig import run_config
 
-SCHEDULE: dict[str, Any] = {"guidance": {"every_ticks": 2}, "navigation": {"every_ticks": 5}, "control": {}}
+SCHEDULE: dict[str, Any] = {"guidance": {"decimation": 2}, "navigation": {"decimation": 5}, "control": {}}
 POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of the tests gives it
 
 
@@ -89,8 +89,8 @@ class Stage:
 @contextmanager
 def stage(**config: Any) -> Iterator[Stage]:
     """The worm in real time, with guidance, navigation, and control with the controller that shows its views."""
-    common = {"controller": "showing", "pace": "realtime", "services": SCHEDULE, "rate_hz": 50.0}
-    made = run_config(**{**common, "faults_allowed": True, **POSE, **config})
+    common = {"controller": "showing", "clock_mode": "realtime", "services": SCHEDULE, "rate_hz": 50.0}
+    made = run_config(**{**common, "allow_fault_injection": True, **POSE, **config})
     Showing.views, Showing.answers = [], []
     with (
         offered(CONTROLLERS, "showing", Showing),

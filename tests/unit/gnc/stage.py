@@ -46,7 +46,7 @@ def make_world(**changes: Any) -> World:
     """A world model with a body at the origin and nothing around it, with whatever is to be different."""
     values: dict[str, Any] = {
         "tick": 0,
-        "stamp_ns": 0,
+        "timestamp_ns": 0,
         "base_position_w": (0.0, 0.0, 0.0),
         "base_orientation_wxyz": (1.0, 0.0, 0.0, 0.0),
         "base_confidence": 1.0,
@@ -124,18 +124,18 @@ class Stage:
         seen = lay if world_tail_s_m is None else lay_chain(self.route, world_tail_s_m, segments)
         world = make_world(
             tick=tick - world_age_ticks,
-            stamp_ns=stamp_of(tick - world_age_ticks),
-            pose_stamp_ns=stamp_of(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
+            timestamp_ns=stamp_of(tick - world_age_ticks),
+            pose_timestamp_ns=stamp_of(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
             base_position_w=(*seen.tail_w, BODY_RADIUS_M),
             base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
             contacts=contacts or [],
-            contacts_stamp_ns=None if contacts is None else stamp_of(tick - world_age_ticks),
+            contacts_timestamp_ns=None if contacts is None else stamp_of(tick - world_age_ticks),
             obstacles=self.pegs,
         )
-        joints = state(self.robot, angles.tolist(), torque=torque_nm, tick=tick, stamp_ns=stamp_of(tick))
+        joints = state(self.robot, angles.tolist(), torque=torque_nm, tick=tick, timestamp_ns=stamp_of(tick))
         trajectory = Trajectory(
             tick=0,
-            stamp_ns=0,
+            timestamp_ns=0,
             path_id=self.path_id,
             path_w=[(x, y) for x, y in self.route.points_w.tolist()],
             speed_m_s=self.speed_m_s,

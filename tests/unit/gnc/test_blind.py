@@ -25,25 +25,25 @@ def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
         return [controller.update(stage.view(t, tail_s_m, torque_nm=TORQUE_NM, **more)) for t in ticks]
 
     before = act(range(100))[-1]
-    pushing = Mode.TORQUE in before.set_points.mode
+    pushing = Mode.TORQUE in before.setpoints.mode
     assert pushing == (plugin is ObstacleTriplet)
     blind = act(range(100, 300), without=without)
-    assert all(set(action.set_points.mode) == {Mode.POSITION} for action in blind)
+    assert all(set(action.setpoints.mode) == {Mode.POSITION} for action in blind)
     assert all(action.report.propulsion_joint is None for action in blind)
-    targets = np.array([action.set_points.target for action in blind])
+    targets = np.array([action.setpoints.target for action in blind])
     angles = np.array(stage.view(0, TAIL_S_M).joints.angle_rad)
     assert np.abs(np.diff(targets, axis=0)).max() < STEP_RAD
     assert np.abs(targets[-1] - targets[-100]).max() < 2e-3  # it stays
     if pushing:  # what the joint pushed with has faded, and is not kept up by a position target far away
-        turn = before.set_points.mode.index(Mode.TORQUE)
+        turn = before.setpoints.mode.index(Mode.TORQUE)
         stiffness = stage.robot.joints[turn].stiffness_nm_per_rad
         assert abs(targets[0, turn] - angles[turn]) * stiffness == pytest.approx(TORQUE_NM, rel=0.2)
         assert abs(targets[-1, turn] - angles[turn]) * stiffness < 0.05 * TORQUE_NM
     back = act(range(300, 360), tail_s_m=TAIL_S_M + 0.02)  # it has slid a little meanwhile
-    steps = np.array(back[0].set_points.target) - targets[-1]
-    steady = np.array([mode == Mode.POSITION for mode in back[0].set_points.mode])
+    steps = np.array(back[0].setpoints.target) - targets[-1]
+    steady = np.array([mode == Mode.POSITION for mode in back[0].setpoints.mode])
     assert np.abs(steps[steady]).max() < STEP_RAD
-    assert (Mode.TORQUE in back[-1].set_points.mode) == pushing
+    assert (Mode.TORQUE in back[-1].setpoints.mode) == pushing
 
 
 @pytest.mark.parametrize("without", ["world", "trajectory"])
@@ -54,7 +54,7 @@ def test_before_it_knows_anything_it_holds_its_first_pose_and_says_what_is_missi
     view = stage.view(0, TAIL_S_M, without=without)
     first = controller.update(view)
     assert first.report.why == {"world": "no world model", "trajectory": "no trajectory"}[without]
-    assert first.set_points.target == pytest.approx(view.joints.angle_rad)
-    assert set(first.set_points.mode) == {Mode.POSITION}
+    assert first.setpoints.target == pytest.approx(view.joints.angle_rad)
+    assert set(first.setpoints.mode) == {Mode.POSITION}
     slid = controller.update(stage.view(1, TAIL_S_M, without=without, turned={3: 0.2}))
-    assert slid.set_points.target == pytest.approx(first.set_points.target)  # held, not followed
+    assert slid.setpoints.target == pytest.approx(first.setpoints.target)  # held, not followed

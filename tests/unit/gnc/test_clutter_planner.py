@@ -33,7 +33,7 @@ def field(density: float = 8.0) -> tuple[list[Obstacle], np.ndarray]:
 
 
 def world(at_s: float, obstacles: list[Obstacle]) -> World:
-    return make_world(tick=round(100 * at_s), stamp_ns=round(at_s * SECOND), obstacles=obstacles)
+    return make_world(tick=round(100 * at_s), timestamp_ns=round(at_s * SECOND), obstacles=obstacles)
 
 
 def planner(known: list[Obstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:

@@ -38,9 +38,9 @@ def readings(pushes, *, friction=0.0, acceleration=(0.0, 0.0)):
     torques = [-sum(np.cross(at - rear[i + 1], load)[2] for k, at, load in loads if k > i) for i in range(COUNT)]
     felt = [tuple(frame.T @ [*acceleration, GRAVITY_M_S2]) for frame in frames]
     still = [(0.0, 0.0, 0.0)] * (COUNT + 1)
-    imu = Imu(tick=0, stamp_ns=0, link=list(range(COUNT + 1)), angular_velocity_rad_s=still, acceleration_m_s2=felt)
-    centre = masses @ middles / masses.sum()
-    turning_nm = sum(np.cross(at - centre, load)[2] for _, at, load in loads)
+    imu = Imu(tick=0, timestamp_ns=0, link=list(range(COUNT + 1)), angular_velocity_rad_s=still, acceleration_m_s2=felt)
+    center = masses @ middles / masses.sum()
+    turning_nm = sum(np.cross(at - center, load)[2] for _, at, load in loads)
     return torques, imu, np.sum([load for _, _, load in loads], axis=0), turning_nm
 
 
@@ -81,7 +81,7 @@ def test_pushes_that_accelerate_the_body_are_found_with_their_place_side_and_for
 
 
 def test_a_robot_that_sends_no_imu_readings_is_taken_at_its_torques():
-    imu = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    imu = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     assert estimated([0.0] * COUNT, imu) == []
 
 

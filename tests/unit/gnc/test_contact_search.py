@@ -36,7 +36,7 @@ def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[Action
 
 
 def targets(actions: list[Action]) -> np.ndarray:
-    return np.array([action.set_points.target for action in actions])
+    return np.array([action.setpoints.target for action in actions])
 
 
 def period_s(actions: list[Action]) -> float:
@@ -180,4 +180,4 @@ def test_a_body_in_a_u_that_nothing_can_push_is_no_error(pegs: list[Obstacle]) -
     for tail_s_m in np.linspace(0.3, 0.7, 9):
         controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
         for tick in range(5):
-            assert np.isfinite(controller.update(stage.view(tick, float(tail_s_m))).set_points.target).all()
+            assert np.isfinite(controller.update(stage.view(tick, float(tail_s_m))).setpoints.target).all()

@@ -90,7 +90,7 @@ def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_
             wait_until(lambda key=key: f"{key} is " not in known(made.state()).reason, "another reason")
         for view in made.views:  # nothing too old was ever handed over
             if view.world is not None:
-                assert view.tick * PERIOD_NS - (view.world.pose_stamp_ns or 0) <= 300_000_000
+                assert view.tick * PERIOD_NS - (view.world.pose_timestamp_ns or 0) <= 300_000_000
         assert not made.run.status.faults
         made.reported.clear()
         made.services["guidance"].stop()
@@ -107,15 +107,15 @@ def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why() -> 
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
         assert speed(made) == 0.2  # the mission's
-        now_ns = clocks.drain()[-1].stamp_ns
-        intents.put(Intent(stamp_ns=now_ns, who="ann", speed_m_s=0.1, valid_for_ns=500_000_000))
+        now_ns = clocks.drain()[-1].timestamp_ns
+        intents.put(Intent(timestamp_ns=now_ns, who="ann", speed_m_s=0.1, valid_for_ns=500_000_000))
         wait_until(lambda: speed(made) == 0.1, "the operator's speed")
         wait_until(lambda: speed(made) == 0.0, "no speed")
         stopped = next(view for view in made.views if view.trajectory is not None and view.trajectory.speed_m_s == 0.0)
         assert (stopped.tick * PERIOD_NS - now_ns) * 1e-9 == pytest.approx(0.6, abs=0.25)
         reported = made.tells("the intent of ann has expired")
         assert reported.state == "Idle" and "send a new one to go on" in reported.reason
-        intents.put(Intent(stamp_ns=clocks.drain()[-1].stamp_ns, who="ann"))
+        intents.put(Intent(timestamp_ns=clocks.drain()[-1].timestamp_ns, who="ann"))
         wait_until(lambda: speed(made) == 0.2, "a new intent")
 
 

@@ -12,9 +12,9 @@ from tests.unit.gnc.stage import make_world
 from tests.unit.hal.rig import description, run_config, state
 
 SCHEDULE = {
-    "control": {"lag_ticks": 2},
-    "guidance": {"every_ticks": 2, "lag_ticks": 2},
-    "navigation": {"every_ticks": 20, "lag_ticks": 20},
+    "control": {"latency_ticks": 2},
+    "guidance": {"decimation": 2, "latency_ticks": 2},
+    "navigation": {"decimation": 20, "latency_ticks": 20},
 }
 SECOND = 10**9
 NOW = 100 * SECOND
@@ -31,12 +31,16 @@ def limits(config: RunConfig | None = None, **rates: float) -> Limits:
 
 
 def world(**changes: Any) -> World:
-    return make_world(**({"tick": 9_990, "stamp_ns": NOW, "pose_stamp_ns": NOW, "contacts_stamp_ns": NOW} | changes))
+    return make_world(
+        **({"tick": 9_990, "timestamp_ns": NOW, "pose_timestamp_ns": NOW, "contacts_timestamp_ns": NOW} | changes)
+    )
 
 
-def trajectory(stamp_ns: int | None) -> Trajectory:
+def trajectory(timestamp_ns: int | None) -> Trajectory:
     path = [(0.0, 0.0), (1.0, 0.0)]
-    return Trajectory(tick=0, stamp_ns=stamp_ns, path_id=0, path_w=path, speed_m_s=0.1, push_points=[], finished=False)
+    return Trajectory(
+        tick=0, timestamp_ns=timestamp_ns, path_id=0, path_w=path, speed_m_s=0.1, push_points=[], finished=False
+    )
 
 
 def test_the_limits_follow_from_rates_delays_and_schedules() -> None:
@@ -46,7 +50,7 @@ def test_the_limits_follow_from_rates_delays_and_schedules() -> None:
     assert found.sensors_s == pytest.approx({"sensor/pose": 0.05 + 0.04 + 0.2, "sensor/contacts": 0.05 + 0.04 + 0.3})
     assert found.trajectory_s == pytest.approx(0.04 + 0.2 + 3 * 0.2)
     assert limits().joints_s == pytest.approx(0.03) and limits().sensors_s == {}
-    tracked = run_config(services={**SCHEDULE, "sensor": {"every_ticks": 10, "lag_ticks": 3}})
+    tracked = run_config(services={**SCHEDULE, "sensor": {"decimation": 10, "latency_ticks": 3}})
     assert limits(tracked).sensors_s == pytest.approx({"sensor/pose": 0.04 + 0.03 + 0.3})  # by a service's schedule
 
 
@@ -74,17 +78,20 @@ def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
     ("made", "words"),
     [
         ({}, ""),
-        ({"pose_stamp_ns": NOW - 310_000_000}, "sensor/pose is 0.31 s old, at most 0.29 s"),
-        ({"pose_stamp_ns": NOW - 290_000_000}, ""),
-        ({"contacts_stamp_ns": NOW - SECOND}, "sensor/contacts is 1 s old, at most 0.29 s"),
+        ({"pose_timestamp_ns": NOW - 310_000_000}, "sensor/pose is 0.31 s old, at most 0.29 s"),
+        ({"pose_timestamp_ns": NOW - 290_000_000}, ""),
+        ({"contacts_timestamp_ns": NOW - SECOND}, "sensor/contacts is 1 s old, at most 0.29 s"),
         (
-            {"pose_stamp_ns": 0, "contacts_stamp_ns": NOW - SECOND},
+            {"pose_timestamp_ns": 0, "contacts_timestamp_ns": NOW - SECOND},
             "sensor/pose is 100 s old, at most 0.29 s; sensor/contacts is 1 s old, at most 0.29 s",
         ),
-        ({"contacts_stamp_ns": None}, "guidance/world was made without sensor/contacts"),
-        ({"stamp_ns": NOW - SECOND, "pose_stamp_ns": NOW - SECOND}, "guidance/world is 1 s old, at most 0.22 s"),
-        ({"stamp_ns": NOW + SECOND}, "guidance/world is stamped 1 s ahead of the robot's clock"),
-        ({"pose_stamp_ns": 2**62}, "sensor/pose is stamped 4.61e+09 s ahead of the robot's clock"),
+        ({"contacts_timestamp_ns": None}, "guidance/world was made without sensor/contacts"),
+        (
+            {"timestamp_ns": NOW - SECOND, "pose_timestamp_ns": NOW - SECOND},
+            "guidance/world is 1 s old, at most 0.22 s",
+        ),
+        ({"timestamp_ns": NOW + SECOND}, "guidance/world is stamped 1 s ahead of the robot's clock"),
+        ({"pose_timestamp_ns": 2**62}, "sensor/pose is stamped 4.61e+09 s ahead of the robot's clock"),
     ],
 )
 def test_a_world_model_is_as_old_as_what_it_was_made_of(made: dict[str, Any], words: str) -> None:
@@ -96,20 +103,20 @@ def test_a_perceived_map_is_as_old_as_its_newest_image() -> None:
     sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=20.0, delay_s=0.03) for name in ("depth/a", "range/b")]
     seeing = msgspec.structs.replace(description(), sensors=sensors)
     found, known = Limits.of(config, seeing), Limits.of(run_config(services=SCHEDULE), seeing)
-    assert found.against_world(world(depth_stamp_ns=NOW - 270_000_000), NOW) == ""
-    old = found.against_world(world(depth_stamp_ns=NOW - 400_000_000), NOW)
+    assert found.against_world(world(depth_timestamp_ns=NOW - 270_000_000), NOW) == ""
+    old = found.against_world(world(depth_timestamp_ns=NOW - 400_000_000), NOW)
     assert old == "sensor/depth or sensor/range is 0.4 s old, at most 0.27 s"
     assert "was made without sensor/depth" in found.against_world(world(), NOW)
     assert known.against_world(world(), NOW) == ""  # of the scene's file, which does not age
 
 
 def test_a_sensor_that_the_robot_lacks_cannot_be_stale() -> None:
-    bare = world(pose_stamp_ns=None, contacts_stamp_ns=None)
+    bare = world(pose_timestamp_ns=None, contacts_timestamp_ns=None)
     assert limits().against_world(bare, NOW) == ""
 
 
 def test_joints_and_trajectory_have_their_own_limits() -> None:
-    found, joints = limits(), state(robot(), stamp_ns=NOW)
+    found, joints = limits(), state(robot(), timestamp_ns=NOW)
     assert found.against_joints(joints, NOW + 30_000_000) == ""
     assert found.against_joints(joints, NOW + 31_000_000) == "sensor/joints is 0.031 s old, at most 0.03 s"
     assert found.against_joints(joints, NOW - 10_000_000) == ""  # it came before its tick's clock

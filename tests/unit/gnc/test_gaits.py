@@ -55,6 +55,6 @@ def test_a_bent_robot_that_cannot_do_it_stays_bent_and_says_why(gait: type[Sidew
     stage = make_stage()
     controller = gait(stage.robot, gait.Settings())
     actions = [controller.update(stage.view(tick, 0.3)) for tick in range(200)]
-    targets = [action.set_points.target for action in actions]
+    targets = [action.setpoints.target for action in actions]
     assert all("no joints that turn up and down" in action.report.why for action in actions)
     assert np.abs(targets[0]).max() > 0.2 and np.abs(np.array(targets) - targets[0]).max() < 1e-9

@@ -50,8 +50,8 @@ def reported(**report: Any) -> Action:
     return Action(GOOD, Report(**report))
 
 
-def made_of(set_points: Any, report: Any = None) -> Action:
-    return Action(set_points, report or Report())
+def made_of(setpoints: Any, report: Any = None) -> Action:
+    return Action(setpoints, report or Report())
 
 
 def test_a_good_answer_passes_as_it_is() -> None:
@@ -63,22 +63,22 @@ def test_a_good_answer_passes_as_it_is() -> None:
     ("answer", "words"),
     [
         (None, r"update\(\) returned None, must return an Action"),
-        (GOOD, r"update\(\) returned SetPoints\(.*\.\.\. \(SetPoints\), must return an Action"),
-        (made_of([0.0] * 3), r"Action.set_points is \[0.0, 0.0, 0.0\] \(list\), must be SetPoints"),
+        (GOOD, r"update\(\) returned Setpoints\(.*\.\.\. \(Setpoints\), must return an Action"),
+        (made_of([0.0] * 3), r"Action.setpoints is \[0.0, 0.0, 0.0\] \(list\), must be Setpoints"),
         (made_of(GOOD, "moving"), r"Action.report is 'moving', must be a Report"),
-        (points(target=[0.0] * 2), r"SetPoints.target has 2 values, must have 3: one a joint, joint_1 to joint_3"),
-        (points(mode=[Mode.POSITION] * 4), "SetPoints.mode has 4 values, must have 3"),
-        (points(torque_limit_nm=[]), "SetPoints.torque_limit_nm has 0 values"),
-        (points(target=np.zeros(3)), r"SetPoints.target is array\(.*\(ndarray\), must be a list; use .tolist\(\)"),
-        (points(target=[0.0, math.nan, 0.0]), r"SetPoints.target\[1\] \(joint_2\) is nan, must be a finite number"),
-        (points(target=[0.0, 0.0, -math.inf]), r"SetPoints.target\[2\] \(joint_3\) is -inf"),
+        (points(target=[0.0] * 2), r"Setpoints.target has 2 values, must have 3: one a joint, joint_1 to joint_3"),
+        (points(mode=[Mode.POSITION] * 4), "Setpoints.mode has 4 values, must have 3"),
+        (points(torque_limit_nm=[]), "Setpoints.torque_limit_nm has 0 values"),
+        (points(target=np.zeros(3)), r"Setpoints.target is array\(.*\(ndarray\), must be a list; use .tolist\(\)"),
+        (points(target=[0.0, math.nan, 0.0]), r"Setpoints.target\[1\] \(joint_2\) is nan, must be a finite number"),
+        (points(target=[0.0, 0.0, -math.inf]), r"Setpoints.target\[2\] \(joint_3\) is -inf"),
         (points(target=[2e5, 0.0, 0.0]), r".* is 200000.0, must be .* of rad, rad/s or N·m from -100000 to 100000"),
         (points(target=[np.float64(1), 0.0, 0.0]), r".* is .*1.0.* \(float64\), must be a plain float"),
         (points(target=[True, 0.0, 0.0]), r".* is True \(bool\), must be a plain float"),
         (points(target=["1", 0.0, 0.0]), ".* is '1', must be a plain float"),
         (points(torque_limit_nm=[7.0, -1.0, 7.0]), r".*_limit_nm\[1\] \(joint_2\) is -1.0, must be .* N·m from 0"),
-        (points(mode=[1, 1, 1]), r"SetPoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION"),
-        (points(mode=[Mode.POSITION, 7, "x"]), r"SetPoints.mode\[1\] \(joint_2\) is 7"),
+        (points(mode=[1, 1, 1]), r"Setpoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION"),
+        (points(mode=[Mode.POSITION, 7, "x"]), r"Setpoints.mode\[1\] \(joint_2\) is 7"),
         (reported(why=None), "Report.why is None, must be a str"),
         (reported(usable_push_points="3"), "Report.usable_push_points is '3'"),
         (reported(propulsion_joint=3), "Report.propulsion_joint is 3, must be None or an int from 0 to 2"),

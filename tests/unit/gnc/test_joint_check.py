@@ -16,7 +16,7 @@ def targets(start_rad: float, seconds: float, dead: int | None = None) -> list[l
     made: list[list[float]] = []
     for tick in range(round(seconds / PERIOD_S)):
         view = View(tick, tick * PERIOD_S, PERIOD_S, state(ROBOT, angles), None, None)
-        made.append(list(check.update(view).set_points.target))
+        made.append(list(check.update(view).setpoints.target))
         angles = [angle if joint == dead else made[-1][joint] for joint, angle in enumerate(angles)]
     return made
 

@@ -11,7 +11,16 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, SettingsRequest
 from tests.unit.hal.rig import description
 
-CLOCK = Clock(tick=7, stamp_ns=70, period_ns=10, pace="lockstep", lifecycle="armed", arming=1, lease_epoch=1, newest={})
+CLOCK = Clock(
+    tick=7,
+    timestamp_ns=70,
+    period_ns=10,
+    clock_mode="lockstep",
+    lifecycle="armed",
+    arm_session=1,
+    lease_epoch=1,
+    newest={},
+)
 
 
 class Bench:

@@ -60,7 +60,7 @@ def test_contacts_on_one_side_cannot_push() -> None:
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
 def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
-    push = push_forward(nodes, touches, slope, loose_m=0.005)
+    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
     assert len(touches) >= 3 and push.balanced
     assert push.lambdas.min() >= 0.0
     forces = push.lambdas[:, None] * touches.directions_w
@@ -85,7 +85,7 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
     random = np.random.default_rng(seed)
     pegs = [peg for peg in make_stage().pegs if random.uniform() < 0.6]
     nodes, touches, slope = touching(float(random.uniform(0.0, 2.0)), pegs)
-    push = push_forward(nodes, touches, slope, loose_m=0.005)
+    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
     assert (push.lambdas >= 0.0).all() and np.isfinite(push.torques_nm).all()
     if len(touches) < 3:
         assert not push.balanced
@@ -94,7 +94,9 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
 def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
-    thrifty, smallest = (push_forward(nodes, touches, one, loose_m=0.005) for one in (slope, np.zeros_like(slope)))
+    thrifty, smallest = (
+        push_forward(nodes, touches, one, contact_gap_scale_m=0.005) for one in (slope, np.zeros_like(slope))
+    )
     assert thrifty.balanced and smallest.balanced
     done, circled = (np.abs(one.torques_nm * slope).sum() for one in (thrifty, smallest))
     assert done < 0.9 * circled
@@ -107,7 +109,7 @@ def test_dearer_contacts_leave_the_push_to_three_that_can_do_it_alone(tail_s_m: 
     three = np.argsort(touches.body_s_m)[:3]
     dearer = np.full(len(touches), 1000.0)
     dearer[three] = 0.0
-    push = push_forward(nodes, touches, slope, loose_m=0.005, dearer=dearer)
-    usual = push_forward(nodes, touches, slope, loose_m=0.005)
+    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005, dearer=dearer)
+    usual = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
     assert push.rest < 0.1 and np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
     assert len(touches) == 3 or np.delete(usual.lambdas, three).sum() > np.delete(push.lambdas, three).sum()

@@ -18,11 +18,11 @@ PEG = Obstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_
 
 
 def intent(at_s: float, **more: Any) -> Intent:
-    return Intent(**{"stamp_ns": round(at_s * SECOND), "who": "ann", "speed_m_s": 0.1, **more})
+    return Intent(**{"timestamp_ns": round(at_s * SECOND), "who": "ann", "speed_m_s": 0.1, **more})
 
 
-def world(tail_x_m: float, stamp_ns: int = 0) -> World:
-    return make_world(stamp_ns=stamp_ns, base_position_w=(tail_x_m, 0.0, 0.0))
+def world(tail_x_m: float, timestamp_ns: int = 0) -> World:
+    return make_world(timestamp_ns=timestamp_ns, base_position_w=(tail_x_m, 0.0, 0.0))
 
 
 def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
@@ -34,11 +34,11 @@ def test_the_trajectory_is_as_old_as_the_world_model_that_it_was_planned_from() 
     planner = KnownPath(ROUTE, [PEG], 0.15)
     blind = planner.update(0, None, MISSION)
     assert blind.peg_friction == 0.15
-    assert blind.stamp_ns is None and blind.push_points == [] and not blind.finished
-    seen = planner.update(20, world(0.5, stamp_ns=18 * 10**7), MISSION)
-    assert (seen.tick, seen.stamp_ns, seen.push_points) == (20, 18 * 10**7, ["peg"])
-    again = planner.update(40, world(0.5, stamp_ns=18 * 10**7), MISSION)
-    assert again.stamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
+    assert blind.timestamp_ns is None and blind.push_points == [] and not blind.finished
+    seen = planner.update(20, world(0.5, timestamp_ns=18 * 10**7), MISSION)
+    assert (seen.tick, seen.timestamp_ns, seen.push_points) == (20, 18 * 10**7, ["peg"])
+    again = planner.update(40, world(0.5, timestamp_ns=18 * 10**7), MISSION)
+    assert again.timestamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
 
 
 def test_the_path_ends() -> None:

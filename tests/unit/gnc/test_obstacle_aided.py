@@ -15,11 +15,11 @@ def test_from_torque_mode_it_goes_on_holding_with_the_torque_that_is_there(lost:
     stage = make_stage()
     controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
     views = [stage.view(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
-    pushing = [controller.update(view) for view in views][-1].set_points
+    pushing = [controller.update(view) for view in views][-1].setpoints
     assert set(pushing.mode) == {Mode.TORQUE}
     assert np.abs(pushing.target).max() > 0.1
 
-    holding = controller.update(stage.view(40, 1.0, torque_nm=HELD_NM, without=lost)).set_points
+    holding = controller.update(stage.view(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
     assert set(holding.mode) == {Mode.POSITION}
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
     by_spring_nm = (np.array(holding.target) - views[-1].joints.angle_rad) * stiffness
@@ -31,4 +31,4 @@ def test_a_body_that_nothing_can_push_holds_its_shape_in_position_mode():
     stage.pegs = []
     controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
     actions = [controller.update(stage.view(tick, 1.0)) for tick in range(40)]
-    assert set(actions[-1].set_points.mode) == {Mode.POSITION}
+    assert set(actions[-1].setpoints.mode) == {Mode.POSITION}

@@ -15,7 +15,7 @@ def make_controller(stage, **settings) -> ObstacleTriplet:
 
 
 def torque_joints(action) -> list[int]:
-    return [i for i, mode in enumerate(action.set_points.mode) if mode == Mode.TORQUE]
+    return [i for i, mode in enumerate(action.setpoints.mode) if mode == Mode.TORQUE]
 
 
 def stay(controller, stage, ticks, **more):
@@ -33,13 +33,13 @@ def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved
     assert report.propulsion_n == pytest.approx(35.0, rel=0.01)
     assert report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
     others = [i for i in range(13) if i != report.propulsion_joint]
-    targets, angles = np.array(action.set_points.target), np.array(report.reference_rad)
+    targets, angles = np.array(action.setpoints.target), np.array(report.reference_rad)
     assert targets[others] == pytest.approx(angles[others], abs=1e-3)
     forces = np.array([point.force_w for point in report.push_points])[:, :2]
     tangent = np.array(report.push_points[0].tangent_w)[:2]
     assert forces.sum(axis=0) == pytest.approx(report.propulsion_n * tangent, abs=1e-6)
-    assert np.hypot(*forces.T) == pytest.approx(report.solved_force_n)
-    assert min(report.solved_force_n) > 0
+    assert np.hypot(*forces.T) == pytest.approx(report.desired_force_n)
+    assert min(report.desired_force_n) > 0
     places = [point.body_s_m for point in report.push_points]
     assert places == sorted(places)
     torque = report.bending_torque_nm[known(report.propulsion_joint)]
@@ -51,17 +51,17 @@ def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved
 
 def test_on_request_servos_lead_by_the_load_that_they_are_to_hold():
     stage = make_stage()
-    controller = make_controller(stage, load_share=1.0, load_filter_s=0.05)
+    controller = make_controller(stage, load_ratio=1.0, load_filter_s=0.05)
     action = stay(controller, stage, 99)
     others = [i for i in range(13) if i != action.report.propulsion_joint]
     stiffness = np.array([joint.stiffness_nm_per_rad for joint in stage.robot.joints])
-    lead = np.array(action.set_points.target) - np.array(action.report.reference_rad)
+    lead = np.array(action.setpoints.target) - np.array(action.report.reference_rad)
     load = np.array(action.report.bending_torque_nm) / stiffness
     assert lead[others] == pytest.approx(load[others], abs=2e-3)
     assert np.abs(load[others]).max() > 0.03
     blind = controller.update(stage.view(99, TAIL_S_M, without="world"))
-    targets = np.array(blind.set_points.target)
-    assert targets[others] == pytest.approx(np.array(action.set_points.target)[others], abs=5e-3)  # and fades
+    targets = np.array(blind.setpoints.target)
+    assert targets[others] == pytest.approx(np.array(action.setpoints.target)[others], abs=5e-3)  # and fades
 
 
 def test_the_faster_it_moves_the_less_it_pushes():
@@ -105,7 +105,7 @@ def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
     assert report.saturated
     assert known(report.torque_headroom_nm) < 0
     assert known(report.propulsion_n) < 35.0
-    assert abs(action.set_points.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
+    assert abs(action.setpoints.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
     assert abs(report.bending_torque_nm[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
 
 
@@ -177,7 +177,7 @@ def test_pitch_joints_stay_straight():
     action = stay(make_controller(stage), stage, 100)
     assert known(action.report.propulsion_joint) % 2 == 0
     assert action.report.why == ""
-    pitch = np.array(action.set_points.target)[1::2]
+    pitch = np.array(action.setpoints.target)[1::2]
     assert np.abs(pitch).max() < 1e-6
     assert len(action.report.bending_torque_nm) == 26
 
@@ -185,9 +185,9 @@ def test_pitch_joints_stay_straight():
 def test_a_new_path_moves_no_target_at_once():
     stage = make_stage()
     controller = make_controller(stage)
-    before = stay(controller, stage, 50).set_points
+    before = stay(controller, stage, 50).setpoints
     stage.path_id = 1
-    after = controller.update(stage.view(50, TAIL_S_M + 0.05)).set_points
+    after = controller.update(stage.view(50, TAIL_S_M + 0.05)).setpoints
     steady = [i for i in range(13) if before.mode[i] == after.mode[i] == Mode.POSITION]
     assert len(steady) >= 11
     for i in steady:

@@ -18,10 +18,10 @@ def test_a_held_body_is_asked_for_no_more_than_the_look_ahead():
     stage = make_stage()
     controller = make_controller(stage, look_ahead_m=0.03)
     action = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(200)][-1]
-    assert set(action.set_points.mode) == {Mode.POSITION}
+    assert set(action.setpoints.mode) == {Mode.POSITION}
     nodes = nodes_of(stage, TAIL_S_M + 0.03)
     headings = np.arctan2(*np.diff(nodes)[::-1])
-    assert action.set_points.target == pytest.approx(np.diff(headings), abs=0.01)
+    assert action.setpoints.target == pytest.approx(np.diff(headings), abs=0.01)
     assert action.report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
     assert action.report.usable_push_points is None
 
@@ -40,5 +40,5 @@ def test_it_starts_without_a_jump():
     stage = make_stage()
     view = stage.view(0, TAIL_S_M)
     action = make_controller(stage).update(view)
-    steps = np.abs(np.array(action.set_points.target) - view.joints.angle_rad)
+    steps = np.abs(np.array(action.setpoints.target) - view.joints.angle_rad)
     assert steps.max() < 0.02

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.carried import Carried
+from snakesim_gnc.control.carried import NetContactForce
 from snakesim_gnc.control.push import find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_gnc.geometry.planar_body import PlanarBody
@@ -27,7 +27,7 @@ def peg(name: str, x: float, side: int) -> Obstacle:
 
 def pushing(pegs: Sequence[Obstacle]):
     touches = find_touches(NODES, 0.04, Outlines.of(pegs), reach_m=0.03, friction=0.0)
-    return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), loose_m=0.005)
+    return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), contact_gap_scale_m=0.005)
 
 
 def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
@@ -50,6 +50,6 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
     ],
 )
 def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
-    nothing = Carried(strongest_n=0.0, ahead_n=0.0, back_n=0.0, holder="", touched=frozenset())
+    nothing = NetContactForce(strongest_n=0.0, ahead_n=0.0, back_n=0.0, holder="", touched=frozenset())
     jammed, why = why_it_stands(*pushing(pegs), force_n, max_force_n, nothing, ["a", "b", "c"])
     assert not jammed and words in why

@@ -138,16 +138,16 @@ def choices_in_row(count=7):
 
 def test_the_present_triplet_stays_and_its_successor_shares_most_push_points():
     row = choices_in_row()
-    assert choose(row, row[3].triplet, switch_share=0.5) is row[3]
+    assert choose(row, row[3].triplet, switch_fraction=0.5) is row[3]
     rest = [row[0], row[1], row[4], row[6]]
-    assert choose(rest, row[3].triplet, switch_share=0.5) is row[4]
+    assert choose(rest, row[3].triplet, switch_fraction=0.5) is row[4]
 
 
 def test_of_equals_the_one_nearest_to_the_tail_is_chosen():
     row = choices_in_row()
-    assert choose(row, None, switch_share=0.5) is row[0]
-    assert choose(row, None, switch_share=0.5, banned=[row[0].triplet.names]) is row[1]
-    assert choose(row, None, switch_share=0.5, banned=[c.triplet.names for c in row]) is None
+    assert choose(row, None, switch_fraction=0.5) is row[0]
+    assert choose(row, None, switch_fraction=0.5, banned=[row[0].triplet.names]) is row[1]
+    assert choose(row, None, switch_fraction=0.5, banned=[c.triplet.names for c in row]) is None
 
 
 def test_points_become_choices_with_a_joint_each():

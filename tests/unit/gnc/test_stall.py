@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from snakesim_gnc.control.carried import Carried, FeltContacts
+from snakesim_gnc.control.carried import FeltContacts, NetContactForce
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
 from snakesim_hal.wire.messages import World
 from tests.unit.gnc.stage import known, make_contact, make_world
@@ -36,13 +36,13 @@ def test_forgetting_starts_a_new_window():
     assert stands_after(stall_watch, 0.9) is None
 
 
-def world_with(*forces: tuple[str, float, float], stamp_ns: int = 1) -> World:
+def world_with(*forces: tuple[str, float, float], timestamp_ns: int = 1) -> World:
     """Contacts with these forces in x and y."""
     contacts = [make_contact(name, (ahead_n, across_n, 0.0)) for name, ahead_n, across_n in forces]
-    return make_world(contacts=contacts, contacts_stamp_ns=stamp_ns)
+    return make_world(contacts=contacts, contacts_timestamp_ns=timestamp_ns)
 
 
-def along(*forces: tuple[str, float, float]) -> Carried:
+def along(*forces: tuple[str, float, float]) -> NetContactForce:
     """What contacts with these forces along and across the direction do."""
     felt = FeltContacts()
     felt.take(world_with(*forces))
@@ -62,7 +62,7 @@ def cause(**more):
         "saturated": None,
         "swung": None,
         "jam_force_n": 60.0,
-        "drag_share": 0.5,
+        "drag_ratio": 0.5,
     }
     return explain(**{**given, **more})
 
@@ -126,7 +126,7 @@ def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given,
 def test_forces_are_judged_as_means_over_50_ms():
     felt = FeltContacts()
     for turn in range(9):
-        felt.take(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), stamp_ns=turn * 10_000_000))
+        felt.take(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
     carried = known(felt.along((1.0, 0.0)))
     assert carried.strongest_n == pytest.approx(10.0) and carried.ahead_n == pytest.approx(10.0)
 
@@ -134,5 +134,5 @@ def test_forces_are_judged_as_means_over_50_ms():
 def test_estimated_contacts_are_no_measured_forces():
     felt, world = FeltContacts(), world_with(*PUSHED)
     felt.take(world)
-    felt.take(msgspec.structs.replace(world, contacts_stamp_ns=2, contacts_from="joint_torques"))
+    felt.take(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
     assert felt.along((1.0, 0.0)) is None and felt.at(["peg_1"]) == []

@@ -41,11 +41,9 @@ def test_the_head_steers_towards_the_path_and_against_its_bend_if_the_wave_goes_
 
 def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> None:
     stage = make_stage()
-    controller = ObstacleAided(
-        stage.robot, ObstacleAided.Settings(largest_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE)
-    )
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(max_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE))
     first, *_, last = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(400)]
-    pushed = np.abs(np.array(last.set_points.target) - first.set_points.target)
+    pushed = np.abs(np.array(last.setpoints.target) - first.setpoints.target)
     assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
     assert last.report.propulsion_n is not None and first.report.propulsion_n is not None
     assert last.report.propulsion_n > first.report.propulsion_n

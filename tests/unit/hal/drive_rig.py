@@ -3,7 +3,7 @@
 from typing import Any
 
 from snakesim_drivers.kit.drive_backend import DriveBackend
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
@@ -15,7 +15,7 @@ def drives_of(backend: Any, bus: int = 0) -> Any:
 
 
 class DriveRig:
-    """While armed, every joint has the same set-point; otherwise all are passive, unless they damp in a fault."""
+    """While armed, every joint has the same setpoint; otherwise all are passive, unless they damp in a fault."""
 
     def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
         self.config, self.backend = config, backend
@@ -30,9 +30,9 @@ class DriveRig:
         for _ in range(ticks):
             self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
             count = len(self.joints.angle_rad)
-            mode, target = self._set_point(lifecycle)
+            mode, target = self._setpoint(lifecycle)
             self.backend.enact(
-                SetPoints([mode] * count, [target] * count, [self.limit_nm] * count, self.isolated), lifecycle
+                Setpoints([mode] * count, [target] * count, [self.limit_nm] * count, self.isolated), lifecycle
             )
             self.backend.advance()
             found += self.backend.faults()
@@ -41,7 +41,7 @@ class DriveRig:
             self.tick += 1
         return found
 
-    def _set_point(self, lifecycle: LifecycleState) -> tuple[Mode, float]:
+    def _setpoint(self, lifecycle: LifecycleState) -> tuple[Mode, float]:
         match lifecycle:
             case "armed":
                 return self.mode, self.target

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.faults.allowed import faults_of_host
 from snakesim_hal.host.guarded_backend import GuardedBackend
@@ -69,7 +69,7 @@ def meeting(*namespaces: str | None) -> Iterator[list[Session]]:
 
 
 class LagBackend:
-    """Joints that follow their set-points with a first-order lag. Neither mass nor contacts."""
+    """Joints that follow their setpoints with a first-order lag. Neither mass nor contacts."""
 
     class Settings(msgspec.Struct):
         """None."""
@@ -79,8 +79,8 @@ class LagBackend:
         count = config.robot.chain.modules
         self._period_s = config.period_ns * 1e-9
         self.angles = [0.0] * count
-        self._points = SetPoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
-        self.enacted: list[SetPoints] = []
+        self._points = Setpoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
+        self.enacted: list[Setpoints] = []
         self.advanced = 0
         self.fails_in: str | None = None  # sample, enact, advance or faults
         self.fails_with: Exception = BackendError("diverged")
@@ -95,14 +95,14 @@ class LagBackend:
         pose_sensor = SensorDescription(key=keys.POSE, rate_hz=0.2e9 / self._config.period_ns, delay_s=0.0)
         return msgspec.structs.replace(described, sensors=[*described.sensors, pose_sensor])
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Joints every tick, the pose every fifth."""
         self._fail("sample")
         time.sleep(self.read_s)
         count = len(self.angles)
         joints = JointState(
             tick=tick,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             angle_rad=list(self.angles),
             velocity_rad_s=[0.0] * count,
             torque_nm=[0.0] * count,
@@ -111,13 +111,13 @@ class LagBackend:
         )
         if tick % 5:
             return Samples(joints)
-        return Samples(joints, {keys.POSE: pose(tick, stamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
+        return Samples(joints, {keys.POSE: pose(tick, timestamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
 
-    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
         """From now on."""
         self._fail("enact")
-        self._points = set_points
-        self.enacted.append(set_points)
+        self._points = setpoints
+        self.enacted.append(setpoints)
 
     def advance(self) -> None:
         """One period."""
@@ -177,8 +177,8 @@ class Follower:
             points = commander.stay(joints)
             if clock.lifecycle == "armed":
                 self.armed_ticks.append(clock.tick)
-                wave = self.amplitude_rad * math.sin(2 * math.pi * clock.stamp_ns * 1e-9)
-                points = SetPoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
+                wave = self.amplitude_rad * math.sin(2 * math.pi * clock.timestamp_ns * 1e-9)
+                points = Setpoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
             commander.send(clock, joints, points)
         client.done(clock.tick)
 

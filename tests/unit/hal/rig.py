@@ -47,7 +47,7 @@ RUN: dict[str, Any] = {
     "scene": SCENE,
     "backend": "lag",
     "controller": "hold",
-    "pace": "lockstep",
+    "clock_mode": "lockstep",
     "services": {"control": {}},
     "start": {"on_route": False},
 }
@@ -78,7 +78,7 @@ rate_hz = 100
 tail_s_m = 0.1
 [services.control]
 [services.guidance]
-every_ticks = 2
+decimation = 2
 [controllers.hold]
 """
 
@@ -118,7 +118,7 @@ def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any
     def column(value: Any) -> list[Any]:
         return list(value) if isinstance(value, list | tuple) else [value] * count
 
-    values: dict[str, Any] = {"tick": 0, "stamp_ns": 0, "valid": [True] * count, "age_ns": [0] * count, **other}
+    values: dict[str, Any] = {"tick": 0, "timestamp_ns": 0, "valid": [True] * count, "age_ns": [0] * count, **other}
     return JointState(angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values)
 
 
@@ -148,15 +148,15 @@ def power(
 
     values: dict[str, Any] = {"motor_c": motor_c, "voltage_v": voltage_v, "leak": leak, "valid": valid, **other}
     columns = {name: column(value) for name, value in values.items()}
-    return Power(tick=0, stamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
+    return Power(tick=0, timestamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
 
 
-def pose(tick: int = 0, stamp_ns: int = 0, **other: Any) -> Pose:
+def pose(tick: int = 0, timestamp_ns: int = 0, **other: Any) -> Pose:
     """A body at rest at the origin, unless configured otherwise."""
     still = (0.0, 0.0, 0.0)
     values = {"position_w": still, "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
     values |= {"velocity_w": still, "angular_velocity_w": still, **other}
-    return Pose(tick=tick, stamp_ns=stamp_ns, **values)
+    return Pose(tick=tick, timestamp_ns=timestamp_ns, **values)
 
 
 def contact(link: int = 0, **other: Any) -> Contact:
@@ -167,10 +167,17 @@ def contact(link: int = 0, **other: Any) -> Contact:
     return Contact(link=link, **{"obstacle": None, **values, **other})
 
 
-def clock(tick: int, *, arming: int = 0, **other: Any) -> Clock:
+def clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:
     """A clock of 100 Hz in lockstep, armed if it names an arming."""
-    values = {"pace": "lockstep", "lifecycle": "armed" if arming else "disarmed", "lease_epoch": 1, "newest": {}}
-    return Clock(tick=tick, stamp_ns=tick * PERIOD_NS, period_ns=PERIOD_NS, arming=arming, **{**values, **other})
+    values = {
+        "clock_mode": "lockstep",
+        "lifecycle": "armed" if arm_session else "disarmed",
+        "lease_epoch": 1,
+        "newest": {},
+    }
+    return Clock(
+        tick=tick, timestamp_ns=tick * PERIOD_NS, period_ns=PERIOD_NS, arm_session=arm_session, **{**values, **other}
+    )
 
 
 def write_files(
@@ -187,10 +194,10 @@ def status(**reported: Any) -> Status:
     """What a host of the worm tells, with these values."""
     values: dict[str, Any] = {
         "tick": 0,
-        "stamp_ns": 0,
+        "timestamp_ns": 0,
         "robot": "worm",
         "backend": "lag",
-        "pace": "realtime",
+        "clock_mode": "realtime",
         "rate_hz": 100.0,
         "lifecycle": "armed",
         "why": "armed",

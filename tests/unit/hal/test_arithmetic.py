@@ -24,14 +24,14 @@ def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     arithmetic.environment.cache_clear()
 
 
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that family")
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
 def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
     computer.write_text(INTEL)
     wanted = arithmetic.environment()
     assert wanted["OPENBLAS_CORETYPE"] == "Haswell" and "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
 
 
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that family")
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
 def test_what_was_set_before_has_no_effect(computer: Path) -> None:
     computer.write_text(INTEL.replace(" avx512f", ""))
     wanted = arithmetic.environment()

@@ -29,8 +29,8 @@ def exit_unless(file: str) -> str:
 
 def listening_sockets() -> list[object]:
     """Every TCP socket of this process and its children that somebody could connect to."""
-    family = [psutil.Process(), *psutil.Process().children(recursive=True)]
-    sockets = [socket for one in family for socket in one.net_connections("tcp")]
+    driver_type = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    sockets = [socket for one in driver_type for socket in one.net_connections("tcp")]
     return [socket for socket in sockets if socket.status == psutil.CONN_LISTEN]
 
 

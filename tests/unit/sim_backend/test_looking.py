@@ -11,7 +11,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Ranges
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
 from snakesim_sim_backend.flat_ground import SINK_M
 from tests.unit.sim_backend.rig import Run, make_config
 
@@ -71,7 +71,7 @@ def test_the_ground_is_as_far_as_height_and_pitch_say():
 
 
 def test_a_camera_looks_where_its_yaw_and_pitch_and_its_message_say():
-    ball = {"sphere": [{"position_m": [0.7, 1.0], "radius_m": 0.1, "centre_height_m": 0.9}]}
+    ball = {"sphere": [{"position_m": [0.7, 1.0], "radius_m": 0.1, "center_height_m": 0.9}]}
     run = looking(ball, link=6, position_m=[0.05, 0.0, 0.1], yaw_rad=1.4, pitch_rad=-0.6)
     image = seen(run)
     depth_m = metres(image)
@@ -102,7 +102,7 @@ def test_what_is_too_near_or_too_far_is_not_measured():
 
 def test_a_lidar_measures_along_each_beam_from_right_to_left():
     scene = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.4], "radius_m": 0.2, "height_m": 1.0}]}
-    scan = seen(looking(scene, kind="range", beams=181, view_rad=3.0), keys.ranges("front"))
+    scan = seen(looking(scene, kind="range", beams=181, fov_rad=3.0), keys.ranges("front"))
     assert isinstance(scan, Ranges)
     angles = scan.angle_min_rad + scan.angle_step_rad * np.arange(181)
     assert (angles[0], angles[-1]) == pytest.approx((-1.5, 1.5))
@@ -128,7 +128,7 @@ def test_noise_and_dropouts_have_the_size_of_the_robot_file():
     assert np.isnan(depth_m).mean() == pytest.approx(0.1, abs=0.01)
     assert np.nanmean(depth_m) == pytest.approx(2.0, abs=0.001)
     assert np.nanstd(depth_m) == pytest.approx(0.002 + 0.003 * 2.0**2, rel=0.03)
-    noisy = {"beams": 1001, "view_rad": 0.2, "noise_m": 0.01, "dropout": 0.2}
+    noisy = {"beams": 1001, "fov_rad": 0.2, "noise_m": 0.01, "dropout": 0.2}
     scan = seen(looking(wall, kind="range", **noisy), keys.ranges("front"))
     angles = scan.angle_min_rad + scan.angle_step_rad * np.arange(1001)
     found = np.array([np.nan if x is None else x for x in scan.range_m])
@@ -167,18 +167,18 @@ def test_rendered_depth_is_that_of_the_rays():
 
 
 def test_a_colour_image_comes_beside_the_depth_and_shows_the_same():
-    run = rendered(colour=True)
-    image = seen(run, keys.colour("head"))
-    assert isinstance(image, ColourImage)
+    run = rendered(color=True)
+    image = seen(run, keys.color("head"))
+    assert isinstance(image, ColorImage)
     rgb = np.frombuffer(image.rgb, np.uint8).reshape(image.height, image.width, 3).astype(int)
     post, ground = rgb[40, 80], rgb[110, 20]
     assert post[2] > post[0] + 20  # blue
     assert ground[0] > ground[2] + 10  # sand
-    assert [sensor.key for sensor in run.sim.describe().sensors][-2:] == [keys.depth("head"), keys.colour("head")]
+    assert [sensor.key for sensor in run.sim.describe().sensors][-2:] == [keys.depth("head"), keys.color("head")]
 
 
 def test_without_opengl_the_error_names_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     with pytest.raises(ConfigError, match=r"camera 'head'.*OpenGL.*libegl1"):
-        looking(colour=True)
+        looking(color=True)

@@ -23,7 +23,7 @@ QUIET = ("noise_m=0", "noise_m_per_m2=0", "dropout=0")
 
 def config_of(*sets: str) -> RunConfig:
     quiet = [f"robot.sensors.depth.0.{text}" for text in QUIET]
-    schedule = ["services.sensor.every_ticks=5", "services.sensor.lag_ticks=3", "duration_s=0.4"]
+    schedule = ["services.sensor.decimation=5", "services.sensor.latency_ticks=3", "duration_s=0.4"]
     return load("peg_row", [parse_set(text) for text in ("robot=planar13_camera", *quiet, *schedule, *sets)]).config
 
 
@@ -36,7 +36,7 @@ def images_of(config: RunConfig) -> list[DepthImage]:
         for _ in run.turns():
             while (clock := next(ticks)) is not None:
                 image = onlooker.read(images)
-                if image is not None and clock.arming:
+                if image is not None and clock.arm_session:
                     assert image.tick == (max(clock.tick - 3, 0)) // 5 * 5
                     found[image.tick] = image
         assert not run.failed
@@ -83,7 +83,7 @@ def test_a_recording_is_played_again_with_the_times_of_this_run(tmp_path) -> Non
     )
     wanted = [recorded[2 + i % 3].depth for i in range(len(played))]
     assert [image.depth for image in played] == wanted
-    assert [image.stamp_ns for image in played] == [image.tick * 10_000_000 for image in played]
+    assert [image.timestamp_ns for image in played] == [image.tick * 10_000_000 for image in played]
 
 
 def test_a_recording_that_is_none_is_told(tmp_path) -> None:

@@ -11,7 +11,7 @@ KINDS = {
     "tall_peg": {"cylinder": [{"position_m": [3.0, 1.0], "radius_m": 0.1, "height_m": 0.4}]},
     "short_peg": {"cylinder": [{"position_m": [3.0, 1.0], "radius_m": 0.2, "height_m": 0.1}]},
     "box": {"box": [{"position_m": [3.0, 1.0], "size_m": [0.4, 0.2, 0.3], "yaw_rad": 0.5}]},
-    "sphere": {"sphere": [{"position_m": [3.0, 1.0], "radius_m": 0.15, "centre_height_m": 0.04}]},
+    "sphere": {"sphere": [{"position_m": [3.0, 1.0], "radius_m": 0.15, "center_height_m": 0.04}]},
     "wall": {"wall": [{"from_m": [2.5, 0.8], "to_m": [3.4, 1.3], "thickness_m": 0.06}]},
 }
 
@@ -23,17 +23,17 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
     run = Run(config)
     data = run.sim.data
     (placed,) = place_all(config)
-    centre = np.array(placed.obstacle.position_w[:2])
+    center = np.array(placed.obstacle.position_w[:2])
     radius = config.robot.module.radius_m
     for angle in np.arange(0.2, 2 * np.pi, 0.7):
         outward = np.array([np.cos(angle), np.sin(angle)])
         data.qpos[3:7] = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # the snake points away from the obstacle
         data.qpos[7:] = 0.0
         reach = np.linspace(0.0, 1.0, 20001)
-        gaps = np.array([outline_distance_m(placed.obstacle, centre + r * outward) for r in reach[::20]])
+        gaps = np.array([outline_distance_m(placed.obstacle, center + r * outward) for r in reach[::20]])
         touching = float(np.interp(radius, gaps, reach[::20]))
         for offset, touched in ((2e-5, set[str]()), (-2e-5, {placed.obstacle.name})):
-            data.qpos[:3] = [*(centre + (touching + offset) * outward), radius]
+            data.qpos[:3] = [*(center + (touching + offset) * outward), radius]
             run.sim.physics.forward()
             assert {contact.obstacle for contact in run.sim.true_state().contacts} == touched
 

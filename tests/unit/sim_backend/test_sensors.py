@@ -81,14 +81,14 @@ def test_an_imu_on_a_spinning_snake_feels_the_pull_to_the_centre():
     run = Run(make_config(scene={"ground": {"friction": 0.0}}))
     spin, middle = 2.0, 13 * 0.11 / 2
     run.sim.data.qvel[5] = spin
-    run.sim.data.qvel[1] = -spin * middle  # about its centre
+    run.sim.data.qvel[1] = -spin * middle  # about its center
     run.command(Mode.POSITION)
     run.go(0.02)
     imu = run.sensed(Imu)
     lengths = np.array(run.config.robot.link_lengths_m)
-    centres = np.cumsum(lengths) - lengths / 2
+    centers = np.cumsum(lengths) - lengths / 2
     assert np.array(imu.angular_velocity_rad_s)[:, 2] == pytest.approx(spin, rel=0.01)
-    assert np.array(imu.acceleration_m_s2)[:, 0] == pytest.approx(-(spin**2) * (centres - middle), abs=0.05)
+    assert np.array(imu.acceleration_m_s2)[:, 0] == pytest.approx(-(spin**2) * (centers - middle), abs=0.05)
 
 
 def test_pose_velocities_are_the_change_of_the_pose_in_the_world():
@@ -175,7 +175,7 @@ def test_a_delayed_sensor_gives_what_was_there_before():
         history.append(now)
         taken = history[max(tick - 2, 0)]
         assert late.joints.tick == tick
-        assert late.joints.stamp_ns == tick * 10_000_000
+        assert late.joints.timestamp_ns == tick * 10_000_000
         assert late.joints.age_ns == [min(tick, 2) * 10_000_000] * 6
         assert late.joints.angle_rad == taken.joints.angle_rad
         if tick < 3:
@@ -184,7 +184,7 @@ def test_a_delayed_sensor_gives_what_was_there_before():
             pose, then = late.others[keys.POSE], history[tick - 3].others[keys.POSE]
             assert isinstance(pose, Pose)
             assert isinstance(then, Pose)
-            assert (pose.tick, pose.stamp_ns) == (tick, (tick - 3) * 10_000_000)
+            assert (pose.tick, pose.timestamp_ns) == (tick, (tick - 3) * 10_000_000)
             assert pose.position_w == then.position_w
         slow.go()
         prompt.go()

@@ -24,12 +24,12 @@ from snakesim_sim_backend.sensors.depth import RayCamera
 from snakesim_sim_backend.sensors.scope import NoSettings
 
 class Slow(RayCamera):
-    def read(self, tick, stamp_ns):
+    def read(self, tick, timestamp_ns):
         time.sleep({sleep_s})
-        return super().read(tick, stamp_ns)
+        return super().read(tick, timestamp_ns)
 
 class Broken(RayCamera):
-    def read(self, tick, stamp_ns):
+    def read(self, tick, timestamp_ns):
         raise OSError("lens cap on")
 
 class Mute:
@@ -65,7 +65,7 @@ def test_an_image_shows_what_was_there_and_arrives_after_the_delay_but_never_at_
     for tick, image in found:
         assert isinstance(image, DepthImage)
         taken = tick - ticks
-        assert (image.tick, image.stamp_ns) == (tick, taken * 10_000_000)
+        assert (image.tick, image.timestamp_ns) == (tick, taken * 10_000_000)
         middle_m = np.frombuffer(image.depth, "<u2").reshape(30, 40)[10, 20] * image.scale_m
         assert middle_m == pytest.approx(before_m - 0.01 * taken, abs=0.001)
 
@@ -113,7 +113,7 @@ def slow(tmp_path, sleep_s, name="Slow"):
 
 
 def test_in_real_time_late_images_are_dropped_which_is_told_ever_more_rarely_and_stops_nothing(tmp_path):
-    run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, pace="realtime")
+    run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, clock_mode="realtime")
     reported = []
     for _ in range(40):
         assert HEAD not in run.sample().others

@@ -11,13 +11,13 @@ from snakesim_sim_backend.flat_ground import SINK_M
 from snakesim_sim_backend.ground import hills
 from tests.unit.sim_backend.rig import Run, make_config
 
-HILLS = {"ground": {"friction": 0.6, "uneven": {"height_m": 0.06, "wavelength_m": 0.8, "area_m": 6.0}}}
+HILLS = {"ground": {"friction": 0.6, "heightfield": {"height_m": 0.06, "wavelength_m": 0.8, "area_m": 6.0}}}
 CURVE = {"route": {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}}  # cannot roll
 
 
 def uneven_of(config):
-    assert config.scene.ground.uneven is not None
-    return config.scene.ground.uneven
+    assert config.scene.ground.heightfield is not None
+    return config.scene.ground.heightfield
 
 
 def deepest_m(run):

@@ -16,8 +16,8 @@ from snakesim_can_backend.bus.adapter import (
     open_wire,
 )
 from snakesim_can_backend.bus.load import Reports, busiest_s, load
+from snakesim_can_backend.emulator.bus_time import BusTime
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id
-from snakesim_can_backend.twin.bus_time import BusTime
 from snakesim_hal.base.errors import BackendError, ConfigError, SnakesimError
 
 STATE = Frame(frame_id(Opcode.JOINT_STATE, 3), bytes(8))

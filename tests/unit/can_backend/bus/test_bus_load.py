@@ -17,7 +17,7 @@ from snakesim_can_backend.bus.load import (
     check_load,
     every,
     load,
-    most_rate_hz,
+    max_rate_hz,
     reports_of,
     shares,
     streams,
@@ -225,11 +225,11 @@ def test_everything_that_is_suggested_really_fits(
 
 def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
     config, settings = run_of(18, 200.0), CanSettings()
-    best = most_rate_hz(18, config, settings)
+    best = max_rate_hz(18, config, settings)
     assert best is not None
     for rate in range(best + 1, 201):
         assert refusal(run_of(18, float(rate)), settings) is not None
-    assert most_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (None, 20)
+    assert max_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (None, 20)
 
 
 def test_a_bus_that_nothing_helps() -> None:

@@ -24,7 +24,7 @@ class OnFile(VirtualWire):
 def test_what_is_taken_and_what_comes_is_logged_in_order_and_everything_else_is_the_wires_own(tmp_path: Path) -> None:
     path, other = tmp_path / "bus.log", VirtualWire("can3")
     with open_log(path) as log:
-        wire, neighbour = (LoggedWire(OnFile(channel), log) for channel in ("can3", "can4"))
+        wire, neighbor = (LoggedWire(OnFile(channel), log) for channel in ("can3", "can4"))
         assert (wire.channel, wire.fileno(), wire.idle()) == ("can3", 42, math.inf)
         assert wire.send(Frame(0x105, bytes.fromhex("00112233")))
         wire.inject("full", begins=True)
@@ -34,8 +34,8 @@ def test_what_is_taken_and_what_comes_is_logged_in_order_and_everything_else_is_
         for frame in (Frame(0x7, b""), Frame(0x7FF, bytes(8))):
             other.send(frame)
         assert wire.receive() == [Frame(0x7, b""), Frame(0x7FF, bytes(8))] and wire.receive() == []
-        assert neighbour.send(Frame(0, b"\x02"))
-        for one in (other, wire, neighbour):
+        assert neighbor.send(Frame(0, b"\x02"))
+        for one in (other, wire, neighbor):
             one.close()
         with pytest.raises(BackendError, match="can3: cannot send"):
             wire.send(Frame(0, b""))

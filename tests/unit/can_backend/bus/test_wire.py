@@ -70,7 +70,7 @@ def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
 
 
 class CanLike(socket.socket):
-    """A socket of another family that keeps what only CAN sockets take, and whose errors a test may choose."""
+    """A socket of another driver type that keeps what only CAN sockets take, and whose errors a test may choose."""
 
     filters = b""
     fails: OSError | None = None

@@ -37,9 +37,9 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
+from tests.unit.can_backend.emulator.rig import chain
 from tests.unit.can_backend.frames import heartbeat, read
 from tests.unit.can_backend.loop import config
-from tests.unit.can_backend.twin.rig import chain
 
 NAMES = [f"joint_{i}" for i in range(1, 5)]
 Spoil = Callable[[Frame], list[Frame]]
@@ -50,7 +50,7 @@ def as_it_is(frame: Frame) -> list[Frame]:
 
 
 class Modules:
-    """Four stepped twins at the other end of a bus. to_modules, to_host: what becomes of each frame."""
+    """Four stepped emulators at the other end of a bus. to_modules, to_host: what becomes of each frame."""
 
     def __init__(self) -> None:
         self.chain = chain()
@@ -194,7 +194,10 @@ def wrong_with(found: list[Identity], *, lockstep: bool = False) -> list[str]:
             [replace(GOOD[0], protocol=2), *GOOD[1:]],
             "joint_1 (node 1 on can_a) has protocol version 2, this driver 1",
         ),
-        ([replace(GOOD[0], stepped=True), *GOOD[1:]], "joint_1 (node 1 on can_a) is a twin whose time stands still"),
+        (
+            [replace(GOOD[0], stepped=True), *GOOD[1:]],
+            "joint_1 (node 1 on can_a) is an emulator whose time stands still",
+        ),
     ],
 )
 def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[Identity], words: str) -> None:
@@ -204,7 +207,7 @@ def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[Identity], wo
 
 def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
     reported = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
-    assert reported == ["joint_1 (node 1 on can_a) does not support lockstep: use --pace realtime"]
+    assert reported == ["joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"]
 
 
 def test_everything_is_told_at_once() -> None:

@@ -1,4 +1,4 @@
-"""One winding temperature, one torque limit: in the simulator, in module twins on CAN, and in the status.
+"""One winding temperature, one torque limit: in the simulator, in emulated joint modules on CAN, and in the status.
 
 Each robot is pushed against a joint's stop, and the torque that the joint gives there is measured.
 """
@@ -83,7 +83,7 @@ def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
         until_told(rig, celsius)
         rig.arm()
         assert rig.authority.derated.get("joint_1", 1.0) == pytest.approx(share, abs=1e-4), "in the status"
-        from_gate_nm = rig.authority.decide().set_points.torque_limit_nm[0]
+        from_gate_nm = rig.authority.decide().setpoints.torque_limit_nm[0]
         assert from_gate_nm == pytest.approx(share * RATED_NM, abs=1e-3)
         assert pushes_nm(rig, from_gate_nm) == pytest.approx(share * RATED_NM, abs=STEP_NM), "at the joint"
         assert pushes_nm(rig, RATED_NM) == pytest.approx(share * RATED_NM, abs=STEP_NM), "by the motor's own protection"

@@ -1,4 +1,4 @@
-"""Faults on request through the driver: its own twins get theirs, and a virtual bus fails as a kernel interface does.
+"""Faults on request through the driver: its emulators get theirs, and a virtual bus fails as a kernel's does.
 
 What real interfaces do stands in tests/vcan/test_bus_faults.py; the rows here are the same.
 """
@@ -11,9 +11,9 @@ from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.bus_faults import inject_into_interface
 from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.emulator.faults import ABOUT
 from snakesim_can_backend.protocol.definitions import Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.faults import ABOUT
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import parse
@@ -46,7 +46,7 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
         (CanSettings(), "diverge:simulator@1", "its modules support mute, freeze"),
         (CanSettings(), "cut:bus_2@1", "this run has bus_1 to bus_1"),
         (CanSettings(channels=["vcan0"]), "leak:joint_1@1", "its modules are not the driver's own"),
-        (CanSettings(channels=["vcan0"], twins="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
+        (CanSettings(channels=["vcan0"], emulators="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
     ],
 )
 def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSettings, text: str, words: str) -> None:

@@ -1,6 +1,6 @@
 """A robot that may lose a joint, through the driver: the module that fails is switched off, and the others go on.
 
-Driver, twins and the HAL's authority are the real ones, stepped.
+Driver, emulators and the HAL's authority are the real ones, stepped.
 """
 
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.module_monitor import CONCERNS_ALL
+from snakesim_can_backend.emulator.firmware import PASSIVE
 from snakesim_can_backend.protocol.commands import command, emergency
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.firmware import PASSIVE
 from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from snakesim_testing.contract.rig import Rig
@@ -56,10 +56,10 @@ class Lame(Rig):
 
 
 @contextmanager
-def lame_robot(may_lose: int = 1) -> Iterator[Lame]:
+def lame_robot(max_isolated: int = 1) -> Iterator[Lame]:
     """Armed, and its other joints swing."""
-    run = config(robot__safety__may_lose_joints=may_lose)
-    backend = CanBackend(run, CanSettings(plant="inertia"))
+    run = config(robot__safety__max_isolated_joints=max_isolated)
+    backend = CanBackend(run, CanSettings(physics_model="inertia"))
     try:
         robot = Lame(backend, "lockstep", run.period_ns)
         robot.arm()
@@ -148,13 +148,13 @@ def swallowed(robot: Lame, *joints: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("driven", "joints", "may_lose"),
+    ("driven", "joints", "max_isolated"),
     [(True, [2], 0), (True, [2], 1), (True, [2, 3], 1), (True, [2, 3], 2), (False, [2], 1)],
 )
 def test_who_clears_before_a_period_has_passed_clears_all_the_same(
-    driven: bool, joints: list[int], may_lose: int
+    driven: bool, joints: list[int], max_isolated: int
 ) -> None:
-    with lame_robot(may_lose) as robot:
+    with lame_robot(max_isolated) as robot:
         if not driven:
             robot.ask("disarm")
             robot.idle(20)

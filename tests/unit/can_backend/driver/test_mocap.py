@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import Pose
 
 MS = 1_000_000
 TOLD: dict[str, Any] = {"velocity_w": [0.0, 0.0, 0.0], "angular_velocity_w": [0.1, 0.2, 0.3]}
-BARE: dict[str, Any] = {"stamp_ns": 0, "position_w": [1.0, 2.0, 0.5], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
+BARE: dict[str, Any] = {"timestamp_ns": 0, "position_w": [1.0, 2.0, 0.5], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
 GOOD = {**BARE, **TOLD}
 
 
@@ -23,7 +23,7 @@ class Mocap(MocapReceiver):
 
     def __init__(self, delay_s: float = 0.0) -> None:
         self.now_ns = 10**9
-        super().__init__("127.0.0.1:0", delay_s, lambda _stamp_ns: self.now_ns)
+        super().__init__("127.0.0.1:0", delay_s, lambda _timestamp_ns: self.now_ns)
 
     def read(self) -> Pose | None:
         """A tick later."""
@@ -32,7 +32,7 @@ class Mocap(MocapReceiver):
 
     def at(self, late_ms: float = 0.0, **more: Any) -> dict[str, Any]:
         """A datagram that was captured at the next tick, by a clock that is 5 s ahead."""
-        return {**GOOD, "stamp_ns": self.now_ns + 10 * MS + 5000 * MS - round(late_ms * MS), **more}
+        return {**GOOD, "timestamp_ns": self.now_ns + 10 * MS + 5000 * MS - round(late_ms * MS), **more}
 
 
 @contextmanager
@@ -62,7 +62,7 @@ def read(mocap: Mocap, *datagrams: object) -> Pose | None:
 def test_a_pose_is_taken_once() -> None:
     with receiver() as mocap:
         pose = read(mocap, mocap.at())
-        assert pose is not None and (pose.tick, pose.stamp_ns) == (7, mocap.now_ns)
+        assert pose is not None and (pose.tick, pose.timestamp_ns) == (7, mocap.now_ns)
         assert pose.position_w == (1.0, 2.0, 0.5) and pose.orientation_wxyz == (1.0, 0.0, 0.0, 0.0)
         assert pose.velocity_w == (0.0, 0.0, 0.0) and pose.angular_velocity_w == (0.1, 0.2, 0.3)
         assert mocap.read() is None
@@ -74,18 +74,18 @@ def test_stamps_go_on_although_a_tick_is_late() -> None:
         send(mocap, mocap.at())
         mocap.now_ns += 25 * MS  # what came 15 ms ago is read now, in the tick that was due then
         second = mocap.newest(8, mocap.now_ns - 15 * MS)
-        assert first is not None and second is not None and second.stamp_ns == first.stamp_ns + 1
+        assert first is not None and second is not None and second.timestamp_ns == first.timestamp_ns + 1
         third = read(mocap, mocap.at())
-        assert third is not None and third.stamp_ns == mocap.now_ns
+        assert third is not None and third.timestamp_ns == mocap.now_ns
 
 
 def test_what_was_captured_before_the_robots_time_began_is_no_pose() -> None:
     with receiver(delay_s=0.02) as mocap:
-        for stamp_ns, known in ((0, False), (10 * MS, False), (20 * MS, True)):
+        for timestamp_ns, known in ((0, False), (10 * MS, False), (20 * MS, True)):
             send(mocap, mocap.at())
             mocap.now_ns += 10 * MS
-            pose = mocap.newest(0, stamp_ns)
-            assert (pose is not None) is known and (pose is None or pose.stamp_ns == 0)
+            pose = mocap.newest(0, timestamp_ns)
+            assert (pose is not None) is known and (pose is None or pose.timestamp_ns == 0)
 
 
 def bare(mocap: Mocap, x: float, late_ms: float = 0.0) -> dict[str, Any]:
@@ -118,11 +118,13 @@ def test_after_a_gap_or_a_jump_of_its_clock_a_velocity_is_known_again_with_the_s
         assert read(mocap, bare(mocap, 0.1)) is None
         assert read(mocap, bare(mocap, 0.1)) is not None
         for _ in range(5):
-            jumped = {**bare(mocap, 0.1), "stamp_ns": mocap.now_ns + 10 * MS + 6000 * MS}
+            jumped = {**bare(mocap, 0.1), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS}
             assert read(mocap, jumped) is None
         assert mocap.refused == {"future": 4}
-        pose = read(mocap, {**bare(mocap, 0.105), "stamp_ns": mocap.now_ns + 10 * MS + 6000 * MS})
-        assert pose is not None and pose.velocity_w == pytest.approx((0.5, 0.0, 0.0)) and pose.stamp_ns == mocap.now_ns
+        pose = read(mocap, {**bare(mocap, 0.105), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS})
+        assert (
+            pose is not None and pose.velocity_w == pytest.approx((0.5, 0.0, 0.0)) and pose.timestamp_ns == mocap.now_ns
+        )
 
 
 def test_a_leap_that_no_body_makes_is_no_velocity() -> None:
@@ -145,16 +147,16 @@ def test_a_leap_that_no_body_makes_is_no_velocity() -> None:
         b'{"a":' * 400,
         b'{"position_w":[' + b"9" * 2000,
         {"position_w": [0.0, 0.0, 0.0]},
-        {name: value for name, value in GOOD.items() if name != "stamp_ns"},
-        {**GOOD, "stamp_ns": -1},
-        {**GOOD, "stamp_ns": 2**63},
-        {**GOOD, "stamp_ns": 1.5},
+        {name: value for name, value in GOOD.items() if name != "timestamp_ns"},
+        {**GOOD, "timestamp_ns": -1},
+        {**GOOD, "timestamp_ns": 2**63},
+        {**GOOD, "timestamp_ns": 1.5},
         {**GOOD, "position_w": [0.0, 0.0]},
         {**GOOD, "position_w": ["a", 0.0, 0.0]},
         {**GOOD, "position_w": [1e300, 0.0, 0.0]},
         {**GOOD, "orientation_wxyz": [0.5, 0.0, 0.0, 0.0]},
-        b'{"stamp_ns": 1, "position_w": [NaN, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
-        b'{"stamp_ns": 1, "position_w": [1e999, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
+        b'{"timestamp_ns": 1, "position_w": [NaN, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
+        b'{"timestamp_ns": 1, "position_w": [1e999, 0, 0], "orientation_wxyz": [1, 0, 0, 0]}',
         {**GOOD, "name": "x" * 3000},
     ],
 )
@@ -192,10 +194,10 @@ def test_a_socket_that_breaks_is_an_error_of_the_backend() -> None:
 @pytest.mark.parametrize("address", ["127.0.0.1:70000", "127.0.0.1:port", f"{'x' * 70}:1"])
 def test_an_address_that_is_none_is_told(address: str) -> None:
     with pytest.raises(ConfigError, match=r"`pose_listen`.*choose another"):
-        MocapReceiver(address, 0.0, lambda stamp_ns: stamp_ns)
+        MocapReceiver(address, 0.0, lambda timestamp_ns: timestamp_ns)
 
 
 def test_without_a_host_it_listens_on_loopback() -> None:
-    mocap = MocapReceiver(":0", 0.0, lambda stamp_ns: stamp_ns)
+    mocap = MocapReceiver(":0", 0.0, lambda timestamp_ns: timestamp_ns)
     assert mocap.address.startswith("127.0.0.1:")
     mocap.close()

@@ -26,8 +26,8 @@ class Camera:
         self.now_ns += 10 * MS
         return list(self.times.judge([self.stamp(ms) for ms in late_ms], self.now_ns))
 
-    def late_ms(self, stamp_ns: int) -> float:
-        return self.times.late_ns(stamp_ns, self.now_ns) / MS
+    def late_ms(self, timestamp_ns: int) -> float:
+        return self.times.late_ns(timestamp_ns, self.now_ns) / MS
 
 
 def running(readings: int = 20) -> Camera:
@@ -85,10 +85,10 @@ def test_strange_stamps_that_do_not_agree_are_never_believed() -> None:
 
 def test_one_stamp_for_ever_is_a_duplicate_and_no_jump() -> None:
     camera = running()
-    stamp_ns = camera.stamp(0.0)
+    timestamp_ns = camera.stamp(0.0)
     for _ in range(100):
         camera.now_ns += 10 * MS
-        assert camera.times.judge([stamp_ns], camera.now_ns) == ["duplicate"]
+        assert camera.times.judge([timestamp_ns], camera.now_ns) == ["duplicate"]
     assert camera.times.jumps == 0
 
 
@@ -98,7 +98,7 @@ def test_a_clock_that_drifts_stays_known(share: float) -> None:
     times = CaptureTimes()
     for tick in range(60_000):
         now_ns = tick * 10 * MS
-        stamp_ns = round(now_ns * share) + AHEAD_NS
-        assert times.judge([stamp_ns], now_ns) == [None]
-        assert times.late_ns(stamp_ns, now_ns) < 5 * MS
+        timestamp_ns = round(now_ns * share) + AHEAD_NS
+        assert times.judge([timestamp_ns], now_ns) == [None]
+        assert times.late_ns(timestamp_ns, now_ns) < 5 * MS
     assert times.jumps == 0

@@ -58,10 +58,10 @@ MISPLACED = {
     "a port": (JointExceptions(port="can3"), {}, ["joint_2: `port` = 'can3'", "`backends.can.channels`"]),
     "a zero": (JointExceptions(zero_rad=2.5), {}, ["joint_2: `limits.angle_rad` = 4.07", "at the module's shaft"]),
     "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}, ["mounted.joint_99", "to joint_13"]),
-    "no twins": (
+    "no emulators": (
         JointExceptions(),
-        {"mounted": {"joint_2": Mounted(sign=-1)}, "twins": "none", "channels": ["can0"]},
-        ["is for twins"],
+        {"mounted": {"joint_2": Mounted(sign=-1)}, "emulators": "none", "channels": ["can0"]},
+        ["is for emulators"],
     ),
 }
 
@@ -73,7 +73,7 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
     with pytest.raises(ConfigError) as caught:
         check_drives(robot, settings)
-        check_mounted(robot, "backends.can", settings.mounted, twins=settings.twins_run != "none")
+        check_mounted(robot, "backends.can", settings.mounted, emulators=settings.emulators_run != "none")
         check_ratings(robot)
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
@@ -90,7 +90,7 @@ def test_the_safe_action_is_the_robots_the_watchdog_that_of_the_settings_and_rep
 ) -> None:
     robot = changed("safety", action=action)
     told = parameters_of(robot, CanSettings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
-    names = (Parameter.SAFE_ACTION, Parameter.WATCHDOG, Parameter.CONTACT_EVERY, Parameter.IMU_EVERY)
+    names = (Parameter.STOP_MODE, Parameter.WATCHDOG, Parameter.CONTACT_EVERY, Parameter.IMU_EVERY)
     assert [told[name] for name in names] == [motion, 0.05, 3.0, 17.0]
     check_ratings(robot)
 

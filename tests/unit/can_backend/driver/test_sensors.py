@@ -1,4 +1,4 @@
-"""What the HAL publishes of the modules' frames, and what the twins make of a touch, there and back."""
+"""What the HAL publishes of the modules' frames, and what the emulators make of a touch, there and back."""
 
 import math
 from typing import Any
@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from snakesim_can_backend.bus.load import Reports, reports_of
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
+from snakesim_can_backend.emulator.frames import write_contact, write_tail_contact
+from snakesim_can_backend.emulator.reports import touch
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
-from snakesim_can_backend.twin.reports import touch
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.plant import LinkLoad
+from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Power
 from snakesim_hal.wire.quantities import Vector
@@ -52,7 +52,7 @@ def test_every_state_has_its_age_and_is_valid_for_the_lease() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
     fresh = sensors.sample(7, 70 * 10**6).joints
-    assert (fresh.tick, fresh.stamp_ns) == (7, 70 * 10**6)
+    assert (fresh.tick, fresh.timestamp_ns) == (7, 70 * 10**6)
     assert fresh.angle_rad == pytest.approx([0.5] * JOINTS)
     assert fresh.velocity_rad_s == pytest.approx([-1.0] * JOINTS)
     assert fresh.torque_nm == pytest.approx([2.0] * JOINTS)
@@ -92,7 +92,7 @@ def test_nothing_touched_is_an_empty_list() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     begin(reading, contacts=True)
     reading.take(contact(2, reading.sync, touched=False, force_x=9.0))
-    assert contacts_of(sensors.sample(3, 30)) == Contacts(tick=3, stamp_ns=30, contacts=[], felt_n=0.0)
+    assert contacts_of(sensors.sample(3, 30)) == Contacts(tick=3, timestamp_ns=30, contacts=[], measured_force_n=0.0)
 
 
 def test_a_touch_is_told_in_the_frame_of_its_link() -> None:
@@ -118,7 +118,7 @@ def test_what_is_weaker_than_the_robots_threshold_is_left_out() -> None:
     assert [found.link for found in contacts_of(sensors.sample(0, 0)).contacts] == [2, 3]
 
 
-# The place of a touch, from the plant through twin and bus to the HAL.
+# The place of a touch, from the physics model through emulator and bus to the HAL.
 
 
 def capsule_point(along_m: float, polar: float, bearing: float, length_m: float, radius_m: float) -> Vector:
@@ -180,7 +180,7 @@ def test_an_imu_message_holds_only_what_is_new() -> None:
     reading.take(accelerometer(3, 0, 9.81))
     reading.take(gyro(1, 0, 0.5))
     found = sensors.sample(1, 10).others[keys.IMU]
-    assert isinstance(found, Imu) and (found.tick, found.stamp_ns, found.link) == (1, 10, [3])
+    assert isinstance(found, Imu) and (found.tick, found.timestamp_ns, found.link) == (1, 10, [3])
     assert found.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
     assert found.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
     assert keys.IMU not in sensors.sample(2, 0).others
@@ -194,7 +194,7 @@ def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
     due = [tick for tick in range(101) if keys.POWER in sensors.sample(tick, 0).others]
     assert due == [0, 50, 100]
     found = sensors.sample(50, 7).others[keys.POWER]
-    assert isinstance(found, Power) and (found.tick, found.stamp_ns) == (50, 7)
+    assert isinstance(found, Power) and (found.tick, found.timestamp_ns) == (50, 7)
     assert found.valid == [False, True, False, True] and found.leak == [False, True, False, False]
     assert found.voltage_v[1] == pytest.approx(23.5) and found.current_a[1] == pytest.approx(-1.5)
     assert (found.motor_c[1], found.board_c[1]) == (-10.0, 40.0)

@@ -1,4 +1,4 @@
-"""Our frames against mjbots' own library: what one encodes the other reads, in both directions, and so do the twins."""
+"""Our frames against mjbots' own library: what one encodes the other reads, both ways, and so do the emulators."""
 
 import math
 from typing import Any
@@ -14,7 +14,7 @@ from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
 from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.loop import config
@@ -97,19 +97,19 @@ def test_a_stop_of_ours_is_theirs_and_ids_are_extended_where_theirs_are() -> Non
 def bus() -> Any:
     """Emulated controllers of a robot, and their bus."""
     wire, clock = VirtualWire("moteus-theirs", fd=True), Clock(CONFIG)
-    twin = MoteusBackend.twin_on(CONFIG, MoteusSettings(plant="inertia"), [wire], clock, None)
+    emulator = MoteusBackend.emulator_on(CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None)
     with can.Bus(interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD) as ours:
-        yield ours, twin, clock
-    twin.close()
+        yield ours, emulator, clock
+    emulator.close()
 
 
 def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: Any) -> None:
-    ours, twin, clock = bus
+    ours, emulator, clock = bus
     client, number = theirs(3), 3
 
     def ask(command: Any) -> dict[int, Any]:
         ours.send(message_of(as_frame(command, number), fd=True))
-        twin()
+        emulator()
         if (message := ours.recv(0)) is None:
             return {}
         result = parse_message(message)
@@ -120,15 +120,15 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
     for _ in range(100):
         ask(client.make_position(position=0.05, velocity=0.0, watchdog_timeout=0.1))
         clock.robot_ns += 10_000_000
-        twin()
+        emulator()
     for kind, close in zip(TYPES, (0.01, 0.0002, 0.0002, 0.0002), strict=True):
         fields = dict.fromkeys((0, 1, 2, 3, 13, 14, 15), kind)
         said = ask(client.make_custom_query(fields))
         assert said[moteus.Register.MODE] == moteus.Mode.POSITION and said[moteus.Register.FAULT] == 0
         assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
-        assert said[moteus.Register.VOLTAGE] == pytest.approx(twin.body.supply(2)[0], abs=0.3)
+        assert said[moteus.Register.VOLTAGE] == pytest.approx(emulator.body.supply(2)[0], abs=0.3)
     clock.robot_ns += 150_000_000
-    twin()
+    emulator()
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
     ask(client.make_position(position=0.1, velocity=0.0))
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, "only a stop ends it"
@@ -137,12 +137,12 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
     ask(client.make_position(position=0.1, velocity=0.0))
     everybody = theirs(127)
     ours.send(message_of(as_frame(everybody.make_stop(), 127), fd=True))
-    twin()
+    emulator()
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, "127 is the broadcast address"
 
 
 def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_file_says() -> None:
-    backend = MoteusBackend(CONFIG, MoteusSettings(plant="inertia"))
+    backend = MoteusBackend(CONFIG, MoteusSettings(physics_model="inertia"))
     drives = drives_of(backend)
     sent: list[Frame] = []
     send = drives.wire.send
@@ -150,7 +150,7 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
     joints = backend.sample(0, 0).joints
     for tick in range(1, 20):
         joints = backend.sample(tick, tick * CONFIG.period_ns).joints
-        backend.enact(SetPoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
+        backend.enact(Setpoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
         backend.advance()
     backend.close()
     read = [parse_registers(frame.data) for frame in sent]

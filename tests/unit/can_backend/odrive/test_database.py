@@ -1,7 +1,7 @@
 """Our messages against ODrive's own database, read by cantools: the same ids, places, types and states.
 
 `odrive-cansimple.dbc` holds the messages of one axis from ODrive Robotics' file of that name (repository
-odriverobotics/ODrive, MIT licence), which is of firmware 0.5.6. It lacks what 0.6 added or changed (version, errors,
+odriverobotics/ODrive, MIT license), which is of firmware 0.5.6. It lacks what 0.6 added or changed (version, errors,
 temperature); of those the error bits were compared with the enumeration of PyPI's `odrive` 0.6.11.
 """
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.family.drives import CanDrives
+from snakesim_can_backend.can_drives.drives import CanDrives
 from snakesim_can_backend.odrive.backend import MountedAxis, OdriveBackend, OdriveSettings
 from snakesim_can_backend.odrive.endpoints import EMULATED, Setting, read_endpoints
 from snakesim_can_backend.odrive.protocol import Message, parted, read_setting, setting_of
@@ -29,7 +29,7 @@ class Robot(DriveRig):
 
     def __init__(self, **settings: Any) -> None:
         config = self.configuration()
-        fixed: dict[str, Any] = {"plant": "inertia", "bring_up_limit_s": 0.3}
+        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 0.3}
         super().__init__(config, OdriveBackend(config, OdriveSettings(**fixed | settings)))
         self.sent: list[Frame] = []
         send = self.drives.wire.send
@@ -81,11 +81,11 @@ def endpoints_file(path: Path, **changed: Any) -> str:
 
 
 def test_arming_never_raises_the_current_limit_that_an_axis_is_configured_for(robot: Robot) -> None:
-    axis = robot.drives._twin.axes[1]
+    axis = robot.drives._emulator.axes[1]
     assert axis.current_soft_max_a == pytest.approx(NEEDED_A)
     robot.run(5, "disarmed")
     robot.run(30, "armed")
-    assert robot.currents_a(1) and max(robot.currents_a(1)) == pytest.approx(1.0 / CONSTANT), "the set-point's 1 N·m"
+    assert robot.currents_a(1) and max(robot.currents_a(1)) == pytest.approx(1.0 / CONSTANT), "the setpoint's 1 N·m"
     axis.current_soft_max_a = 10.0  # configured anew, behind the driver's back: the next start reads it
     with pytest.raises(BackendError, match="joint_2"):
         robot.backend._drives.bring_up()
@@ -107,7 +107,7 @@ def test_a_lower_limit_is_given_back_when_the_axis_is_idle_and_named_where_a_kil
     """The next start reads it, and cannot know who has set it."""
     robot.run(5, "disarmed")
     robot.run(30, "armed")
-    axes = robot.drives._twin.axes
+    axes = robot.drives._emulator.axes
     assert axes[0].current_soft_max_a == pytest.approx(1.0 / CONSTANT)
     robot.run(30, "disarmed")
     assert axes[0].current_soft_max_a == pytest.approx(NEEDED_A)
@@ -116,7 +116,7 @@ def test_a_lower_limit_is_given_back_when_the_axis_is_idle_and_named_where_a_kil
     with pytest.raises(BackendError, match=r"joint_1 .* If a driver was killed, .* lower limit: restart the axis"):
         robot.backend._drives.bring_up()
     for i in range(JOINTS):
-        robot.drives._twin.restart(i)
+        robot.drives._emulator.restart(i)
     robot.backend._drives.bring_up()
 
 
@@ -131,9 +131,9 @@ def test_a_joint_that_needs_more_than_the_driver_may_set_is_refused_before_the_s
     OdriveBackend.check(config, OdriveSettings(channels=REAL, max_current_a=240.0))
 
 
-@pytest.mark.parametrize(("max_current_a", "most_a"), [(None, 1.0), (200.0, 200.0)])
+@pytest.mark.parametrize(("max_current_a", "max_a"), [(None, 1.0), (200.0, 200.0)])
 def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are_unknown(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, max_current_a: float | None, most_a: float
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, max_current_a: float | None, max_a: float
 ) -> None:
     made = CanDrives.__init__
 
@@ -146,8 +146,8 @@ def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are
     robot.limit_nm = TORQUE_NM
     robot.run(20, "armed")
     robot.backend.close()
-    assert max(robot.currents_a(0)) == pytest.approx(most_a)
-    assert f"limits of these axes are unknown: the driver sets no more than {most_a:g} A" in caplog.text
+    assert max(robot.currents_a(0)) == pytest.approx(max_a)
+    assert f"limits of these axes are unknown: the driver sets no more than {max_a:g} A" in caplog.text
 
 
 # --- watchdog and speed --------------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ def test_a_file_that_is_none_of_odrives_is_refused_before_the_start(
 
 
 def test_an_axis_that_does_not_say_what_it_is_configured_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("snakesim_can_backend.odrive.twin.OdriveTwin._answer_setting", lambda *_: None)
+    monkeypatch.setattr("snakesim_can_backend.odrive.emulator.EmulatedOdrive._answer_setting", lambda *_: None)
     with pytest.raises(BackendError, match=r"joint_1 .* does not say `axis0.config.enable_watchdog`"):
         Robot()
 

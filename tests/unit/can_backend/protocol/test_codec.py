@@ -49,7 +49,7 @@ def raw_numbers(signal: Signal) -> st.SearchStrategy[int]:
 
 @st.composite
 def contents(draw: st.DrawFn, layout: Layout) -> dict[str, int]:
-    """Raw numbers of the signals that a frame really carries: of the targets of a set-point one at most."""
+    """Raw numbers of the signals that a frame really carries: of the targets of a setpoint one at most."""
     names = [name for name in layout.signals if name != "checksum"]
     numbers = {name: draw(raw_numbers(layout.signals[name])) for name in names}
     if layout.opcode == Opcode.SET_POINT:

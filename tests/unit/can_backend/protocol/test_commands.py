@@ -1,4 +1,4 @@
-"""What goes out: set-points in raw numbers, and what modules are told when the robot's lifecycle changes."""
+"""What goes out: setpoints in raw numbers, and what modules are told when the robot's lifecycle changes."""
 
 import math
 from typing import get_args
@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
 )
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.wire.messages import LifecycleState, Mode
 from tests.unit.can_backend.frames import read
 
@@ -24,11 +24,11 @@ TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "to
 
 
 def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
-    (frame,) = commands.SetPointWriter(1).frames(SetPoints([mode], [target], [limit_nm]))
+    (frame,) = commands.SetpointWriter(1).frames(Setpoints([mode], [target], [limit_nm]))
     return frame
 
 
-# --- set-points --------------------------------------------------------------------------------------------
+# --- setpoints --------------------------------------------------------------------------------------------
 
 
 @given(st.sampled_from(list(TARGET)), st.floats(-3.2767, 3.2767), st.floats(0, 65.535))
@@ -56,7 +56,7 @@ def test_a_passive_joint_gets_no_target(target: float) -> None:
 
 def test_joints_and_set_points_must_be_as_many() -> None:
     with pytest.raises(ValueError):
-        commands.SetPointWriter(3).frames(SetPoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
+        commands.SetpointWriter(3).frames(Setpoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
 
 
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`docs/can-protocol.md` says what the DBC file, the parameters and the twins' firmware say."""
+"""`docs/can-protocol.md` says what the DBC file, the parameters and the emulators' firmware say."""
 
 import re
 from collections.abc import Callable
@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_can_backend.bus.load import load, reports_at, worst_bits
+from snakesim_can_backend.emulator.firmware import BOOT_US, Module
+from snakesim_can_backend.emulator.parameters import Parameters, from_factory
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.codec import codec, load_database
 from snakesim_can_backend.protocol.definitions import (
@@ -22,8 +24,6 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.firmware import BOOT_US, Module
-from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.physics.thermal import HeatLimits
 
@@ -122,8 +122,8 @@ def test_the_worked_example_of_the_checksum() -> None:
             crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
         assert f"`{crc:04X}`" in text
     assert crc & 0xFF == frame.data[-1]
-    set_point = codec()[Opcode.SET_POINT].frame(NODE, mode=1, count=3, position=-0.5, torque_limit=7.0)
-    assert f"`{set_point.data.hex(' ').upper()}`" in section("SetPoint")
+    setpoint = codec()[Opcode.SET_POINT].frame(NODE, mode=1, count=3, position=-0.5, torque_limit=7.0)
+    assert f"`{setpoint.data.hex(' ').upper()}`" in section("SetPoint")
 
 
 def test_the_bits_of_a_frame() -> None:
@@ -197,7 +197,7 @@ def rest(module: Module) -> None:
 def wrong_counts(module: Module) -> None:
     layout = codec()[Opcode.SET_POINT]
     for _ in range(WRONG_COUNTS + 1):
-        module.receive_set_point(layout.frame(NODE, mode=0, count=9), now_of(module))
+        module.receive_setpoint(layout.frame(NODE, mode=0, count=9), now_of(module))
 
 
 def leak(module: Module) -> None:
@@ -212,7 +212,7 @@ EVENTS: dict[str, Callable[[Module], None]] = {
     "Command clear": command(Action.CLEAR),
     "Command reboot": command(Action.REBOOT),
     "Emergency": emergency,
-    "watchdog's time without a set-point": time_passes,
+    "watchdog's time without a setpoint": time_passes,
     "five wrong counters in a row": wrong_counts,
     "heat, leak, voltage, sensor": leak,
     "at rest": rest,
@@ -231,12 +231,12 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
     if said.startswith("after boot"):
         module.poll(2e5)
     expected = next((s for s in ModuleState if s.name in said), None)
-    if state == ModuleState.BOOT and event == "watchdog's time without a set-point":
+    if state == ModuleState.BOOT and event == "watchdog's time without a setpoint":
         expected = ModuleState.DISARMED  # boot is over meanwhile
     assert module.state == (state if expected is None else expected)
 
 
-# --- pictures and neighbours -------------------------------------------------------------------------------
+# --- pictures and neighbors -------------------------------------------------------------------------------
 
 
 def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:

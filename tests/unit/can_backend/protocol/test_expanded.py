@@ -76,7 +76,7 @@ def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
 def sent() -> list[tuple[Frame, str]]:
     """Frames of every kind, and what stock cantools is to say of them."""
     layouts = codec()
-    set_point = layouts[Opcode.SET_POINT].frame(5, mode=Mode.POSITION, count=3, position=-0.5, torque_limit=7.0)
+    setpoint = layouts[Opcode.SET_POINT].frame(5, mode=Mode.POSITION, count=3, position=-0.5, torque_limit=7.0)
     state = layouts[Opcode.JOINT_STATE].frame(
         62, angle=1.0, velocity=-2.0, torque=0.5, count=3, state=ModuleState.ARMED, derated=1
     )
@@ -85,7 +85,7 @@ def sent() -> list[tuple[Frame, str]]:
         (commands.command(Action.ARM), "Command(action: arm, key: 23214, checksum: 50)"),
         (commands.command(Action.STOP, 7), "Command_07(action: stop"),
         (commands.sync(200, 12345678), "Sync(count: 200, time: 12345678 us)"),
-        (set_point, "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m"),
+        (setpoint, "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m"),
         (state, "JointState_62(angle: 1.0 rad, velocity: -2.0 rad/s, torque: 0.5 N.m, count: 3, state: armed"),
     ]
 

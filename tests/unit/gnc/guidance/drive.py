@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from snakesim_gnc.guidance.body_history import Base
-from snakesim_gnc.guidance.localisation import PoseNoise
+from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.scan import Noise
 from snakesim_hal.base.arrays import Floats
@@ -75,15 +75,15 @@ class Drive:
         for turn in range(self.turn, self.turn + count):
             self.turn = turn
             here, before = self.place(self.turn), self.place(self.turn - 1)
-            stamp_ns = self.turn * STEP_NS
+            timestamp_ns = self.turn * STEP_NS
             self.world.take_joints(self.joints(here, before), None, self.imu(here, before) if imu else None)
             if pose:
                 self.world.take_pose(self.pose(here))
             if images and self.turn % IMAGE_EVERY == 0:
-                self.under_way.append((self.turn + DELAY_TURNS, self.image(here, stamp_ns)))
+                self.under_way.append((self.turn + DELAY_TURNS, self.image(here, timestamp_ns)))
             while self.under_way and self.under_way[0][0] <= self.turn:
                 self.world.take_look(self.under_way.pop(0)[1], NOISE)
-            self.world.world(self.turn, stamp_ns)
+            self.world.world(self.turn, timestamp_ns)
             yield here
         self.turn += 1
 
@@ -91,7 +91,7 @@ class Drive:
         """With the noise of an encoder."""
         angles = here.angles_rad + 0.0005 * self.random.standard_normal(len(here.angles_rad))
         speeds = (here.angles_rad - before.angles_rad) / (STEP_NS * 1e-9)
-        return state(self.robot, angles.tolist(), speeds.tolist(), tick=self.turn, stamp_ns=self.turn * STEP_NS)
+        return state(self.robot, angles.tolist(), speeds.tolist(), tick=self.turn, timestamp_ns=self.turn * STEP_NS)
 
     def imu(self, here: Place, before: Place) -> Imu:
         """Of every link."""
@@ -99,7 +99,7 @@ class Drive:
         rates = rates + 0.005 * self.random.standard_normal(len(rates))
         return Imu(
             tick=self.turn,
-            stamp_ns=self.turn * STEP_NS,
+            timestamp_ns=self.turn * STEP_NS,
             link=list(range(len(rates))),
             angular_velocity_rad_s=[(0.0, 0.0, float(rate)) for rate in rates],
             acceleration_m_s2=[(0.0, 0.0, 9.81)] * len(rates),
@@ -115,7 +115,7 @@ class Drive:
             orientation_wxyz=quaternion_from_yaw(here.base_w[2] + float(turn)),
         )
 
-    def image(self, here: Place, stamp_ns: int) -> DepthImage:
+    def image(self, here: Place, timestamp_ns: int) -> DepthImage:
         """Of a camera at the front end of the head."""
         mount, link = (self.lengths[-1], 0.0, 0.0), len(self.lengths) - 1
         ahead = here.rotations[-1][:2, 0]
@@ -126,7 +126,7 @@ class Drive:
             here.rotations[-1],
             ground=self.ground,
             eye=self.eye,
-            stamp_ns=stamp_ns,
+            timestamp_ns=timestamp_ns,
             link=link,
             position_l=mount,
         )

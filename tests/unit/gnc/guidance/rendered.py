@@ -100,7 +100,7 @@ def depth_image(
     *,
     ground: Ground = flat,
     eye: Eye | None = None,
-    stamp_ns: int = 0,
+    timestamp_ns: int = 0,
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> DepthImage:
@@ -110,7 +110,7 @@ def depth_image(
     counts = np.where(np.isfinite(depth) & (depth < RANGE_M[1]) & (depth > RANGE_M[0]), depth / SCALE_M, 0.0)
     return DepthImage(
         tick=0,
-        stamp_ns=stamp_ns,
+        timestamp_ns=timestamp_ns,
         link=link,
         position_l=position_l,
         orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -123,7 +123,7 @@ def depth_image(
 
 
 def lidar(
-    obstacles: Sequence[Obstacle], position_w: Floats, rotation: Floats, *, beams: int = 181, stamp_ns: int = 0
+    obstacles: Sequence[Obstacle], position_w: Floats, rotation: Floats, *, beams: int = 181, timestamp_ns: int = 0
 ) -> Ranges:
     """A planar lidar that sees half a turn, without errors."""
     angles = np.linspace(-math.pi / 2, math.pi / 2, beams)
@@ -131,7 +131,7 @@ def lidar(
     found = distance_along(position_w, rays, obstacles)
     return Ranges(
         tick=0,
-        stamp_ns=stamp_ns,
+        timestamp_ns=timestamp_ns,
         link=0,
         position_l=(0.0, 0.0, 0.0),
         orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -143,10 +143,10 @@ def lidar(
     )
 
 
-def scanned(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), stamp_ns: int = 0) -> Scan:
+def scanned(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), timestamp_ns: int = 0) -> Scan:
     """What that lidar sees from a place near the ground, looking along x."""
     position, ahead = np.array([*at, 0.05]), turned(0.0)
-    ranges = lidar(obstacles, position, ahead, beams=361, stamp_ns=stamp_ns)
+    ranges = lidar(obstacles, position, ahead, beams=361, timestamp_ns=timestamp_ns)
     return scan_of_ranges(ranges, position, ahead, 0.0, Noise(0.002, 0.0))
 
 

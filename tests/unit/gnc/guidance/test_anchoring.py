@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.guidance.anchoring import ESTIMATED, MEASURED, Anchors
 from snakesim_gnc.guidance.body_history import Base
-from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
+from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Contact, Obstacle
 from tests.unit.gnc.stage import BODY_RADIUS_M, make_robot
@@ -49,22 +49,22 @@ def felt(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     ]
 
 
-def held(off_w, obstacles, contacts, trust=ESTIMATED, turns: int = 20) -> Localiser:
-    """A localiser that begins off the truth, and what is known after some turns."""
-    localiser = Localiser(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
-    localiser.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
+def held(off_w, obstacles, contacts, trust=ESTIMATED, turns: int = 20) -> Localizer:
+    """A localizer that begins off the truth, and what is known after some turns."""
+    localizer = Localizer(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
+    localizer.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
     anchors = Anchors(ROBOT, obstacles)
     for _ in range(turns):
-        anchors.hold(localiser, SHAPE, contacts, trust)
-    return localiser
+        anchors.hold(localizer, SHAPE, contacts, trust)
+    return localizer
 
 
 @pytest.mark.parametrize(("trust", "turns"), [(ESTIMATED, 20), (MEASURED, 1000)])
 @pytest.mark.parametrize("off_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
 def test_three_contacts_on_known_pegs_bring_the_pose_back(trust, turns, off_w):
-    localiser = held(np.array(off_w), pegs(), felt(), trust, turns)
-    assert np.abs(localiser.base.planar_w - TRUE_W).max() < 0.006
-    assert localiser.position_sd_m < 0.02
+    localizer = held(np.array(off_w), pegs(), felt(), trust, turns)
+    assert np.abs(localizer.base.planar_w - TRUE_W).max() < 0.006
+    assert localizer.position_sd_m < 0.02
 
 
 def test_a_body_lies_in_no_peg_whether_it_feels_it_or_not():

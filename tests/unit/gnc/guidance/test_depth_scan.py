@@ -31,13 +31,13 @@ def errors_m(scan, obstacles) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("ground", "eye", "median_m", "most_m"),
+    ("ground", "eye", "median_m", "max_m"),
     [(flat, None, 0.001, 0.006), (hills(0.02, 1.5), Eye(0.002, 0.003, 0.01), 0.004, 0.02)],
     ids=["flat", "hills and noise"],
 )
-def test_points_lie_on_what_stands_there(ground, eye, median_m, most_m):
+def test_points_lie_on_what_stands_there(ground, eye, median_m, max_m):
     off = errors_m(look(SCENE, turned(0.1), ground=ground, eye=eye), SCENE)
-    assert len(off) > 20 and np.median(off) < median_m and off.max() < most_m
+    assert len(off) > 20 and np.median(off) < median_m and off.max() < max_m
 
 
 @given(st.floats(-0.6, 0.6), st.floats(-0.1, 0.15), st.floats(-0.15, 0.15))

@@ -20,14 +20,14 @@ BODY_M = 0.04
 def mapped(*obstacles, looks=4) -> ObstacleMap:
     map_ = ObstacleMap()
     for k in range(looks):
-        map_.take_scan(scanned(*obstacles, stamp_ns=k * S // 20))
+        map_.take_scan(scanned(*obstacles, timestamp_ns=k * S // 20))
     return map_
 
 
-def touch(map_, centre, radius_m, angle_rad) -> None:
+def touch(map_, center, radius_m, angle_rad) -> None:
     """A contact with a round thing, from outside."""
     normal = np.array([math.cos(angle_rad), math.sin(angle_rad)])
-    map_.take_touches([(np.array(centre) + radius_m * normal, normal)], 0)
+    map_.take_touches([(np.array(center) + radius_m * normal, normal)], 0)
 
 
 def only(map_, now_ns=0) -> Obstacle:
@@ -69,7 +69,7 @@ def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_
 def test_what_one_can_see_through_is_dropped():
     map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
     for k in range(8):
-        map_.take_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), stamp_ns=k))
+        map_.take_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k))
     assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.obstacles(0, 0.0))
     assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
 
@@ -77,10 +77,10 @@ def test_what_one_can_see_through_is_dropped():
 def test_what_is_hidden_or_out_of_view_is_kept():
     map_ = mapped(cylinder("a", 1.2, 0.0))
     for k in range(20):
-        map_.take_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), stamp_ns=k))
+        map_.take_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
     for k in range(20):
-        map_.take_scan(scanned(at=(2.0, 0.0), stamp_ns=k))
+        map_.take_scan(scanned(at=(2.0, 0.0), timestamp_ns=k))
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
@@ -96,7 +96,7 @@ def test_what_the_body_passes_through_does_not_exist():
 def test_where_the_body_lies_nothing_reaches():
     map_ = ObstacleMap()
     for k in range(4):  # one face of a box: how deep it is, is a guess
-        map_.take_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), stamp_ns=k))
+        map_.take_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
     axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
     assert (outer := only(map_)).half_size_m and _depth_beyond(outer, axis) > 0.02
     for _ in range(5):

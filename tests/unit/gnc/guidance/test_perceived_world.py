@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.localisation import PoseNoise
+from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_hal.wire.messages import Contacts, World
 from snakesim_operator.results.map_score import MapScore, moved, score
@@ -26,7 +26,7 @@ def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
         if drive.turn % 25 == 0 and drive.turn > 25:
             obstacles = reported(drive).obstacles
             if not pose:
-                obstacles = moved(obstacles, drive.world.localiser.base.planar_w.tolist(), here.base_w)
+                obstacles = moved(obstacles, drive.world.localizer.base.planar_w.tolist(), here.base_w)
             total.add(score(obstacles, drive.obstacles, here.head_w, here.headings_rad[-1]))
     return total
 
@@ -62,15 +62,17 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     drive = Drive(random_field(1))
     *_, here = drive.turns(30)
     image, before = drive.image(here, 30 * STEP_NS), reported(drive)
-    drive.world.take_look(msgspec.structs.replace(image, stamp_ns=STEP_NS), NOISE)  # older than what is in the map
-    drive.world.take_look(msgspec.structs.replace(image, stamp_ns=900 * STEP_NS), NOISE)  # of the future
+    drive.world.take_look(msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE)  # older than what is in the map
+    drive.world.take_look(msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE)  # of the future
     joints = drive.joints(here, here)
-    broken = msgspec.structs.replace(joints, stamp_ns=joints.stamp_ns + STEP_NS, valid=[False] * len(joints.valid))
+    broken = msgspec.structs.replace(
+        joints, timestamp_ns=joints.timestamp_ns + STEP_NS, valid=[False] * len(joints.valid)
+    )
     drive.world.take_joints(broken, None, None)
     drive.world.take_look(image, NOISE)
     assert sum(drive.world.refused.values()) == 3 and len(drive.world.refused) == 3
     after = reported(drive)
-    assert after.depth_stamp_ns == before.depth_stamp_ns and len(after.obstacles) == len(before.obstacles)
+    assert after.depth_timestamp_ns == before.depth_timestamp_ns and len(after.obstacles) == len(before.obstacles)
 
 
 def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
@@ -81,7 +83,7 @@ def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     assert len(before.obstacles) > 3
     list(drive.turns(100, pose=False, images=False, imu=False))
     after = reported(drive)
-    assert after.pose_stamp_ns == before.pose_stamp_ns and after.depth_stamp_ns == before.depth_stamp_ns
+    assert after.pose_timestamp_ns == before.pose_timestamp_ns and after.depth_timestamp_ns == before.depth_timestamp_ns
     assert after.base_confidence < before.base_confidence
     assert (after.base_position_sd_m or 0) > 5 * (before.base_position_sd_m or 1)
     seen = {o.name: o for o in before.obstacles}
@@ -95,7 +97,7 @@ def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():
     touch = contact(7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0))
     drive = Drive([])
     for _ in drive.turns(10, images=False):
-        drive.world.take_contacts(Contacts(tick=drive.turn, stamp_ns=drive.turn * STEP_NS, contacts=[touch]))
+        drive.world.take_contacts(Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch]))
     world = drive.world.world(9, 9 * STEP_NS)
     assert world is not None and world.contacts
     assert {c.obstacle for c in world.contacts} <= {o.name for o in world.obstacles}
@@ -106,7 +108,7 @@ def test_a_lidar_maps_as_a_camera_does():
     drive = Drive([cylinder("a", 2.0, 0.3), cylinder("b", 2.2, -0.25)])
     here = drive.place(0)
     for here in drive.turns(60, images=False):
-        beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], stamp_ns=drive.turn * STEP_NS)
+        beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], timestamp_ns=drive.turn * STEP_NS)
         drive.world.take_look(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
     total = score(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
     assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
@@ -114,5 +116,5 @@ def test_a_lidar_maps_as_a_camera_does():
 
 def test_before_the_first_joint_state_there_is_no_world():
     drive = Drive([])
-    world = PerceivedWorld(drive.robot, drive.world.localiser.base, PoseNoise())
+    world = PerceivedWorld(drive.robot, drive.world.localizer.base, PoseNoise())
     assert world.world(0, 0) is None

@@ -59,7 +59,7 @@ def test_a_concave_corner_is_two_things():
 @settings(max_examples=60)
 def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
     track = seen(cylinder("it", x, y, radius), random=np.random.default_rng(seed))
-    off = math.dist(track.centre_w, (x, y))
+    off = math.dist(track.center_w, (x, y))
     assert off < 5 * track.position_sd_m
     if track.shape == "cylinder":  # seen by five beams, one in thousands is taken for a box
         assert off < 0.02 and abs(track.radius_m - radius) < 5 * track.size_sd_m
@@ -71,7 +71,7 @@ def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
     truth = box("it", 0.8, 0.1, (length, width), yaw)
     track = seen(truth, random=np.random.default_rng(seed), views=((0.0, 0.0), (0.0, 0.5), (0.0, -0.3)))
     assert track.shape == "box"
-    assert math.dist(track.centre_w, (0.8, 0.1)) < 0.025
+    assert math.dist(track.center_w, (0.8, 0.1)) < 0.025
     assert sorted(2 * track.half_m) == pytest.approx(sorted((length, width)), abs=0.04)
     turn = (track.yaw_rad - yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
     assert abs(turn) < 0.15
@@ -80,12 +80,12 @@ def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
 def test_behind_a_single_face_the_depth_is_a_guess_and_said_so():
     one = seen(box("it", 0.8, 0.0, (0.1, 0.16)))
     assert one.shape == "box" and one.position_sd_m > 0.015  # its back side is open
-    face = one.centre_w[0] - min(one.half_m)
-    assert abs(one.centre_w[1]) < 0.01 and (
-        abs(face - 0.75) < 0.01 or abs(one.centre_w[0] - max(one.half_m) - 0.75) < 0.01
+    face = one.center_w[0] - min(one.half_m)
+    assert abs(one.center_w[1]) < 0.01 and (
+        abs(face - 0.75) < 0.01 or abs(one.center_w[0] - max(one.half_m) - 0.75) < 0.01
     )
     around = seen(box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6)))
-    assert around.position_sd_m < 0.01 and math.dist(around.centre_w, (0.8, 0.0)) < 0.01
+    assert around.position_sd_m < 0.01 and math.dist(around.center_w, (0.8, 0.0)) < 0.01
 
 
 def test_a_long_face_is_a_thin_wall():
@@ -115,7 +115,7 @@ def test_fusing_looks_lowers_the_scatter_and_the_told_error():
 
     def scatter_m(looks: int) -> tuple[float, float]:
         found = [seen(truth, random=random, views=((0.0, 0.0),) * looks, noise_m=0.005) for _ in range(30)]
-        return float(np.std([t.centre_w[0] for t in found])), float(np.median([t.position_sd_m for t in found]))
+        return float(np.std([t.center_w[0] for t in found])), float(np.median([t.position_sd_m for t in found]))
 
     once, often = scatter_m(1), scatter_m(10)
     assert often[0] < 0.5 * once[0] and often[1] < 0.7 * once[1]

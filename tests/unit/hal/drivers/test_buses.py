@@ -1,4 +1,4 @@
-"""A robot of two families on two buses: in turn, and each bus in a thread of its own. Drives are emulated."""
+"""A robot of two driver types on two buses: in turn, and each bus in a thread of its own. Drives are emulated."""
 
 import threading
 import time
@@ -10,33 +10,33 @@ import pytest
 from snakesim_can_backend.odrive.protocol import State
 from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.messages import Mode, Pace
+from snakesim_hal.wire.messages import ClockMode, Mode
 from tests.contract.drives import DrivesOfAnyFamily
 from tests.harness.wait import wait_until
 from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
 
 AXES, SERVOS = [0, 1], [2, 3]  # joints
-HEAD = {"family": "odrive"}, {"joint_3": {"family": "dynamixel"}, "joint_4": {"family": "dynamixel"}}
+HEAD = {"driver": "odrive"}, {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}}
 LONG_S = 1.0  # a watchdog that a busy computer does not reach
 SHORT_S = 0.2
 
 
 class Robot(DriveRig):
-    """Drives of one family, by default ODrive axes, and two servos at the head."""
+    """Drives of one driver type, by default ODrive axes, and two servos at the head."""
 
-    def __init__(self, pace: Pace = "lockstep", body: str = "odrive", **families: Any) -> None:
-        fixed = {name: {"bring_up_limit_s": 2.0} | families.get(name, {}) for name in (body, "dynamixel")}
+    def __init__(self, clock_mode: ClockMode = "lockstep", body: str = "odrive", **driver_types: Any) -> None:
+        fixed = {name: {"bring_up_limit_s": 2.0} | driver_types.get(name, {}) for name in (body, "dynamixel")}
         config = run_config(
             backend="mixed",
             robot__chain__modules=4,
-            robot__drive=HEAD[0] | {"family": body},
+            robot__drive=HEAD[0] | {"driver": body},
             robot__joints=HEAD[1],
             rate_hz=100,
-            pace=pace,
+            clock_mode=clock_mode,
             backends=fixed,
         )
-        super().__init__(config, MixedBackend(config, MixedSettings(plant="inertia")))
+        super().__init__(config, MixedBackend(config, MixedSettings(physics_model="inertia")))
         self.axes, self.servos = drives_of(self.backend, 0), drives_of(self.backend, 1)
 
     def ages_ms(self, joints: list[int]) -> list[float]:
@@ -48,10 +48,10 @@ class Robot(DriveRig):
         return [self.joints.angle_rad[i] for i in joints]
 
     def axes_follow(self) -> set[bool]:
-        return {axis.state == State.CLOSED_LOOP for axis in self.axes._twin.axes}
+        return {axis.state == State.CLOSED_LOOP for axis in self.axes._emulator.axes}
 
     def servos_follow(self) -> set[bool]:
-        return {servo.on for servo in self.servos._twin.servos}
+        return {servo.on for servo in self.servos._emulator.servos}
 
     def enabled(self) -> list[bool]:
         """Of every drive, in truth."""
@@ -70,8 +70,8 @@ def opened() -> Iterator[Opens]:
     """Opens robots, and closes them in the end."""
     robots: list[Robot] = []
 
-    def open_one(*given: Any, **families: Any) -> Robot:
-        robots.append(Robot(*given, **families))
+    def open_one(*given: Any, **driver_types: Any) -> Robot:
+        robots.append(Robot(*given, **driver_types))
         return robots[-1]
 
     yield open_one
@@ -117,7 +117,7 @@ def test_a_fault_of_a_drive_is_injected_and_reported_by_its_number_in_the_robot(
 
 
 def test_a_bus_of_half_the_rate_is_asked_and_told_every_second_tick_and_stops_at_once(opened: Opens) -> None:
-    robot = opened(dynamixel={"every_ticks": 2})
+    robot = opened(dynamixel={"decimation": 2})
     assert robot.backend.describe().sensors[0].delay_s == 0.01, "so old may a joint state be by itself"
     ages: list[list[float]] = []
     for _ in range(6):
@@ -195,7 +195,7 @@ def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(open
         lambda: (robot.run(1, "armed") and False) or robot.axes_follow() == robot.servos_follow() == {True}, "arms"
     )
     wait_until(lambda: robot.axes_follow() == robot.servos_follow() == {False}, "both", 10.0)
-    assert not any(axis.errors for axis in robot.axes._twin.axes), "not by their watchdogs"
+    assert not any(axis.errors for axis in robot.axes._emulator.axes), "not by their watchdogs"
     found = robot.run(1, "armed")
 
     def both_are_reported() -> bool:
@@ -204,7 +204,7 @@ def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(open
 
     wait_until(both_are_reported, "a fault of each bus", 10.0)
     assert {fault.what for fault in found} == {"no_setpoints"} and "one lease" in found[0].cause
-    assert robot.axes_follow() == robot.servos_follow() == {False}, "set-points of an armed robot enabled them again"
+    assert robot.axes_follow() == robot.servos_follow() == {False}, "setpoints of an armed robot enabled them again"
 
 
 @pytest.mark.parametrize("body", ["odrive", "moteus"])
@@ -244,19 +244,19 @@ def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened:
     [
         (
             {"robot__drive": {}},
-            "joint_1: `family` is not given, and the backend `mixed` drives each joint by its family",
+            "joint_1: `driver` is not given, and the backend `mixed` drives each joint by its driver_type",
         ),
         (
-            {"robot__joints": {"joint_2": {"family": "odriv"}}},
-            r"joint_2: `family` = 'odriv': no backend called 'odriv' .* did you mean `odrive`.*\[joints.joint_2\]",
+            {"robot__joints": {"joint_2": {"driver": "odriv"}}},
+            r"joint_2: `driver` = 'odriv': no backend called 'odriv' .* did you mean `odrive`.*\[joints.joint_2\]",
         ),
         (
-            {"robot__joints": {"joint_2": {"family": "sim"}}},
-            "joint_2: `family` = 'sim', a backend that drives whole robots",
+            {"robot__joints": {"joint_2": {"driver": "sim"}}},
+            "joint_2: `driver` = 'sim', a backend that drives whole robots",
         ),
         (
-            {"robot__joints": {"joint_2": {"family": "can"}}},
-            "joint_2: `family` = 'can', a backend that drives whole robots",
+            {"robot__joints": {"joint_2": {"driver": "can"}}},
+            "joint_2: `driver` = 'can', a backend that drives whole robots",
         ),
         ({"backends": {"odrive": {"mounted": {}}}}, "`backends.odrive.mounted` .* say `backends.mixed.mounted`"),
         ({"backends": {"dynamixel": {"baud": 7}}}, "backends.dynamixel.baud"),
@@ -264,10 +264,10 @@ def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened:
             {"backends": {"dynamixel": {"ports": ["/dev/pts/0"]}}},
             "`backends.odrive` names no bus, and `backends.dynamixel`",
         ),
-        ({"backends": {"dynamixel": {"every_ticks": 4}}}, "`backends.dynamixel.every_ticks` = 4 .* at most 3"),
-        ({"backends": {"odrive": {"every_ticks": 3, "watchdog_s": 0.05}}}, "`every_ticks` = 3: one lost set-point"),
+        ({"backends": {"dynamixel": {"decimation": 4}}}, "`backends.dynamixel.decimation` = 4 .* at most 3"),
+        ({"backends": {"odrive": {"decimation": 3, "watchdog_s": 0.05}}}, "`decimation` = 3: one lost setpoint"),
         (
-            {"robot__joints": {"joint_3": {"family": "dynamixel", "id": 253}}},
+            {"robot__joints": {"joint_3": {"driver": "dynamixel", "id": 253}}},
             "joint_3: `id` = 253; ids of protocol 2.0",
         ),
     ],
@@ -280,5 +280,5 @@ def test_what_is_no_mixed_robot_is_refused_by_joint_family_and_section(changes: 
 
 
 def test_ids_are_those_of_a_family_on_a_port() -> None:
-    config = run_config(robot__drive=HEAD[0], robot__joints={"joint_3": {"family": "dynamixel", "id": 1}})
+    config = run_config(robot__drive=HEAD[0], robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}})
     assert [joint.id for joint in config.robot.joint_table][:3] == [1, 2, 1]

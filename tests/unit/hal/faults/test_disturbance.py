@@ -149,7 +149,7 @@ def test_decoders_get_noise_cuts_and_numbers_that_are_none_and_refuse_them_in_or
         except WireError:
             refused += 1
     assert min(lengths) == 0 and max(lengths) > len(payload) and len(lengths) > 100
-    assert refused > 5_000 and taken > 1_000, "some still make sense: what those ask for is the gate's to judge"
+    assert refused > 5_000 and taken > 1_000, "some still make sense: what those ask for is the limiter's to judge"
 
 
 def test_corruption_strikes_as_often_as_it_says() -> None:

@@ -18,7 +18,7 @@ from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import LagBackend, Running, commanded, meeting, running
 from tests.unit.hal.rig import clock, description, run_config, state
 
-ALLOWED: dict[str, Any] = {"pace": "realtime", "rate_hz": 100, "faults_allowed": True}
+ALLOWED: dict[str, Any] = {"clock_mode": "realtime", "rate_hz": 100, "allow_fault_injection": True}
 
 
 def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
@@ -53,9 +53,9 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is
 
 
 def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
-    with running(run_config(pace="realtime")) as run:
+    with running(run_config(clock_mode="realtime")) as run:
         answer = ask(run, "mute", "joint_1")
-        assert not answer.ok and answer.refusal == "not_allowed" and "faults_allowed = true" in answer.reason
+        assert not answer.ok and answer.refusal == "not_allowed" and "allow_fault_injection = true" in answer.reason
     config = run_config(faults=["mute:joint_1@1"])
     with (
         meeting("worm") as (own,),
@@ -101,12 +101,12 @@ def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
 # --- a part's own rules --------------------------------------------------------------------------------------
 
 
-def turn(injector: Injector, tick: int, arming: int) -> None:
-    injector.turn(tick * 10_000_000, arming, "armed" if arming else "disarmed")
+def turn(injector: Injector, tick: int, arm_session: int) -> None:
+    injector.turn(tick * 10_000_000, arm_session, "armed" if arm_session else "disarmed")
 
 
 def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> None:
-    config = run_config(faults=["drop:actuator/joints@0.1"], faults_allowed=True)
+    config = run_config(faults=["drop:actuator/joints@0.1"], allow_fault_injection=True)
     with meeting("worm") as (session,):
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
             injector = Injector("control", config, session, note=lambda _text, _now_s: None)

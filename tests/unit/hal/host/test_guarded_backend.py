@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Mode, Pace
+from snakesim_hal.wire.messages import ClockMode, Mode
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import LagBackend, commanded
 from tests.unit.hal.rig import pose, power, run_config
@@ -43,13 +43,13 @@ class Wrong(LagBackend):
 
     wrong: Mapping[str, Any] = {}
 
-    def sample(self, tick: int, stamp_ns: int) -> Samples:
-        right = super().sample(tick, stamp_ns)
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
+        right = super().sample(tick, timestamp_ns)
         joints = msgspec.structs.replace(right.joints, **self.wrong.get(keys.JOINTS, {}))
         return Samples(joints, {**right.others, **{key: one for key, one in self.wrong.items() if key != keys.JOINTS}})
 
 
-@pytest.mark.parametrize("pace", ["realtime", "lockstep"])
+@pytest.mark.parametrize("clock_mode", ["realtime", "lockstep"])
 @pytest.mark.parametrize(
     ("key", "sample", "why"),
     [
@@ -67,10 +67,10 @@ class Wrong(LagBackend):
     ],
 )
 def test_a_sample_that_no_reader_would_accept_is_a_latched_fault_that_names_it(
-    pace: Pace, key: str, sample: Any, why: str, monkeypatch: pytest.MonkeyPatch
+    clock_mode: ClockMode, key: str, sample: Any, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tests.unit.hal.local_network.LagBackend", Wrong)
-    with commanded(run_config(pace=pace)) as (run, _):
+    with commanded(run_config(clock_mode=clock_mode)) as (run, _):
         backend: Any = run.backend
         backend.wrong = {key: sample}
         wait_until(run.ended, "the end of the host")

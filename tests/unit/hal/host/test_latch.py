@@ -91,7 +91,7 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
 
 
 def test_a_host_on_a_disk_that_hangs_stops_at_once_answers_and_ends(tmp_path: Path, hanging: Event) -> None:
-    with running(run_config(pace="realtime"), latch=EstopLatch(tmp_path)) as run:
+    with running(run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
         began = time.monotonic()
         answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))
         assert answer.ok and answer.lifecycle == "estop" and "not stored yet" in answer.reason

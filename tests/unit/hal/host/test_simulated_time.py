@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import EstopRequest, Pace, SimulatorRequest
+from snakesim_hal.wire.messages import ClockMode, EstopRequest, SimulatorRequest
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Running, commanded
 from tests.unit.hal.rig import description, run_config
@@ -30,9 +30,9 @@ def stands_at(run: Running) -> int:
     return run.backend.advanced
 
 
-@pytest.mark.parametrize("pace", ["realtime", "lockstep"])
-def test_nothing_expires_in_a_pause_and_steps_are_exact(pace: Pace) -> None:
-    with commanded(run_config(pace=pace, **PATIENT)) as (run, control):
+@pytest.mark.parametrize("clock_mode", ["realtime", "lockstep"])
+def test_nothing_expires_in_a_pause_and_steps_are_exact(clock_mode: ClockMode) -> None:
+    with commanded(run_config(clock_mode=clock_mode, **PATIENT)) as (run, control):
         assert "paused by ada" in ask(run, "pause")
         tick = stands_at(run)
         time.sleep(MANY_LEASES_S)
@@ -51,7 +51,7 @@ def test_nothing_expires_in_a_pause_and_steps_are_exact(pace: Pace) -> None:
 
 def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
     """The lease counts robot time: it is as long after a pause as it was before."""
-    with commanded(run_config(pace="realtime", **PATIENT)) as (run, control):
+    with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, control):
         ask(run, "pause")
         stands_at(run)
         control.silent.set()
@@ -61,7 +61,7 @@ def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
 
 
 def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None:
-    with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
+    with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, _):
         ask(run, "pause")
         tick = stands_at(run)
         assert run.ask(keys.ESTOP, EstopRequest(who="bob")).lifecycle == "estop"
@@ -73,7 +73,7 @@ def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None
 
 
 def test_speed_scales_real_time_and_a_reset_ends_the_host_disarmed() -> None:
-    with commanded(run_config(pace="realtime", **PATIENT)) as (run, _):
+    with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, _):
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")
         assert run.status.speed == 0.2 and run.status.real_time_factor == pytest.approx(0.2, rel=0.3)
@@ -84,7 +84,7 @@ def test_speed_scales_real_time_and_a_reset_ends_the_host_disarmed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("simulated", "pace", "asked", "word"),
+    ("simulated", "clock_mode", "asked", "word"),
     [
         (False, "realtime", {"action": "pause"}, "not_simulated"),
         (False, "realtime", {"action": "reset"}, "not_simulated"),
@@ -92,8 +92,10 @@ def test_speed_scales_real_time_and_a_reset_ends_the_host_disarmed() -> None:
         (True, "lockstep", {"action": "resume"}, "wrong_state"),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(simulated: bool, pace: Pace, asked: dict[str, Any], word: str) -> None:
-    made = SimulatedTime(description(simulated_time=simulated), pace, lambda: 0)
+def test_what_cannot_be_is_refused_in_words(
+    simulated: bool, clock_mode: ClockMode, asked: dict[str, Any], word: str
+) -> None:
+    made = SimulatedTime(description(simulated_time=simulated), clock_mode, lambda: 0)
     outcome = made.take(SimulatorRequest(**asked), 0)
     assert isinstance(outcome, Refusal) and outcome.word == word
     assert not made.stands

@@ -102,7 +102,7 @@ class Square(FileStruct, frozen=True, tag="square", tag_field="kind"):
     """The other."""
 
     edge_m: float
-    colour: Literal["red", "blue"] = "red"
+    color: Literal["red", "blue"] = "red"
 
 
 class Grip(Enum):
@@ -128,15 +128,15 @@ UNION: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "kind of another type": ({"shape": {"kind": 3}}, ["`shape.kind` = 3", "one of 'round', 'square'"]),
     "no kind": ({"shape": {"radius_m": 1}}, ["`shape.kind` is missing", "one of 'round', 'square'"]),
-    "no section": ({"shape": 3}, ["`shape` = 3", "kind = 'round', radius_m", "kind = 'square', edge_m, colour"]),
+    "no section": ({"shape": 3}, ["`shape` = 3", "kind = 'round', radius_m", "kind = 'square', edge_m, color"]),
     "field of the other kind": (
         {"shape": {"kind": "square", "edge_m": 1, "radius_m": 1}},
-        ["unknown field `shape.radius_m`", "known fields: colour, edge_m, kind"],
+        ["unknown field `shape.radius_m`", "known fields: color, edge_m, kind"],
     ),
     "field missing": ({"shape": {"kind": "square"}}, ["`shape.edge_m` is missing", "a number"]),
     "wrong in the second kind": (
-        {"shape": {"kind": "square", "edge_m": 1, "colour": "green"}},
-        ["`shape.colour` = 'green'", "one of 'blue', 'red'"],
+        {"shape": {"kind": "square", "edge_m": 1, "color": "green"}},
+        ["`shape.color` = 'green'", "one of 'blue', 'red'"],
     ),
     "enumeration": ({"grip": "soft"}, ["`grip` = 'soft'", "one of 'firm', 'loose'"]),
 }

@@ -22,10 +22,10 @@ def test_the_robot_that_it_was_made_for_and_longer_ones_get_it_as_it_is() -> Non
     as_it_is = clutter().scene
     for joints in (8, 13, 30):
         scene = clutter(f"robot.chain.modules={joints}").scene
-        assert (scene.route, scene.pegs_along_route, scene.made_for) == (
+        assert (scene.route, scene.pegs_along_route, scene.reference_robot) == (
             as_it_is.route,
             as_it_is.pegs_along_route,
-            as_it_is.made_for,
+            as_it_is.reference_robot,
         )
 
 
@@ -37,9 +37,11 @@ def test_a_robot_of_other_joints_and_another_radius_gets_it_in_proportion() -> N
         assert getattr(sine(config), name) == pytest.approx(share * getattr(sine(before), name))
     (row,), (field,) = config.scene.pegs_along_route, config.scene.random_field
     assert row.corridor_m == pytest.approx(0.035 + share * 0.005)
-    beyond_m = before.scene.random_field[0].low_m[0] - sine(before).length_m
-    assert field.low_m == pytest.approx((sine(config).length_m + beyond_m, -1.0))
-    assert field.high_m[0] - field.low_m[0] == pytest.approx(4.6) and field.clearance_m == pytest.approx(0.11)
+    beyond_m = before.scene.random_field[0].min_corner_m[0] - sine(before).length_m
+    assert field.min_corner_m == pytest.approx((sine(config).length_m + beyond_m, -1.0))
+    assert field.max_corner_m[0] - field.min_corner_m[0] == pytest.approx(4.6) and field.clearance_m == pytest.approx(
+        0.11
+    )
     assert len(place_all(config)) > 40  # and it lies clear of them
 
 

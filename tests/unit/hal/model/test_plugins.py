@@ -170,8 +170,8 @@ WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_operator/robot_commands", "snakesim_operator.run.supervisor", OPERATOR),
     ("snakesim_operator/run", "snakesim_operator.cli", OPERATOR),
     ("snakesim_can_backend/protocol", "snakesim_can_backend.settings", CAN),
-    ("snakesim_can_backend/bus", "snakesim_can_backend.twin.chain", CAN),
-    ("snakesim_can_backend/twin", "snakesim_can_backend.driver.backend", CAN),
+    ("snakesim_can_backend/bus", "snakesim_can_backend.emulator.chain", CAN),
+    ("snakesim_can_backend/emulator", "snakesim_can_backend.driver.backend", CAN),
     ("snakesim_can_backend/driver", "snakesim_can_backend.can_command", CAN),
 ]
 

@@ -55,12 +55,12 @@ def test_the_description_says_what_the_file_says() -> None:
     assert joint.torque_rate_limit_nm_s == limits["torque_rate_nm_s"]
     assert joint.stiffness_nm_per_rad == motor["stiffness_nm_per_rad"]
     assert joint.damping_nm_s_per_rad == motor["damping_nm_s_per_rad"]
-    assert (described.safe_action, described.max_step_rad) == ("damp", 0.3)
+    assert (described.stop_mode, described.max_step_rad) == ("damp", 0.3)
 
 
 def test_one_joint_may_differ_in_every_field_that_the_sections_give_to_all() -> None:
     own = {
-        "id": 17, "sign": -1, "zero_rad": 0.3, "gear": 2.0, "port": "can1", "family": "odrive",
+        "id": 17, "sign": -1, "zero_rad": 0.3, "gear": 2.0, "port": "can1", "driver": "odrive",
         "angle_min_rad": -0.4, "angle_max_rad": 1.2, "speed_rad_s": 2.0, "torque_nm": 3.0, "derate_from_c": 60.0,
         "armature_kg_m2": 0.02, "torque_constant_nm_per_a": 0.08, "rated_nm": 1.0, "peak_nm": 3.5, "voltage_v": 25.2,
         "rise_at_rated_k": 90.0,
@@ -71,14 +71,14 @@ def test_one_joint_may_differ_in_every_field_that_the_sections_give_to_all() -> 
         found = [part for part in (second, *(getattr(second, s) for s in SECTIONS)) if hasattr(part, field)]
         assert {getattr(part, field) for part in found} == {value}, field
     assert (first.id, third.id, first.drive.gear, first.supply.voltage_v) == (1, 3, 9.0, 24.0)
-    assert (first.limits.least_rad, first.limits.most_rad) == (-1.5, 1.0) == (third.limits.least_rad, 1.0)
+    assert (first.limits.lower_rad, first.limits.upper_rad) == (-1.5, 1.0) == (third.limits.lower_rad, 1.0)
     joints = description(joints={"joint_2": own}, limits__angle_max_rad=1.0).joints
     assert [(joint.angle_min_rad, joint.angle_max_rad) for joint in joints] == [(-1.5, 1.0), (-0.4, 1.2), (-1.5, 1.0)]
     assert [joint.torque_limit_nm for joint in joints] == [4.0, 3.0, 4.0]
     assert [joint.speed_limit_rad_s for joint in joints] == [5.0, 2.0, 5.0]
     assert [joint.derate_from_c for joint in joints] == [80.0, 60.0, 80.0]
     either = robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0).joint_table[1].limits
-    assert (either.least_rad, either.most_rad) == (-0.2, 0.2), "to either side, whatever the others' sides are"
+    assert (either.lower_rad, either.upper_rad) == (-0.2, 0.2), "to either side, whatever the others' sides are"
 
 
 def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
@@ -105,7 +105,7 @@ def test_only_the_sensors_that_a_robot_has_are_described_and_none_is_faster_than
 
 def test_cameras_and_lidars_are_described_by_their_names_and_arrive_a_period_late_at_least() -> None:
     depth = [
-        {"name": "head", "delay_s": 0.0, "colour": True},
+        {"name": "head", "delay_s": 0.0, "color": True},
         {"name": "back", "link": 2, "position_m": [0.0, 0.0, 0.1]},
     ]
     rich = description(sensors={"depth": depth, "range": [{"name": "front", "rate_hz": 500.0, "delay_s": 0.04}]})
@@ -113,7 +113,7 @@ def test_cameras_and_lidars_are_described_by_their_names_and_arrive_a_period_lat
     del found[keys.JOINTS]
     assert found == {
         keys.depth("head"): (20.0, 0.01),
-        keys.colour("head"): (20.0, 0.01),
+        keys.color("head"): (20.0, 0.01),
         keys.depth("back"): (20.0, 0.03),
         keys.ranges("front"): (100.0, 0.04),
     }

@@ -45,9 +45,9 @@ def with_flags(path: str, *flags: str) -> Loaded:
 def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     config = load(write_files(tmp_path)).config
     assert (config.name, config.robot.name, config.scene.name) == ("crawl", "worm", "bend")
-    assert config.services == {"control": Service(), "guidance": Service(every_ticks=2)}
+    assert config.services == {"control": Service(), "guidance": Service(decimation=2)}
     assert config.robot.sensors.pose is not None and config.robot.sensors.contacts is None
-    assert (config.pace, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
+    assert (config.clock_mode, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
     assert config.period_ns == 10_000_000
 
 
@@ -135,7 +135,7 @@ def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(r
 
 @given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
 def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, lag: int) -> None:
-    service = Service(every_ticks=every, lag_ticks=lag)
+    service = Service(decimation=every, latency_ticks=lag)
     counting = service.used_output_tick(tick)
     assert counting % every == 0 and counting >= 0
     assert counting == 0 or counting <= tick - lag
@@ -153,8 +153,8 @@ def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, 
         (" rate_hz = 50.5", "rate_hz", 50.5),
         ("start.on_route=false", "start.on_route", False),
         ("start.position_m=[1.0, 2.0]", "start.position_m", [1.0, 2.0]),
-        ("pace=free", "pace", "free"),
-        ('pace="free"', "pace", "free"),
+        ("clock_mode=free", "clock_mode", "free"),
+        ('clock_mode="free"', "clock_mode", "free"),
         ("controller=./wave.py:Wave", "controller", "./wave.py:Wave"),
         ("title=a = b", "title", "a = b"),
         ("title=", "title", ""),
@@ -181,8 +181,14 @@ def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
     assert reported["robot.sensors.pose.rate_hz"] == (50.0, str(tmp_path / "worm.toml"))
     assert reported["scene.cylinder.1.position_m"] == ((1.5, 1.0), str(tmp_path / "bend.toml"))
     assert reported["rate_hz"] == (100.0, str(tmp_path / "crawl.toml"))
-    assert reported["services.guidance.every_ticks"] == (2, str(tmp_path / "crawl.toml"))
-    for key in ("seed", "robot.motor.friction_nm", "services.control.every_ticks", "scene.cylinder.0.friction", "pace"):
+    assert reported["services.guidance.decimation"] == (2, str(tmp_path / "crawl.toml"))
+    for key in (
+        "seed",
+        "robot.motor.friction_nm",
+        "services.control.decimation",
+        "scene.cylinder.0.friction",
+        "clock_mode",
+    ):
         assert reported[key][1] == "default", key
     assert set(reported) == {key for key, _ in flat(msgspec.to_builtins(loaded.config))}
 
@@ -203,7 +209,7 @@ def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_fla
         assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
         assert config.control_settings == {"gain": 3} and config.control_section == "controllers.Wave"
     assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
-    assert with_flags(path, "backend=twin", "backend.step=1").config.backends == {"twin": {"step": 1}}
+    assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {"emulator": {"step": 1}}
 
 
 # --- what is wrong: one error, in words ------------------------------------------------------------------------
@@ -234,7 +240,7 @@ def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load(path)
     said = str(caught.value)
-    if wrong != "robot empty":  # an empty file has no neighbour that could tell whose the field is
+    if wrong != "robot empty":  # an empty file has no neighbor that could tell whose the field is
         assert said.startswith(f"{tmp_path / name}: "), said
     assert all(word in said for word in words), said
     assert "\n" not in said
@@ -305,7 +311,7 @@ def test_off_the_route_the_snake_lies_straight_where_told() -> None:
 
 
 def test_random_fields_stay_clear_of_the_start() -> None:
-    field = {"seed": 1, "low_m": [-0.3, -0.3], "high_m": [0.7, 0.3], "density_per_m2": 30.0}
+    field = {"seed": 1, "min_corner_m": [-0.3, -0.3], "max_corner_m": [0.7, 0.3], "density_per_m2": 30.0}
     field |= {"radius_m": [0.02, 0.03], "clearance_m": 0.01}
     config = run_config(scene__random_field=[field])
     placed = place_all(config)

@@ -27,8 +27,8 @@ from tests.unit.hal.rig import SCENE
 SINE = {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}
 FIELD: dict[str, Any] = {
     "seed": 7,
-    "low_m": [0.0, -1.0],
-    "high_m": [2.0, 1.0],
+    "min_corner_m": [0.0, -1.0],
+    "max_corner_m": [2.0, 1.0],
     "density_per_m2": 5.0,
     "radius_m": [0.02, 0.05],
     "clearance_m": 0.05,
@@ -56,7 +56,7 @@ def test_every_kind_of_obstacle_is_placed_as_described() -> None:
         scene(
             cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}],
             box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}],
-            sphere=[{"position_m": [0, 3], "radius_m": 0.2, "centre_height_m": 0.05}],
+            sphere=[{"position_m": [0, 3], "radius_m": 0.2, "center_height_m": 0.05}],
             wall=[{"from_m": [0, 5], "to_m": [3, 9], "thickness_m": 0.1, "height_m": 0.5}],
             step=[{"position_m": [0, -4], "size_m": [1.0, 0.5], "height_m": 0.03}],
         )
@@ -119,9 +119,9 @@ def test_pegs_stand_at_their_distance_on_the_side_that_pushes_forward(
     assert [peg.name for peg in pegs] == [f"peg_0_{first + k}" for k in range(count)]
     spots = route.inflections_s_m()[first:]
     for k, peg in enumerate(pegs):
-        centre, foot = np.array(peg.position_w[:2]), route.position_w(spots[k])
-        push = (foot - centre) / np.linalg.norm(foot - centre)  # from the peg onto the body
-        assert np.linalg.norm(foot - centre) - radius_m == pytest.approx(corridor_m)
+        center, foot = np.array(peg.position_w[:2]), route.position_w(spots[k])
+        push = (foot - center) / np.linalg.norm(foot - center)  # from the peg onto the body
+        assert np.linalg.norm(foot - center) - radius_m == pytest.approx(corridor_m)
         assert push @ route.tangent_w(spots[k]) == pytest.approx(0.0, abs=1e-6)
         assert push[0] > 0  # the route runs along x
     sides = [math.copysign(1, peg.position_w[1] - route.at(s)[1]) for peg, s in zip(pegs, spots, strict=False)]
@@ -155,20 +155,20 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
     placed = pegs[1:]
     assert len(placed) == round(5.0 * 4.0)
     for i, peg in enumerate(placed):
-        centre = np.array(peg.position_w[:2])
+        center = np.array(peg.position_w[:2])
         assert 0.02 <= peg.radius_m <= 0.05
-        assert -1e-9 <= centre[0] <= 2 and -1 <= centre[1] <= 1
+        assert -1e-9 <= center[0] <= 2 and -1 <= center[1] <= 1
         for other in [pegs[0], *placed[:i]]:
-            assert outline_distance_m(other, centre) - peg.radius_m >= clearance_m - 1e-9
-        assert LINKS.distance_m(centre).min() - peg.radius_m >= clearance_m - 1e-9
+            assert outline_distance_m(other, center) - peg.radius_m >= clearance_m - 1e-9
+        assert LINKS.distance_m(center).min() - peg.radius_m >= clearance_m - 1e-9
         dense = route.position_w(np.linspace(0, route.length_m, 2000))
-        assert np.hypot(*(dense - centre).T).min() - peg.radius_m >= route_clearance_m - 1e-5
+        assert np.hypot(*(dense - center).T).min() - peg.radius_m >= route_clearance_m - 1e-5
 
 
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=4)
 def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
-    field = {**FIELD, "seed": seed, "density_per_m2": 8.0, "box_share": 0.6, "clearance_m": 0.1}
+    field = {**FIELD, "seed": seed, "density_per_m2": 8.0, "box_fraction": 0.6, "clearance_m": 0.1}
     placed = [item.obstacle for item in place(scene(random_field=[field]), SNAKE)]
     assert {o.shape for o in placed} == {"cylinder", "box"}
     around = np.linspace(-1.0, 1.0, 41)
@@ -189,7 +189,7 @@ def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
     first, again = (place(scene(random_field=[FIELD])) for _ in range(2))
     assert first == again
     assert place(scene(random_field=[{**FIELD, "seed": 8}])) != first
-    two = place(scene(random_field=[FIELD, {**FIELD, "low_m": [3, -1], "high_m": [5, 1]}]))
+    two = place(scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}]))
     assert two[: len(first)] == first  # a second field does not stir the first
     assert {peg.obstacle.name for peg in two[len(first) :]} == {f"random_1_{k}" for k in range(20)}
     assert [p.obstacle.radius_m for p in two[len(first) :]] != [p.obstacle.radius_m for p in first]
@@ -209,7 +209,7 @@ def test_two_obstacles_with_one_name_are_refused() -> None:
 def test_a_wall_of_no_length_and_a_route_of_equal_points_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"`wall\.0`: `from_m` and `to_m` are the same point"):
         place(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
-    with pytest.raises(ConfigError, match=r"`route\.points_m`: .*no two neighbours"):
+    with pytest.raises(ConfigError, match=r"`route\.points_m`: .*no two neighbors"):
         route_of(scene(route={"kind": "waypoints", "points_m": [[0, 0], [0, 0]]}))
 
 

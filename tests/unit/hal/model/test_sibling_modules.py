@@ -1,4 +1,4 @@
-"""A plugin's file may import its neighbours, and they replace nothing."""
+"""A plugin's file may import its neighbors, and they replace nothing."""
 
 import subprocess
 from pathlib import Path

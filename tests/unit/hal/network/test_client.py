@@ -28,8 +28,10 @@ def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Cl
 def test_in_lockstep_a_tick_that_was_shown_many_times_is_answered_once_as_it_is_now(
     sessions: tuple[Session, Session],
 ) -> None:
-    ticks = shown(sessions, [clock(0)] * 50 + [clock(0, arming=1), clock(1, arming=1), clock(2, arming=1)])
-    assert [(c.tick, c.arming) if c is not None else None for c in (next(ticks) for _ in range(4))] == [
+    ticks = shown(
+        sessions, [clock(0)] * 50 + [clock(0, arm_session=1), clock(1, arm_session=1), clock(2, arm_session=1)]
+    )
+    assert [(c.tick, c.arm_session) if c is not None else None for c in (next(ticks) for _ in range(4))] == [
         *((0, 1), (1, 1), (2, 1)),
         None,
     ]
@@ -46,7 +48,7 @@ def test_in_lockstep_a_sample_of_a_later_tick_is_not_read_although_it_is_here(
     wait_until(lambda: poses.heard() and clocks.heard(), "the service listens", 5.0)
     poses.put(pose(3))
     seen: list[int | None] = []
-    for at in (clock(2, arming=1), msgspec.structs.replace(clock(3, arming=1), newest={keys.POSE: 3})):
+    for at in (clock(2, arm_session=1), msgspec.structs.replace(clock(3, arm_session=1), newest={keys.POSE: 3})):
         clocks.put(at)
         assert next(ticks) is not None
         found = client.read(feed)
@@ -55,7 +57,7 @@ def test_in_lockstep_a_sample_of_a_later_tick_is_not_read_although_it_is_here(
 
 
 def test_in_real_time_only_the_newest_counts(sessions: tuple[Session, Session]) -> None:
-    ticks = shown(sessions, [clock(tick, pace="realtime") for tick in range(5)])
+    ticks = shown(sessions, [clock(tick, clock_mode="realtime") for tick in range(5)])
     newest, nothing = next(ticks), next(ticks)
     assert newest is not None and newest.tick == 4 and nothing is None
 
@@ -69,10 +71,10 @@ def test_a_tick_that_was_commanded_before_is_reported_done_when_it_is_shown_agai
     publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
     wait_until(publisher.heard, "the service listens", 5.0)
     ticks = client.ticks(5.0)
-    for arming in (0, 1):
-        publisher.put(clock(0, arming=arming))
+    for arm_session in (0, 1):
+        publisher.put(clock(0, arm_session=arm_session))
         assert next(ticks) is not None
-        if arming == 0:
+        if arm_session == 0:
             client.commanded_tick = 0
         client.done(0)
     assert received(reports, "the tick reported done") == [Done(tick=0)]

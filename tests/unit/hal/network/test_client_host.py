@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES
@@ -35,7 +35,7 @@ from tests.unit.hal.rig import command, description, run_config, state
 pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
-def passive(points: SetPoints) -> bool:
+def passive(points: Setpoints) -> bool:
     return set(points.mode) == {Mode.PASSIVE}
 
 
@@ -69,7 +69,7 @@ def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
 
 def test_a_slow_participant_is_waited_for() -> None:
     """Guidance owes tick t only at the end of tick t + lag - 1, and no tick passes without it."""
-    config = run_config(services={"control": {}, "guidance": {"every_ticks": 5, "lag_ticks": 5}})
+    config = run_config(services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}})
     with running(config, max_ticks=40) as run, following(run.link, Follower()), open_session(run.link) as session:
         client = Client(session, "guidance")
         client.description()
@@ -126,7 +126,7 @@ def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_cl
 
 
 def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
-    with commanded(run_config(pace="realtime")) as (run, _):
+    with commanded(run_config(clock_mode="realtime")) as (run, _):
         answer = run.ask(keys.ESTOP, EstopRequest(who="passer-by"))
         assert answer.ok and answer.lifecycle == "estop"
         at = len(run.backend.enacted)
@@ -142,7 +142,7 @@ def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
 
 
 def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is_not() -> None:
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()) as control:
+    with running(run_config(clock_mode="realtime")) as run, following(run.link, Follower()) as control:
         run.arm()
         request = LeaseRequest(action="acquire", holder="teleop")
         answer = run.ask(keys.LEASE, request)
@@ -229,7 +229,7 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
 
 def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
     limit = LIMITS[SAMPLES] or 0
-    config = run_config(pace="realtime")
+    config = run_config(clock_mode="realtime")
     with meeting("worm", "worm") as (own, stranger):
         host = Host(config, GuardedBackend(LagBackend(config)), own)
         publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
@@ -255,7 +255,7 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
 
 def test_realtime_keeps_its_deadlines_on_average() -> None:
     """As many periods pass as there is time for, and are answered; how many are late is for the computer to say."""
-    config = run_config(pace="realtime", rate_hz=50.0)
+    config = run_config(clock_mode="realtime", rate_hz=50.0)
     with running(config, max_ticks=50) as run, following(run.link, Follower()):
         run.arm()
         wait_until(run.ended, "the end of the run")
@@ -271,7 +271,7 @@ def test_realtime_keeps_its_deadlines_on_average() -> None:
 
 def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold() -> None:
     """Also where nothing is armed: arming may be what its old samples prevent."""
-    with running(run_config(pace="realtime", rate_hz=50.0)) as run:
+    with running(run_config(clock_mode="realtime", rate_hz=50.0)) as run:
         run.backend.read_s = 0.03
         slow = "backend 'lag' takes 3"
         wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
@@ -281,7 +281,7 @@ def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold(
 
 
 def test_free_waits_for_nobody() -> None:
-    with running(run_config(pace="free")) as run:
+    with running(run_config(clock_mode="free")) as run:
         wait_until(lambda: run.backend.advanced > 200, "two hundred ticks without anybody")
         assert run.host.authority.state == "disarmed" and all(passive(points) for points in run.backend.enacted)
 

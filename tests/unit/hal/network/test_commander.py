@@ -34,8 +34,8 @@ def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
     assert feed.newest() is None
 
 
-def naming(tick: int, joints_tick: int, arming: int = 1) -> Clock:
-    return clock(tick, arming=arming, newest={keys.JOINTS: joints_tick})
+def naming(tick: int, joints_tick: int, arm_session: int = 1) -> Clock:
+    return clock(tick, arm_session=arm_session, newest={keys.JOINTS: joints_tick})
 
 
 def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
@@ -68,14 +68,14 @@ def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never
         with pytest.raises(StalledError, match="joints of tick 7 was named by the clock of tick 7 and never came"):
             client.read(feed)
         hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
-        clocks.put(naming(0, 0, arming=0))  # the HAL started over
+        clocks.put(naming(0, 0, arm_session=0))  # the HAL started over
         again = next(ticks)
         assert again is not None and again.tick == 0 and client.read(feed) is None
         wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
 
 
 def test_a_commander_asks_for_a_free_lease_and_gives_up_one_that_passed_on() -> None:
-    with running(run_config(pace="realtime", services={})) as run, open_session(run.link) as session:
+    with running(run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
         client = Client(session, "pilot")
         commander = Commander(client, client.description())
         other = LeaseRequest(action="acquire", holder="teleop", priority=200)

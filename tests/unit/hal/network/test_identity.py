@@ -46,7 +46,7 @@ def test_a_service_of_a_run_does_not_take_a_forged_description(monkeypatch: pyte
 def test_a_run_is_armed_over_its_private_channel() -> None:
     ours, its = socket_pair()
     starter = StarterEnd(ours)
-    with running(run_config(pace="realtime"), starter=HostEnd(its)) as run, following(run.link, Follower()):
+    with running(run_config(clock_mode="realtime"), starter=HostEnd(its)) as run, following(run.link, Follower()):
 
         def ready() -> bool:
             starter.take_in()

@@ -39,11 +39,11 @@ from tests.unit.hal.strategies import plain_example
 
 ROBOT = description()  # three joints, four links
 X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-CLOCK = clock(3, pace="realtime")
+CLOCK = clock(3, clock_mode="realtime")
 
 
 def contacts(link: int) -> Contacts:
-    return Contacts(tick=0, stamp_ns=0, contacts=[contact(link)])
+    return Contacts(tick=0, timestamp_ns=0, contacts=[contact(link)])
 
 
 def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:
@@ -53,11 +53,13 @@ def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGH
 
 
 def imu(link: list[int], rates: int) -> Imu:
-    return Imu(tick=0, stamp_ns=0, link=link, angular_velocity_rad_s=[X] * rates, acceleration_m_s2=[X] * len(link))
+    return Imu(tick=0, timestamp_ns=0, link=link, angular_velocity_rad_s=[X] * rates, acceleration_m_s2=[X] * len(link))
 
 
 def trajectory(*path: tuple[float, float]) -> Trajectory:
-    return Trajectory(tick=0, stamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False)
+    return Trajectory(
+        tick=0, timestamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False
+    )
 
 
 def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthImage:
@@ -91,7 +93,7 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (image(bytes(12), turned=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
         (trajectory((0.0, 0.0), (1.0, 0.0)), None),
         (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
-        (Intent(stamp_ns=0, who="operator"), None),
+        (Intent(timestamp_ns=0, who="operator"), None),
     ],
 )
 def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
@@ -121,7 +123,7 @@ def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out()
         asked, felt = hal.publisher(keys.INTENT, Intent), hal.publisher(keys.JOINTS, JointState)
         wait_until(lambda: clocks.heard() and asked.heard() and felt.heard(), "everybody heard")
         for speed in (0.1, 0.2):
-            asked.put(Intent(stamp_ns=5, who="operator", speed_m_s=speed))
+            asked.put(Intent(timestamp_ns=5, who="operator", speed_m_s=speed))
         felt.put(state(ROBOT, 0.1, tick=3))
         felt.put(msgspec.structs.replace(state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
         ticks = client.ticks()
@@ -172,8 +174,8 @@ def test_large_images_arrive_where_they_are_expected() -> None:
     """A robot's own processes know its cameras; to everybody else more than a MiB is too long."""
     endpoint, largest = free_endpoint(), 2 * 1280 * 960
     with (
-        open_session(Link(endpoint, "worm", listen=True, largest_bytes=largest)) as hal,
-        open_session(Link(endpoint, "worm", largest_bytes=largest)) as session,
+        open_session(Link(endpoint, "worm", listen=True, max_bytes=largest)) as hal,
+        open_session(Link(endpoint, "worm", max_bytes=largest)) as session,
         open_session(Link(endpoint, "worm")) as small,
     ):
         readers = [each.reader(keys.depth("head"), DepthImage) for each in (session, small)]
@@ -186,7 +188,7 @@ def test_large_images_arrive_where_they_are_expected() -> None:
 
 
 def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
-    config, answers = run_config(pace="realtime", services={}), list[Answer]()
+    config, answers = run_config(clock_mode="realtime", services={}), list[Answer]()
     with meeting("worm") as (session,):
         host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
         host.answer(LeaseRequest(action="acquire", holder="control"), answers.append)

@@ -20,7 +20,7 @@ def test_half_of_rated_torque_is_held_for_ever_at_80_degrees() -> None:
     heat = windings()
     heat.pass_time(3600.0, np.array([2.0**2]))
     assert heat.winding_c[0] == pytest.approx(80.0)
-    assert heat.share_left() is None
+    assert heat.remaining_fraction() is None
 
 
 def test_it_is_exact_whatever_the_step() -> None:
@@ -36,16 +36,16 @@ def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cool
     heat = windings(2)
     for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
         heat.winding_c[1] = celsius
-        share = heat.share_left()
+        share = heat.remaining_fraction()
         assert (share is not None) is reported
-        assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.share_left(celsius)])
+        assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.remaining_fraction(celsius)])
 
 
 def test_a_motor_at_stall_fades_and_never_overheats() -> None:
     heat = windings()
     shares: list[float] = []
     for _ in range(60_000):
-        shares.append(LIMITS.share_left(float(heat.winding_c[0])))
+        shares.append(LIMITS.remaining_fraction(float(heat.winding_c[0])))
         heat.pass_time(0.01, np.array([(4.0 * shares[-1]) ** 2]))
     assert np.abs(np.diff(shares)).max() < 0.01
     assert heat.winding_c[0] < LIMITS.stop_at_c - 5 and shares[-1] < 0.8
@@ -73,10 +73,12 @@ def test_a_warm_module_at_work_takes_more_from_its_supply() -> None:
 
 
 def test_one_motor_may_warm_up_otherwise_than_the_others() -> None:
-    heat = windings(2, rated_nm=2.0, rise_at_rated_k=100.0, time_constant_s=30.0, derate_from_c=50.0, board_share=0.5)
+    heat = windings(
+        2, rated_nm=2.0, rise_at_rated_k=100.0, time_constant_s=30.0, derate_from_c=50.0, board_fraction=0.5
+    )
     heat.pass_time(30.0, np.array([4.0, 4.0]))
     assert heat.winding_c == pytest.approx([20 + 100 * (1 - np.exp(-1)), 20 + 60 * (1 - np.exp(-0.5))])
-    share = heat.share_left()
+    share = heat.remaining_fraction()
     assert share is not None and share[0] < 1.0 and share[1] == 1.0, "each by its own limits"
     assert (heat.board_c() - 20) / (heat.winding_c - 20) == pytest.approx([0.5, 0.3])
     assert heat.power_w(np.array([2.0, 2.0]), np.zeros(2)) == pytest.approx([48.0, 12.0])

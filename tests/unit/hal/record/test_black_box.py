@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
@@ -20,7 +20,7 @@ ROBOT = description()
 
 
 def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Decision:
-    return Decision(SetPoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
+    return Decision(Setpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
 
 
 def digest(*rows: tuple[int, Decision], angle: float = 0.0) -> str:
@@ -49,7 +49,7 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
             others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
         if tick in (3, 6):
             touches = [contact(obstacle="a", force_l=(3.0, 4.0, 0.0)), contact(obstacle="a"), contact(obstacle="b")]
-            others[keys.CONTACTS] = Contacts(tick=tick, stamp_ns=0, contacts=touches if tick == 3 else [])
+            others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=touches if tick == 3 else [])
         joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
         box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
     columns = all_rows(box)
@@ -169,7 +169,7 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
 def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
     robot = description(chain__modules=100)
     box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
-    reported = Decision(SetPoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    reported = Decision(Setpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
     for tick in range(300):
         box.record(tick, tick, row, reported)
     peaks = [0] * 700
@@ -186,6 +186,6 @@ def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
 
 def test_the_force_over_50_ms_is_kept_where_the_sensor_tells_it() -> None:
     box = BlackBox(ROBOT)
-    touches = Contacts(tick=0, stamp_ns=0, contacts=[contact(force_l=(3.0, 4.0, 0.0))], felt_n=1.5)
+    touches = Contacts(tick=0, timestamp_ns=0, contacts=[contact(force_l=(3.0, 4.0, 0.0))], measured_force_n=1.5)
     box.record(0, 0, Samples(state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
     assert all_rows(box)["contact_peak_n"].tolist() == [1.5]

@@ -12,7 +12,7 @@ from threading import Event
 import msgspec
 import pytest
 
-from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.programs.host_program import record_of
 from snakesim_hal.run_log import writer as under_test
 from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
@@ -25,7 +25,7 @@ from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.rig import description, run_config, state
 
 ROBOT = description()
-TOLD = Decision(SetPoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
+TOLD = Decision(Setpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
 ROW = BlackBox(ROBOT).layout.row_bytes
 
 
@@ -60,7 +60,7 @@ def memory() -> Iterator[int]:
     handle = os.memfd_create("test")
     yield handle
     for thread in [thread for thread in threading.enumerate() if thread.name == "recorder"]:
-        thread.join(5.0)  # one that hung would write to whatever has this number next
+        thread.join(5.0)  # one that suspended would write to whatever has this number next
     os.close(handle)
 
 
@@ -165,7 +165,7 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
 ) -> None:
     monkeypatch.setattr(under_test, "CLOSE_LIMIT_S", 0.3)
     with (
-        running(run_config(pace="lockstep"), max_ticks=75) as run,
+        running(run_config(clock_mode="lockstep"), max_ticks=75) as run,
         following(run.link, Follower()),
     ):
         with HostRecordWriter(run.host.black_box, run.host.description, partial(record_of, run.host), tmp_path, memory):

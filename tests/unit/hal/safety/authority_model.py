@@ -62,7 +62,7 @@ class Model(RuleBasedStateMachine):
 
     authority: Authority
     action: str
-    may_lose: int
+    max_isolated: int
 
     def __init__(self) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class Model(RuleBasedStateMachine):
         self.tick = 0
         self.sequence = 0
         self.state: LifecycleState = "disarmed"
-        self.arming = 0
+        self.arm_session = 0
         self.seen_tick = 0  # of the newest joint state
         self.armed_tick = -1  # of the state that was the newest at the last arming
         self.holder: str | None = None
@@ -89,7 +89,7 @@ class Model(RuleBasedStateMachine):
         self.faults = 0  # kept since the last clear
         self.hold_at = [0.0] * JOINTS
         self.halt: list[list[float]] | None = None  # wanted angle, its velocity, target: of every joint
-        self.stamp_ns = 0
+        self.timestamp_ns = 0
         self.good: list[tuple[float, float] | None] = [None] * JOINTS  # angle and when it was taken
         self.strays: list[list[tuple[float, float]]] = [[] for _ in range(JOINTS)]
         self.same: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]  # state, time, target
@@ -114,10 +114,10 @@ class Model(RuleBasedStateMachine):
         self.state = following
 
     def mode_before(self, i: int) -> Mode:
-        return Mode.PASSIVE if self.last is None else self.last.set_points.mode[i]
+        return Mode.PASSIVE if self.last is None else self.last.setpoints.mode[i]
 
     def target_before(self, i: int) -> float:
-        return 0.0 if self.last is None else self.last.set_points.target[i]
+        return 0.0 if self.last is None else self.last.setpoints.target[i]
 
     def beginning_of_halt(self, i: int) -> list[float]:
         angle, velocity, torque = (column[i] for column in self.measured)
@@ -160,7 +160,7 @@ class Model(RuleBasedStateMachine):
         if self.same[i] and self.same[i][-1][0] != state_:
             self.same[i] = []
         self.same[i].append((state_, taken_s, self.target_before(i)))
-        limit = self.last.set_points.torque_limit_nm[i] if self.last else TORQUE
+        limit = self.last.setpoints.torque_limit_nm[i] if self.last else TORQUE
         targets = [target for _, _, target in self.same[i]]
         ways = [max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))]
         far = [taken for (_, taken, _), way in zip(self.same[i], ways, strict=True) if way > FAR / 4]
@@ -180,7 +180,7 @@ class Model(RuleBasedStateMachine):
         """Whether the robot goes on without these joints, too."""
         if joints <= self.aside:
             return True
-        if self.state != "armed" or len(self.aside | joints) > self.may_lose:
+        if self.state != "armed" or len(self.aside | joints) > self.max_isolated:
             return False
         self.aside |= joints
         self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
@@ -200,8 +200,8 @@ class Model(RuleBasedStateMachine):
         assert answer.reason and answer.epoch == self.epoch and answer.lifecycle == self.state
 
     def check_aside(self, decision: Decision) -> None:
-        points = decision.set_points
-        assert points.isolated == self.aside and len(self.aside) <= self.may_lose
+        points = decision.setpoints
+        assert points.isolated == self.aside and len(self.aside) <= self.max_isolated
         assert self.authority.isolated == [f"joint_{i + 1}" for i in sorted(self.aside)]
         for i in self.aside:
             assert (points.mode[i], points.target[i], points.torque_limit_nm[i]) == (Mode.PASSIVE, 0.0, 0.0)
@@ -216,42 +216,42 @@ class Model(RuleBasedStateMachine):
     def check_safe(self, decision: Decision) -> None:
         assert decision.sequence is None and not decision.limited
         action = self.action if self.state == "fault" and self.halt is not None else "passive"
-        assert self.of_the_rest(decision.set_points.torque_limit_nm) == self.torques()
+        assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
         if action == "hold":
-            assert set(self.of_the_rest(decision.set_points.mode)) <= {Mode.POSITION}
+            assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION}
             held = [self.halt_for_a_period(i) for i in range(JOINTS)]
-            assert self.of_the_rest(decision.set_points.target) == pytest.approx(self.of_the_rest(held))
-            assert all(abs(target) <= ANGLE for target in decision.set_points.target)
+            assert self.of_the_rest(decision.setpoints.target) == pytest.approx(self.of_the_rest(held))
+            assert all(abs(target) <= ANGLE for target in decision.setpoints.target)
             return
         mode = Mode.VELOCITY if action == "damp" else Mode.PASSIVE
-        assert set(self.of_the_rest(decision.set_points.mode)) <= {mode}
-        assert decision.set_points.target == [0.0] * JOINTS
+        assert set(self.of_the_rest(decision.setpoints.mode)) <= {mode}
+        assert decision.setpoints.target == [0.0] * JOINTS
 
     def check_held(self, decision: Decision, angle_rad: list[float]) -> None:
-        assert set(self.of_the_rest(decision.set_points.mode)) <= {Mode.POSITION} and not decision.limited
+        assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION} and not decision.limited
         held = [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
-        assert self.of_the_rest(decision.set_points.target) == self.of_the_rest(held)
-        assert self.of_the_rest(decision.set_points.torque_limit_nm) == self.torques()
+        assert self.of_the_rest(decision.setpoints.target) == self.of_the_rest(held)
+        assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
 
     def check_commanded(self, decision: Decision, sent: JointCommand) -> None:
         for i in self.aside:
             assert decision.limited.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
-        assert self.of_the_rest(decision.set_points.mode) == self.of_the_rest(sent.mode)
+        assert self.of_the_rest(decision.setpoints.mode) == self.of_the_rest(sent.mode)
         for i in self.of_the_rest(ALL):
-            applied = decision.set_points.torque_limit_nm[i]
-            before = TORQUE if self.last is None else self.last.set_points.torque_limit_nm[i]
+            applied = decision.setpoints.torque_limit_nm[i]
+            before = TORQUE if self.last is None else self.last.setpoints.torque_limit_nm[i]
             allowed = TORQUE if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
             cool = TORQUE * self.shares[i] + TINY
             assert 0.0 <= applied <= min(cool, allowed) and applied <= before + TORQUE_RATE * PERIOD_S + TINY
             if sent.mode[i] is not Mode.PASSIVE:
                 self.check_target(i, decision, sent.mode[i], sent.target[i], bound_by_heat=min(TORQUE, allowed) > cool)
             else:
-                assert decision.set_points.target[i] == 0.0 and i not in decision.limited
+                assert decision.setpoints.target[i] == 0.0 and i not in decision.limited
 
     def check_target(self, i: int, decision: Decision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
         """Inside the limits, no faster than allowed, as near to what is wanted as that permits; else named."""
         angle, velocity, torque = (column[i] for column in self.measured)
-        target = decision.set_points.target[i]
+        target = decision.setpoints.target[i]
         if mode is Mode.POSITION:
             low, high = (within(angle + side * FAR, -ANGLE, ANGLE) for side in (-1, 1))
             step, start = SPEED * PERIOD_S, angle + (torque + DAMPING * velocity) / STIFFNESS
@@ -259,7 +259,7 @@ class Model(RuleBasedStateMachine):
             low, high = max(-SPEED, -stoppable(ANGLE + angle)), min(SPEED, stoppable(ANGLE - angle))
             step, start = ACCELERATION * PERIOD_S, velocity + torque / VELOCITY_GAIN
         else:
-            most = decision.set_points.torque_limit_nm[i]
+            most = decision.setpoints.torque_limit_nm[i]
             low, high = -stoppable(ANGLE + angle) - velocity, stoppable(ANGLE - angle) - velocity  # gain 1 N·m·s/rad
             if angle >= ANGLE:
                 low, high = min(low, min(high, 0.0)), min(high, 0.0)
@@ -267,8 +267,8 @@ class Model(RuleBasedStateMachine):
                 low, high = max(low, 0.0), max(high, max(low, 0.0))
             low, high = within(low, -most, most), within(high, -most, most)
             step, start = TORQUE_RATE * PERIOD_S, torque
-        if self.last is not None and self.last.set_points.mode[i] is mode:
-            start = self.last.set_points.target[i]
+        if self.last is not None and self.last.setpoints.mode[i] is mode:
+            start = self.last.setpoints.target[i]
         assert math.isfinite(target) and low <= target <= high
         assert abs(target - start) <= step + TINY or target in (low, high)  # the limits themselves outrank the rate
         assert abs(target - within(within(wanted, start - step, start + step), low, high)) <= TINY

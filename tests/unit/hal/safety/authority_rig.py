@@ -23,12 +23,12 @@ class Rig:
         self.now_ns = 0
         self.tick = 0
         self.sequence = 0
-        self.stamp_ns = 0
+        self.timestamp_ns = 0
 
     def observe(self, *values: Any, **other: Any) -> None:
         """A state so much later than the one before that the joints may have come from anywhere."""
-        self.stamp_ns += 10**9
-        self.authority.observe(state(self.robot, *values, stamp_ns=self.stamp_ns, **other))
+        self.timestamp_ns += 10**9
+        self.authority.observe(state(self.robot, *values, timestamp_ns=self.timestamp_ns, **other))
 
     def acquire(self, holder: str = "control", priority: int = 100) -> Answer:
         return self.authority.on_lease(LeaseRequest(action="acquire", holder=holder, priority=priority), self.now_ns)
@@ -36,7 +36,12 @@ class Rig:
     def send(self, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> str | None:
         self.sequence += 1
         authority = self.authority
-        values = {"sequence": self.sequence, "lease_epoch": authority.lease.epoch, "arming": authority.arming, **other}
+        values = {
+            "sequence": self.sequence,
+            "lease_epoch": authority.lease.epoch,
+            "arm_session": authority.arm_session,
+            **other,
+        }
         values = {"tick": self.tick, **values}
         asked = command(self.robot, target, mode, **values)
         return self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=0)
@@ -71,7 +76,7 @@ def armed(**robot: Any) -> Rig:
 
 
 def modes(decision: Decision) -> set[Mode]:
-    return set(decision.set_points.mode)
+    return set(decision.setpoints.mode)
 
 
 def receive(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:

@@ -1,11 +1,11 @@
-"""A robot of three joints, and its limits as the gate has them."""
+"""A robot of three joints, and its limits as the limiter has them."""
 
 from typing import Any
 
 import numpy as np
 
-from snakesim_hal.safety.gate import Applied, JointLimits, Measured, bumpless_target, limit, why_limited
 from snakesim_hal.safety.lease import Lease
+from snakesim_hal.safety.limiter import Applied, JointLimits, Measured, bumpless_target, limit, why_limited
 from snakesim_hal.wire.messages import JointCommand, Mode
 from tests.unit.hal.rig import description
 

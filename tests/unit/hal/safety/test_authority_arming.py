@@ -32,7 +32,7 @@ def test_the_way_to_armed() -> None:
         assert answer is None or (not answer.ok and answer.reason == "; ".join(against))
         assert rig.authority.state == "disarmed"
     answer = rig.arm()
-    assert answer.ok and answer.lifecycle == "armed" and rig.authority.arming == 1
+    assert answer.ok and answer.lifecycle == "armed" and rig.authority.arm_session == 1
 
 
 def test_a_stopped_robot_is_armed_only_after_a_clear_and_says_so() -> None:
@@ -87,7 +87,7 @@ def test_a_robot_that_does_not_know_its_joints_is_not_armed_and_does_not_stay_ar
     assert rig.authority.state == "fault" and decision.sequence is None
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
     assert joint in rig.authority.faults[0].cause
-    assert np.isfinite(decision.set_points.target).all()
+    assert np.isfinite(decision.setpoints.target).all()
 
 
 @pytest.mark.parametrize("column", ["angle", "velocity", "torque", "valid", "age_ns"])
@@ -98,7 +98,7 @@ def test_a_state_of_another_number_of_joints_is_no_state(column: str, length: in
     rig.observe(**{column: values})
     decision = rig.pass_tick()
     assert rig.authority.state == "fault" and rig.authority.why == "no joint state of 3 joints"
-    assert decision.set_points.target == [0.0] * JOINTS
+    assert decision.setpoints.target == [0.0] * JOINTS
 
 
 def test_only_the_joints_that_are_not_known_are_named() -> None:
@@ -134,7 +134,7 @@ def test_arming_is_refused_while_a_target_is_far_and_names_the_joint() -> None:
 
 def test_a_first_command_may_use_the_whole_torque() -> None:
     rig = armed()
-    assert rig.tick_with(0.1).set_points.torque_limit_nm == [4.0] * JOINTS
+    assert rig.tick_with(0.1).setpoints.torque_limit_nm == [4.0] * JOINTS
 
 
 def test_the_very_first_decision_is_passive() -> None:
@@ -150,8 +150,8 @@ def test_right_after_arming_the_pose_is_held_until_a_new_command_comes() -> None
     rig = armed()
     decision = rig.pass_tick()
     assert decision.sequence is None  # the command from before arming is not enacted
-    assert modes(decision) == {Mode.POSITION} and decision.set_points.target == [0.1] * JOINTS
-    assert rig.tick_with(0.11).set_points.target == pytest.approx([0.11] * JOINTS)
+    assert modes(decision) == {Mode.POSITION} and decision.setpoints.target == [0.1] * JOINTS
+    assert rig.tick_with(0.11).setpoints.target == pytest.approx([0.11] * JOINTS)
 
 
 def test_arming_needs_commands_that_still_come() -> None:
@@ -170,7 +170,7 @@ def test_arming_needs_commands_that_still_come() -> None:
 @pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
 def test_arming_is_refused_to_a_stream_that_moves(mode: Mode) -> None:
     rig = commanded([0.1, 0.0, 0.1], [Mode.POSITION, mode, Mode.PASSIVE])
-    reason = f"joint_2 is commanded in mode {mode.name.lower()}; it must hold its position at arming"
+    reason = f"joint_2 is commanded in mode {mode.name.lower()}; it must hold its position at arm_session"
     assert rig.arm().reason == reason and rig.authority.state == "disarmed"
 
 
@@ -180,11 +180,11 @@ def test_a_passive_stream_may_be_armed_whatever_its_targets() -> None:
 
 def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_lease() -> None:
     rig = armed()
-    rig.tick_with(0.1, arming=1)
+    rig.tick_with(0.1, arm_session=1)
     for other in (0, 2, 0, 2):
-        assert rig.send(0.2, arming=other) == "before_arming"
-        assert rig.pass_tick().set_points.target == pytest.approx([0.1] * JOINTS)
-    rig.tick_with(0.2, arming=0)
+        assert rig.send(0.2, arm_session=other) == "before_arming"
+        assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINTS)
+    rig.tick_with(0.2, arm_session=0)
     assert rig.authority.state == "fault" and rig.authority.faults[0].what == "lease_expired"
     assert rig.authority.rejected == {"before_arming": 5}
     assert (rig.authority.accepted, rig.authority.standby) == (1, 1)
@@ -210,8 +210,8 @@ def test_a_new_holder_of_the_lease_must_command_itself_from_sequence_0_on() -> N
 def test_while_disarmed_it_does_not_matter_which_arming_a_command_names() -> None:
     rig = armed()
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
-    for arming in (0, 1, 2):
-        assert rig.send(0.1, arming=arming) is None
+    for arm_session in (0, 1, 2):
+        assert rig.send(0.1, arm_session=arm_session) is None
 
 
 def test_arming_begins_a_new_term_of_the_lease() -> None:
@@ -235,7 +235,7 @@ def test_a_command_that_names_no_arming_never_moves_an_armed_robot() -> None:
     bare = command(ROBOT, 0.2, tick=rig.tick, sequence=50, lease_epoch=rig.authority.lease.epoch)
     assert rig.authority.offer(bare, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "before_arming"
     assert rig.authority.rejected == {"before_arming": 1}
-    assert rig.pass_tick().set_points.target == pytest.approx([0.1] * JOINTS)
+    assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINTS)
 
 
 def test_a_command_that_was_under_way_when_the_robot_was_armed_is_nobodys_mistake() -> None:
@@ -245,14 +245,14 @@ def test_a_command_that_was_under_way_when_the_robot_was_armed_is_nobodys_mistak
     rig.acquire()
     rig.send(0.1)
     assert rig.arm().ok
-    assert rig.send(0.1, arming=0) == "before_arming"
+    assert rig.send(0.1, arm_session=0) == "before_arming"
     assert rig.authority.standby == 2 and not rig.authority.rejected
     rig.tick = 8
-    assert rig.send(0.1, arming=0) == "before_arming"
+    assert rig.send(0.1, arm_session=0) == "before_arming"
     assert rig.authority.standby == 2 and rig.authority.rejected == {"before_arming": 1}
 
 
-@pytest.mark.parametrize("wrong", [{"arming": 0}, {"arming": 2}, {"layout": "other"}, {"tick": 10**6}])
+@pytest.mark.parametrize("wrong", [{"arm_session": 0}, {"arm_session": 2}, {"layout": "other"}, {"tick": 10**6}])
 def test_a_refused_command_does_not_make_the_next_good_one_a_replay(wrong: dict[str, Any]) -> None:
     rig = armed()
     rig.pass_tick()
@@ -268,7 +268,7 @@ def test_what_counted_in_an_earlier_arming_does_not_count_in_the_next() -> None:
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
-    assert rig.arm().ok and rig.authority.arming == 2
+    assert rig.arm().ok and rig.authority.arm_session == 2
     assert rig.authority.decide(rig.tick).sequence is None
     assert rig.authority.decide().sequence is None
 
@@ -294,7 +294,7 @@ def test_no_arming_before_the_motors_were_told_of_a_stop(stop: str) -> None:
     rig.send(0.1)
     answer = rig.arm()
     assert (answer.ok, answer.refusal) == (False, "not_ready") and "have not received the stop" in answer.reason
-    assert rig.authority.decide().set_points.mode == [Mode.PASSIVE] * JOINTS
+    assert rig.authority.decide().setpoints.mode == [Mode.PASSIVE] * JOINTS
     assert rig.arm().ok
 
 

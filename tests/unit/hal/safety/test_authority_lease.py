@@ -17,12 +17,12 @@ def test_in_lockstep_a_command_waits_for_its_tick() -> None:
     rig.send(0.11, tick=0)
     rig.tick = 1
     rig.send(0.12, tick=1)
-    assert rig.authority.decide(0).set_points.target == pytest.approx([0.11] * JOINTS)
-    assert rig.authority.decide(1).set_points.target == pytest.approx([0.12] * JOINTS)
+    assert rig.authority.decide(0).setpoints.target == pytest.approx([0.11] * JOINTS)
+    assert rig.authority.decide(1).setpoints.target == pytest.approx([0.12] * JOINTS)
 
 
 def test_in_lockstep_the_last_command_goes_on_when_a_flood_has_pushed_it_out() -> None:
-    """Falling back to the pose at arming would be a jump that no gate has limited."""
+    """Falling back to the pose at arming would be a jump that no limiter has limited."""
     rig = armed()
     before = rig.authority.decide(0)
     for tick in range(5):
@@ -33,7 +33,7 @@ def test_in_lockstep_the_last_command_goes_on_when_a_flood_has_pushed_it_out() -
     for _ in range(COMMANDS_KEPT + 1):
         rig.send(0.1)
     decision = rig.authority.decide(4)
-    assert decision.sequence == before.sequence and decision.set_points.target == pytest.approx([0.3] * JOINTS)
+    assert decision.sequence == before.sequence and decision.setpoints.target == pytest.approx([0.3] * JOINTS)
 
 
 # --- the lease -------------------------------------------------------------------------------------------------
@@ -48,7 +48,7 @@ def test_commands_keep_the_lease_and_silence_ends_it_with_a_fault() -> None:
         assert rig.pass_tick().sequence == rig.sequence
     decision = rig.pass_tick()
     assert rig.authority.state == "fault" and decision.sequence is None
-    assert modes(decision) == {Mode.VELOCITY} and decision.set_points.target == [0.0] * JOINTS
+    assert modes(decision) == {Mode.VELOCITY} and decision.setpoints.target == [0.0] * JOINTS
     (fault,) = rig.authority.faults
     assert (fault.what, fault.tick) == ("lease_expired", rig.tick)
     assert fault.cause == "lease of control expired: no accepted command for 50 ms"
@@ -66,14 +66,14 @@ def test_refused_commands_neither_keep_the_lease_nor_reach_a_motor(wrong: dict[s
     for _ in range(4):
         assert rig.send(**{"target": 0.2, **wrong}) is not None
         decision = rig.pass_tick()
-        assert decision.sequence == good and decision.set_points.target == pytest.approx([0.1] * JOINTS)
+        assert decision.sequence == good and decision.setpoints.target == pytest.approx([0.1] * JOINTS)
     rig.tick_with(**{"target": 0.2, **wrong})
     assert rig.authority.state == "fault"
     assert sum(rig.authority.rejected.values()) == 5
 
 
 def test_asking_to_renew_is_not_commanding() -> None:
-    """A process whose controller hangs but whose lease thread lives must not keep the last set-points going."""
+    """A process whose controller hangs but whose lease thread lives must not keep the last setpoints going."""
     rig = armed()
     rig.send(0.1)
     for _ in range(10):

@@ -45,7 +45,7 @@ KEPT = 4  # commands: fewer than in earnest, so that a few are a flood
 
 HOLDERS = st.sampled_from(["control", "teleop", "mission"])
 NUMBERS = st.floats(-2, 2) | st.floats(-6, 6) | st.sampled_from([0.0, 1e5, -1e5, 5e-324, 1.5, -1.5])
-DEFECTS = ("epoch", "replayed", "future", "stale", "layout", "length", "finite")  # in the order of the gate's checks
+DEFECTS = ("epoch", "replayed", "future", "stale", "layout", "length", "finite")  # in the order of the limiter's checks
 REASONS = {
     "epoch": "wrong_epoch",
     "replayed": "replayed",
@@ -75,12 +75,12 @@ class Everything(Model):
         action=st.sampled_from(["passive", "damp", "hold"]),
         first_epoch=st.sampled_from([0, 1_800_000_000_000]),
         lag=st.sampled_from([None, None, 0, 1, 2]),
-        may_lose=st.sampled_from([0, 0, 1, 2]),
+        max_isolated=st.sampled_from([0, 0, 1, 2]),
         at_once=often(True, False),
     )
-    def begin(self, action: str, first_epoch: int, lag: int | None, may_lose: int, at_once: bool) -> None:
-        self.robot = description(safety__action=action, safety__may_lose_joints=may_lose)
-        self.may_lose = may_lose
+    def begin(self, action: str, first_epoch: int, lag: int | None, max_isolated: int, at_once: bool) -> None:
+        self.robot = description(safety__action=action, safety__max_isolated_joints=max_isolated)
+        self.max_isolated = max_isolated
         self.action = action
         self.lag = lag  # in lockstep; None: the newest command counts
         kept, under_test.COMMANDS_KEPT = under_test.COMMANDS_KEPT, KEPT
@@ -111,7 +111,7 @@ class Everything(Model):
     ) -> None:
         valid, age_ns = [True] * JOINTS, [FRESH_NS] * JOINTS
         shown = list(angle)
-        self.stamp_ns += later_ns
+        self.timestamp_ns += later_ns
         match failure:
             case "valid":
                 valid[joint] = False
@@ -127,7 +127,7 @@ class Everything(Model):
                 age_ns = []
             case _:
                 pass
-        when = {"tick": self.tick, "stamp_ns": self.stamp_ns}
+        when = {"tick": self.tick, "timestamp_ns": self.timestamp_ns}
         seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, **when)
         self.authority.observe(seen)
         self.seen_tick = self.tick
@@ -137,7 +137,7 @@ class Everything(Model):
         measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
         unknown, strayed, stuck = set[int](), set[int](), set[int]()
         for i in range(JOINTS):
-            taken_s = (self.stamp_ns - age_ns[i]) * 1e-9
+            taken_s = (self.timestamp_ns - age_ns[i]) * 1e-9
             frozen = self.is_frozen(i, (shown[i], velocity[i], torque[i]), taken_s)
             sound = failure is None or i != joint
             believed = sound and self.believe(i, angle[i], taken_s)
@@ -223,7 +223,7 @@ class Everything(Model):
         near=st.booleans(),
         defects=st.sets(st.sampled_from(DEFECTS), max_size=2),
         broken=st.booleans(),
-        arming=often(0, None, -1, 1),  # None: the command names none
+        arm_session=often(0, None, -1, 1),  # None: the command names none
         back=often(0, 1, 2),
         times=often(1, 6),
     )
@@ -235,7 +235,7 @@ class Everything(Model):
         near: bool,
         defects: set[str],
         broken: bool,
-        arming: int | None,
+        arm_session: int | None,
         back: int,
         times: int,
     ) -> None:
@@ -247,7 +247,7 @@ class Everything(Model):
             wanted = wanted[1:]
         if "finite" in defects:
             wanted = [[NAN, INF, -INF][self.sequence % 3], *wanted[1:]]
-        meant = 0 if arming is None else max(self.arming + arming, 0)
+        meant = 0 if arm_session is None else max(self.arm_session + arm_session, 0)
         for _ in range(times):
             self.sequence += 1
             asked = command(
@@ -259,7 +259,7 @@ class Everything(Model):
                 lease_epoch=self.epoch + 1 if "epoch" in defects else self.epoch,
                 layout="of another robot" if "layout" in defects else self.robot.layout,
                 torque_limit_nm=torque_limit,
-                arming=meant,
+                arm_session=meant,
             )
             self.offer(asked, LEASE_NS + 1 if "stale" in defects else LEASE_NS, defects)
 
@@ -276,7 +276,7 @@ class Everything(Model):
             assert refusal == expected and self.authority.rejected[expected] == counted + 1
             self.rejected += 1
             return
-        if self.state == "armed" and asked.arming != self.arming:
+        if self.state == "armed" and asked.arm_session != self.arm_session:
             assert refusal == "before_arming"
             self.rejected += asked.tick > self.armed_tick
             return
@@ -306,7 +306,7 @@ class Everything(Model):
             (word, i) for word, i in self.wrong if word == "leak" or (word == "overheated" and i not in self.aside)
         }
         weak = any(health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths)
-        ready = ready and not wrong and not weak and (self.reported or self.arming == 0)
+        ready = ready and not wrong and not weak and (self.reported or self.arm_session == 0)
         if ready and self.heard is not None:
             heard_ns, asked = self.heard
             ready = self.now_ns - heard_ns <= LEASE_NS and all(
@@ -325,7 +325,7 @@ class Everything(Model):
         answer = self.authority.on_lifecycle(request, self.now_ns)
         if ready:
             self.leave_for("armed")
-            self.arming += 1
+            self.arm_session += 1
             self.armed_tick = self.seen_tick
             self.heard = None
             self.since_arming, self.counting = [], None
@@ -461,7 +461,7 @@ class Everything(Model):
             return
         found = self.authority
         assert found.state == self.state, f"{found.state}, not {self.state}: {found.why}"
-        assert found.arming == self.arming
+        assert found.arm_session == self.arm_session
         expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
         assert found.lease.epoch == self.epoch  # the model's only ever grows
         assert (found.lease.holder, found.lease.live(self.now_ns)) == (self.holder, self.live)
@@ -469,7 +469,7 @@ class Everything(Model):
         assert found.why and len(found.why) <= 500
         assert len(found.faults) == self.faults and all(len(fault.cause) <= 500 for fault in found.faults)
         assert found.rejected.total() == self.rejected
-        assert found.accepted == len(self.since_arming) or found.arming > 1
+        assert found.accepted == len(self.since_arming) or found.arm_session > 1
         assert found.accepted + found.standby + found.rejected.total() == self.offered
 
 

@@ -25,7 +25,7 @@ def test_an_estop_is_latched_and_only_clear_and_arm_lead_back() -> None:
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
     assert modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
     assert rig.arm().ok
-    assert rig.pass_tick().set_points.target == [0.1] * JOINTS  # resumes from the measured pose
+    assert rig.pass_tick().setpoints.target == [0.1] * JOINTS  # resumes from the measured pose
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_a_fault_takes_the_robots_safe_action(action: str, mode: Mode, target: f
     for angle in (0.4, 0.6, 0.9):  # what the joint does afterwards does not move the pose that is held
         rig.observe(angle)
         decision = rig.pass_tick()
-        assert modes(decision) == {mode} and decision.set_points.target == [target] * JOINTS
+        assert modes(decision) == {mode} and decision.setpoints.target == [target] * JOINTS
     assert rig.authority.lease.holder is None
     assert rig.acquire("control").lifecycle != "armed" and not rig.arm().ok
 
@@ -50,7 +50,7 @@ def test_a_joint_without_a_velocity_mode_is_damped_by_its_position_and_then_let_
     rig.authority.fault(Fault(tick=1, what="hot", cause="joint_1 is hot"))
     seen: list[tuple[Mode, float]] = []
     while not seen or seen[-1][0] is not Mode.PASSIVE:
-        points = rig.pass_tick().set_points
+        points = rig.pass_tick().setpoints
         assert points.mode[0] is points.mode[2] is Mode.VELOCITY and points.target[0] == points.target[2] == 0.0
         seen.append((points.mode[1], points.target[1]))
         assert len(seen) < 10
@@ -71,7 +71,7 @@ def test_a_fault_while_disarmed_switches_no_motor_on(action: str) -> None:
     rig = Rig(safety__action=action)
     rig.observe(0.7)
     rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
-    assert set(rig.pass_tick().set_points.mode) == {Mode.PASSIVE}
+    assert set(rig.pass_tick().setpoints.mode) == {Mode.PASSIVE}
 
 
 def test_a_joint_that_moves_when_a_fault_comes_is_slowed_down_over_some_periods() -> None:
@@ -79,7 +79,7 @@ def test_a_joint_that_moves_when_a_fault_comes_is_slowed_down_over_some_periods(
     rig = armed(safety__action="hold")
     rig.observe(0.4, 3.0)
     rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
-    held = [rig.pass_tick().set_points.target[0] for _ in range(5)]
+    held = [rig.pass_tick().setpoints.target[0] for _ in range(5)]
     assert held == pytest.approx([0.425, 0.44, 0.445, 0.445, 0.445])
 
 
@@ -94,7 +94,7 @@ def test_a_held_pose_stays_inside_the_angle_limits() -> None:
     rig = armed(safety__action="hold")
     rig.observe(1.9)
     rig.authority.fault(Fault(tick=1, what="hot", cause="hot"))
-    assert rig.pass_tick().set_points.target == [1.5] * JOINTS
+    assert rig.pass_tick().setpoints.target == [1.5] * JOINTS
 
 
 def test_a_fault_does_not_turn_an_estop_into_something_milder() -> None:
@@ -209,13 +209,13 @@ def test_a_glitch_of_an_encoder_moves_no_motor_and_stops_the_robot() -> None:
     rig = armed(safety__action="hold")
     rig.observe(0.1)
     rig.tick_with(0.1)
-    rig.stamp_ns += PERIOD_NS - 10**9
+    rig.timestamp_ns += PERIOD_NS - 10**9
     rig.observe([0.1, 0.9, 0.1])
     decision = rig.tick_with([0.1, 0.9, 0.1])
     (fault,) = rig.authority.faults
     assert (fault.what, fault.joint, fault.tick) == ("state_invalid", "joint_2", rig.tick)
     assert "joint_2 by +0.80 rad" in fault.cause
-    assert decision.set_points.target == pytest.approx([0.1] * JOINTS)
+    assert decision.setpoints.target == pytest.approx([0.1] * JOINTS)
 
 
 def test_a_glitch_stands_against_arming() -> None:
@@ -223,7 +223,7 @@ def test_a_glitch_stands_against_arming() -> None:
     rig.observe(0.1)
     rig.acquire()
     rig.send(0.1)
-    rig.stamp_ns += PERIOD_NS - 10**9
+    rig.timestamp_ns += PERIOD_NS - 10**9
     rig.observe([0.1, 0.9, 0.1])
     assert "joint_2 by +0.80 rad" in rig.arm().reason
     rig.observe(0.1)
@@ -232,7 +232,7 @@ def test_a_glitch_stands_against_arming() -> None:
 
 def test_time_that_the_host_knows_of_counts() -> None:
     rig = armed()
-    rig.authority.observe(state(rig.robot, 0.9, stamp_ns=rig.stamp_ns), rig.stamp_ns + 10**9)
+    rig.authority.observe(state(rig.robot, 0.9, timestamp_ns=rig.timestamp_ns), rig.timestamp_ns + 10**9)
     rig.pass_tick()
     assert rig.authority.state == "armed"
 
@@ -240,7 +240,7 @@ def test_time_that_the_host_knows_of_counts() -> None:
 def test_a_frozen_joint_stops_an_armed_robot() -> None:
     rig = armed()
     for k in range(12):
-        rig.stamp_ns += PERIOD_NS - 10**9
+        rig.timestamp_ns += PERIOD_NS - 10**9
         rig.observe(0.1, 0.0, [0.1, 0.5, 0.1 * k])
         rig.tick_with([0.1, 0.1 + 0.02 * k, 0.1 + 0.02 * k])
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("joint_frozen", "joint_2")]
@@ -253,13 +253,13 @@ def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> No
     rig = armed()
     receive(rig, [20.0, 92.5, 20.0])
     decision = rig.tick_with(0.1)
-    assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
+    assert decision.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
     assert decision.limited == {1: "thermal"} and rig.authority.limited == {"thermal": 1}
     assert rig.authority.derated == {"joint_2": pytest.approx(0.6)}
     receive(rig, [20.0, 110.0, 20.0])
     decision = rig.pass_tick()
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
-    assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also of the safe action
+    assert decision.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also of the stop mode
     rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     rig.acquire()
     rig.tick_with(0.1)

@@ -115,7 +115,7 @@ def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     assert bench.receive() == [] and bench.derating.wrong == []
 
 
-WAY_OUT = "check the supply, or set `least_voltage_v` under [limits] in the robot file of 'worm'"
+WAY_OUT = "check the supply, or set `min_voltage_v` under [limits] in the robot file of 'worm'"
 
 
 def test_a_weak_supply_keeps_the_robot_from_arming_at_once() -> None:

@@ -1,4 +1,4 @@
-"""Nothing beyond a limit ever comes out of the gate, also at the ends of a joint and when modes change."""
+"""Nothing beyond a limit ever comes out of the limiter, also at the ends of a joint and when modes change."""
 
 import dataclasses
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.gate import (
+from snakesim_hal.safety.limiter import (
     Applied,
     JointLimits,
     Measured,
@@ -59,7 +59,7 @@ def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
 
 @st.composite
 def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
-    """Any command that passes the refusals, any state, and any set-points that were applied before."""
+    """Any command that passes the refusals, any state, and any setpoints that were applied before."""
     any_target = st.floats(-2, 2) | HUGE
     torque_limit = draw(st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10)))
     modes = draw(per_joint(st.sampled_from(list(Mode))))

@@ -13,7 +13,7 @@ SAYS_NO = [True, False, True]  # joint_2 has no valid state
 
 def lame(**robot: Any) -> Rig:
     """An armed robot that has lost joint_2."""
-    rig = armed(safety__may_lose_joints=1, **robot)
+    rig = armed(safety__max_isolated_joints=1, **robot)
     rig.observe(0.1, valid=SAYS_NO)
     rig.tick_with(0.1)
     assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2"]
@@ -42,7 +42,7 @@ def test_a_joint_that_fails_is_passive_and_the_others_go_on() -> None:
         rig.observe(0.1, valid=SAYS_NO)
         assert rig.send(0.12, torque_limit_nm=[3.0] * JOINTS) is None
         decision = rig.pass_tick()
-        points = decision.set_points
+        points = decision.setpoints
         assert points.mode == [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]
         assert points.target == [0.12, 0.0, 0.12] and points.torque_limit_nm == [3.0, 0.0, 3.0]
         assert points.isolated == {1} and decision.limited == {1: "isolated"}
@@ -71,11 +71,11 @@ def test_one_joint_too_many_stops_the_robot(known: bool) -> None:
 
 
 def test_two_that_fail_at_once_are_two() -> None:
-    rig = armed(safety__may_lose_joints=1)
+    rig = armed(safety__max_isolated_joints=1)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
     assert rig.authority.state == "fault" and rig.authority.isolated == []
-    rig = armed(safety__may_lose_joints=2)
+    rig = armed(safety__max_isolated_joints=2)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
     assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2", "joint_3"]
@@ -85,13 +85,13 @@ def test_two_that_fail_at_once_are_two() -> None:
     "fault", [broken(reach="robot"), broken(joint=None), broken(joint="joint_9")], ids=["robot", "nobody", "unknown"]
 )
 def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
-    rig = armed(safety__may_lose_joints=3)
+    rig = armed(safety__max_isolated_joints=3)
     rig.authority.fault(fault)
     assert rig.authority.state == "fault" and rig.authority.isolated == []
 
 
 def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
-    rig = armed(safety__may_lose_joints=3)
+    rig = armed(safety__max_isolated_joints=3)
     rig.observe(0.1, valid=[])
     rig.pass_tick()
     assert rig.authority.state == "fault"
@@ -106,7 +106,7 @@ def test_what_a_lost_joint_complains_of_is_no_news() -> None:
 
 
 def test_while_disarmed_no_joint_is_set_aside() -> None:
-    rig = Rig(safety__may_lose_joints=1)
+    rig = Rig(safety__max_isolated_joints=1)
     rig.observe(0.1, valid=SAYS_NO)
     rig.acquire()
     rig.send(0.1)
@@ -123,7 +123,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
     rig.observe(0.1, valid=SAYS_NO)
     rig.send([0.1, 1.4, 0.1])  # where nobody knows the joint to be
     assert rig.arm().ok
-    assert rig.tick_with(0.1).set_points.isolated == {1}
+    assert rig.tick_with(0.1).setpoints.isolated == {1}
 
 
 def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
@@ -140,7 +140,7 @@ def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
     rig.observe(0.1)
     rig.send(0.1)
     assert rig.arm().ok
-    assert rig.tick_with(0.1).set_points.mode == [Mode.POSITION] * JOINTS
+    assert rig.tick_with(0.1).setpoints.mode == [Mode.POSITION] * JOINTS
 
 
 @pytest.mark.parametrize("action", ["passive", "damp", "hold"])
@@ -148,7 +148,7 @@ def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
     rig = lame(safety__action=action)
     rig.pass_tick(6)
     assert rig.authority.state == "fault"
-    points = rig.pass_tick().set_points
+    points = rig.pass_tick().setpoints
     assert points.isolated == {1} and points.mode[1] is Mode.PASSIVE and points.torque_limit_nm[1] == 0.0
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated == []
 
@@ -161,9 +161,9 @@ def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
 
 
 def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
-    rig = armed(safety__may_lose_joints=1)
+    rig = armed(safety__max_isolated_joints=1)
     receive(rig, [20.0, 110.0, 20.0])
-    assert rig.tick_with(0.1).set_points.isolated == {1} and rig.authority.state == "armed"
+    assert rig.tick_with(0.1).setpoints.isolated == {1} and rig.authority.state == "armed"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
@@ -189,7 +189,7 @@ def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
 @pytest.mark.parametrize("kept", ["since_clear", "since_start"])
 @pytest.mark.parametrize("before", [0, 3, 20, 50])
 def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None:
-    rig = armed(safety__may_lose_joints=1)
+    rig = armed(safety__max_isolated_joints=1)
     for tick in range(before):
         rig.authority.note(Fault(tick=tick, what="noted", cause=""))
     rig.authority.fault(Fault(tick=1000, what="leak", cause="water"))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.lease import Lease, Ruling, freed, renewed, rule
+from snakesim_hal.safety.lease import Lease, LeaseDecision, freed, renewed, rule
 from snakesim_hal.wire.messages import LeaseRequest
 
 TERM = 50
@@ -19,8 +19,8 @@ def request(action: str, holder: str = "control", epoch: int = 4, priority: int 
     return LeaseRequest(action=action, holder=holder, epoch=epoch, priority=priority)  # pyright: ignore[reportArgumentType]
 
 
-def taken(holder: str, now: int, priority: int = 100) -> Ruling:
-    return Ruling(Lease(holder, 5, priority, now + TERM), None, True)
+def taken(holder: str, now: int, priority: int = 100) -> LeaseDecision:
+    return LeaseDecision(Lease(holder, 5, priority, now + TERM), None, True)
 
 
 GRANTED = {
@@ -28,9 +28,9 @@ GRANTED = {
     "acquire a lease that ran out": (HELD, request("acquire", "teleop", 0), AFTER, taken("teleop", AFTER)),
     "acquire again after it ran out": (HELD, request("acquire"), AFTER, taken("control", AFTER)),
     "preempt": (HELD, request("acquire", "teleop", 0, 101), DURING, taken("teleop", DURING, 101)),
-    "renew": (HELD, request("renew"), DURING, Ruling(Lease("control", 4, 100, DURING + TERM))),
-    "renew at the last moment": (HELD, request("renew"), 1000, Ruling(Lease("control", 4, 100, 1000 + TERM))),
-    "release": (HELD, request("release"), DURING, Ruling(Lease(epoch=4), None, True)),
+    "renew": (HELD, request("renew"), DURING, LeaseDecision(Lease("control", 4, 100, DURING + TERM))),
+    "renew at the last moment": (HELD, request("renew"), 1000, LeaseDecision(Lease("control", 4, 100, 1000 + TERM))),
+    "release": (HELD, request("release"), DURING, LeaseDecision(Lease(epoch=4), None, True)),
 }
 
 
@@ -76,7 +76,7 @@ def test_live_until_the_last_nanosecond() -> None:
 
 
 def test_nobody_changes_a_lease_in_place() -> None:
-    for held in (HELD, Ruling(HELD)):
+    for held in (HELD, LeaseDecision(HELD)):
         with pytest.raises(dataclasses.FrozenInstanceError):
             held.lease = FREE  # pyright: ignore[reportAttributeAccessIssue]
     assert Lease() == Lease(None, 0, 0, 0)

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.gate import Applied, JointLimits
+from snakesim_hal.safety.limiter import Applied, JointLimits
 from snakesim_hal.safety.plausibility import Mask, PlausibilityCheck, readable
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointState, Mode
@@ -30,7 +30,7 @@ class Bench:
 
     def __init__(self, **values: Any) -> None:
         self.watch = PlausibilityCheck(LIMITS)
-        self.stamp_ns = 0
+        self.timestamp_ns = 0
         assert self.see(**values) is None
 
     def see(
@@ -43,9 +43,9 @@ class Bench:
         aside: Mask = NOBODY,
         **other: Any,
     ) -> Fault | None:
-        self.stamp_ns += round(periods * PERIOD_NS)
-        seen = state(ROBOT, angle, *values, stamp_ns=self.stamp_ns, tick=7, **other)
-        doubt = self.watch.take(seen, now_ns=self.stamp_ns + late_ns, applied=applied, aside=aside)
+        self.timestamp_ns += round(periods * PERIOD_NS)
+        seen = state(ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other)
+        doubt = self.watch.take(seen, now_ns=self.timestamp_ns + late_ns, applied=applied, aside=aside)
         self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
         return None if doubt is None else doubt.fault
 
@@ -343,10 +343,10 @@ class Whole(PlausibilityCheck):
 
 def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied | None]]:
     """States at the edges of every check, in which at most one joint is not like the others; and what was applied."""
-    stamp_ns, target, angle = 0, 0.0, [0.4] * JOINTS
+    timestamp_ns, target, angle = 0, 0.0, [0.4] * JOINTS
     limit_ns = LIMITS.oldest_state_ns
     for _ in range(length):
-        stamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
+        timestamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
         target += rng.choice((0.0, 0.08))
         velocity, torque = [rng.choice((0.5, 0.6))] * JOINTS, [rng.choice((0.5, 0.6))] * JOINTS
         ages, valid = [0] * JOINTS, [True] * JOINTS
@@ -367,7 +367,7 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied 
             case _:
                 pass
         count = 0 if rng.random() < 0.02 else JOINTS
-        seen = state(ROBOT, angle[:count], velocity, torque, stamp_ns=stamp_ns, age_ns=ages, valid=valid)
+        seen = state(ROBOT, angle[:count], velocity, torque, timestamp_ns=timestamp_ns, age_ns=ages, valid=valid)
         yield seen, targets(target) if rng.random() < 0.9 else None
 
 
@@ -376,7 +376,7 @@ def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
     for _ in range(300):
         quick, whole = PlausibilityCheck(LIMITS), Whole(LIMITS)
         for seen, applied in walk(rng, 24):
-            taken = [one.take(seen, now_ns=seen.stamp_ns, applied=applied, aside=NOBODY) for one in (quick, whole)]
+            taken = [one.take(seen, now_ns=seen.timestamp_ns, applied=applied, aside=NOBODY) for one in (quick, whole)]
             assert repr(taken[0]) == repr(taken[1])
             for good, expected in zip(vars(quick.measured).values(), vars(whole.measured).values(), strict=True):
                 assert good.tolist() == expected.tolist()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.gate import JointLimits
+from snakesim_hal.safety.limiter import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import description

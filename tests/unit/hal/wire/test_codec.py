@@ -14,7 +14,7 @@ from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder,
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Clock,
-    ColourImage,
+    ColorImage,
     DepthImage,
     JointCommand,
     JointState,
@@ -145,7 +145,7 @@ def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
 
 
 def test_the_largest_images_are_taken_and_nothing_else_of_their_size() -> None:
-    for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColourImage, "rgb", b"\1\2\3")):
+    for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColorImage, "rgb", b"\1\2\3")):
         largest = {**plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
         taken = take(message, encode(largest))
         assert taken is not None and getattr(taken, field) == largest[field]

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Done, Ranges
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Done, Ranges
 
 CHUNK = st.text(st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12)
 NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)
@@ -39,7 +39,7 @@ def test_services_are_found_in_their_keys_and_cameras_and_lidars_have_keys_of_th
     assert keys.service_of(keys.done(name)) == keys.service_of(keys.alive(name)) == name
     assert keys.message_at(keys.done(name)) is Done
     assert keys.message_at(keys.depth(name)) is DepthImage
-    assert keys.message_at(keys.colour(name)) is ColourImage
+    assert keys.message_at(keys.color(name)) is ColorImage
     assert keys.message_at(keys.ranges(name)) is Ranges
 
 

@@ -78,4 +78,4 @@ def test_modes_keep_their_numbers() -> None:
 def test_everything_that_a_sensor_tells_has_a_tick_and_a_stamp() -> None:
     for row in keys.SPACE:
         if row.kind == "stream" and row.message is not None and row.key.startswith("sensor/"):
-            assert {"tick", "stamp_ns"} <= set(row.message.__struct_fields__), row.key
+            assert {"tick", "timestamp_ns"} <= set(row.message.__struct_fields__), row.key

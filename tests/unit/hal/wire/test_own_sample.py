@@ -26,7 +26,7 @@ class Skin(OwnSample, frozen=True, kw_only=True):
 
 PLACE: dict[str, Any] = {
     "tick": 3,
-    "stamp_ns": 2,
+    "timestamp_ns": 2,
     "link": 1,
     "position_l": (0.0, 0.1, 0.0),
     "orientation_l_wxyz": (1.0, 0.0, 0.0, 0.0),

@@ -34,7 +34,7 @@ def test_it_goes_at_its_speed_while_the_key_repeats_and_no_longer() -> None:
 def test_it_stays_within_travel_limits_and_near_a_joint_that_is_blocked() -> None:
     assert held(Jog(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(-0.2)
     ends = Jog(JogRequest(joint="joint_1", travel_rad=3.0), JOINT, 0.0)
-    assert (ends.least_rad, ends.most_rad) == (JOINT.angle_min_rad, JOINT.angle_max_rad)
+    assert (ends.lower_rad, ends.upper_rad) == (JOINT.angle_min_rad, JOINT.angle_max_rad)
     assert held(Jog(JogRequest(joint="joint_1"), JOINT, 0.0), "up", 5.0, blocked_rad=0.0) == pytest.approx(AHEAD_RAD)
 
 

@@ -31,16 +31,16 @@ def contact(
     )  # fmt: skip
 
 
-def pushing(points: list[WorldContact], solved_n: list[float], **more: Any) -> ControlState:
+def pushing(points: list[WorldContact], desired_force_n: list[float], **more: Any) -> ControlState:
     return ControlState(
-        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
-        solved_force_n=solved_n, **more,
+        tick=1, timestamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
+        desired_force_n=desired_force_n, **more,
     )  # fmt: skip
 
 
 def world(contacts: list[WorldContact], obstacles: list[Obstacle]) -> World:
     return World(
-        tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+        tick=1, timestamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
         base_confidence=1.0, contacts=contacts, obstacles=obstacles,
     )  # fmt: skip
 
@@ -77,7 +77,7 @@ def test_forces_and_their_resultant():
 
 def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
     points = [contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))]
-    control = pushing(points, [20.0, 30.0], felt_force_n=[17.5, 0.0])
+    control = pushing(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
     drawing = draw(snapshot, None)
     assert drawing is not None and drawing.pushed == {"felt"}
@@ -85,7 +85,7 @@ def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
     assert drawing.asked[0, 1] - drawing.asked[0, 0] == pytest.approx([0.0, LONGEST_M, 0.0])
     table = push_point_table(control)
     assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table and "<td>clear</td><td>30.0</td><td>0.0</td>" in table
-    assert push_point_table(msgspec.structs.replace(control, felt_force_n=[])) == ""
+    assert push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
 
 
 def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
@@ -115,7 +115,7 @@ def test_what_a_map_tells_is_not_drawn_as_perceived():
 
 def test_a_camera_that_looks_along_its_link_looks_along_x():
     image = DepthImage(
-        tick=1, stamp_ns=1, link=0, position_l=(0.0, 0.0, 0.0), orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0), width=4,
+        tick=1, timestamp_ns=1, link=0, position_l=(0.0, 0.0, 0.0), orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0), width=4,
         height=2, fx_px=1.0, fy_px=1.0, cx_px=2.0, cy_px=1.0, range_min_m=0.1, range_max_m=1.0, scale_m=0.001,
         depth=bytes(16),
     )  # fmt: skip

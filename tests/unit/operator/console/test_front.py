@@ -14,7 +14,7 @@ import pytest
 
 from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.connections import ConnectionLimits, Waiting, limits_for, why_no_page
-from snakesim_operator.features.console.front import Front, HandedOn
+from snakesim_operator.features.console.front import Front, HandoffListener
 from snakesim_operator.features.console.peer_user import PeerUsers
 from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 from tests.harness.wait import wait_until
@@ -28,7 +28,7 @@ HALF = (b"", b"GET / HTTP/1.1\r\nHost: ", b"POST /stop HTTP/1.1\r\n")
 class Door:
     """A front without pages behind it."""
 
-    def __init__(self, front: Front, listening: socket.socket, handed_on: HandedOn) -> None:
+    def __init__(self, front: Front, listening: socket.socket, handed_on: HandoffListener) -> None:
         self.front, self.handed_on = front, handed_on
         self.address: tuple[str, int] = listening.getsockname()
 
@@ -50,7 +50,7 @@ class Door:
 @contextmanager
 def door(stop: ReadyStop, limits: ConnectionLimits = FEW) -> Iterator[Door]:
     listening = open_port(None)
-    handed_on = HandedOn(listening.getsockname())
+    handed_on = HandoffListener(listening.getsockname())
     handed_on.setblocking(False)  # as asyncio does
     with contextlib.closing(handed_on), Front(listening, handed_on, stop, limits=limits) as front:
         yield Door(front, listening, handed_on)
@@ -116,7 +116,7 @@ class FullTable(socket.socket):
 def test_a_full_file_table_costs_a_reserved_descriptor_or_the_oldest_request_and_no_stop() -> None:
     stop = ReadyStop()
     listening = FullTable(fileno=open_port(None).detach())
-    handed_on = HandedOn(listening.getsockname())
+    handed_on = HandoffListener(listening.getsockname())
     with contextlib.closing(handed_on), Front(listening, handed_on, stop, limits=FEW) as front:
         at = Door(front, listening, handed_on)
         FullTable.fails = 2

@@ -111,4 +111,4 @@ def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
 
 
 def test_the_legend_has_a_colour_for_each_thing():
-    assert len({colour for _, colour in LEGEND}) == len(LEGEND)
+    assert len({color for _, color in LEGEND}) == len(LEGEND)

@@ -32,7 +32,7 @@ def test_cameras_rates_and_charts_are_those_of_the_instant(tmp_path: Path) -> No
     recorded = RecordedRun(tmp_path / "run")
     early, late = recorded.at(0.3), recorded.at(1.4)
     (seen,), (later,) = early.images.values(), late.images.values()
-    assert [*early.images] == ["sensor/depth/head"] and abs(seen.stamp_ns * 1e-9 - 0.3) < 0.1
+    assert [*early.images] == ["sensor/depth/head"] and abs(seen.timestamp_ns * 1e-9 - 0.3) < 0.1
     assert picture(seen).std() > 0 and (picture(later) != picture(seen)).any()
     assert late.streams["sensor/joints"].rate_hz == approx(100, abs=2)
     charted = [snapshot.time_s or 0.0 for snapshot in recorded.before(1.0)]

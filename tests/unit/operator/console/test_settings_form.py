@@ -16,7 +16,7 @@ VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": tr
 
 
 def settings(values: str, schema: str) -> ControlSettings:
-    return ControlSettings(tick=0, stamp_ns=0, controller="any", settings=values, schema=schema)
+    return ControlSettings(tick=0, timestamp_ns=0, controller="any", settings=values, schema=schema)
 
 
 def test_each_setting_has_an_input_within_its_bounds():

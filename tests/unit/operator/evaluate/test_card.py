@@ -18,7 +18,7 @@ def test_p_as_tabulated() -> None:
 
 
 def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
-    numbers = {"advance_m": 1.0, "advance_m_s": 0.1, "solved_force_error": None}
+    numbers = {"advance_m": 1.0, "advance_m_s": 0.1, "desired_force_error": None}
 
     def card(controllers: list[str], seed: int, crosses: bool, **more: float):
         suite = Suite(scenario="surveyed_clutter", set={"duration_s": 3.0, **more})

@@ -13,9 +13,9 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import find
 from snakesim_hal.model.textfiles import read_text
-from snakesim_operator.features.evaluate import optimise as search
+from snakesim_operator.features.evaluate import optimize as search
 from snakesim_operator.features.evaluate.case import Case, Outcome
-from snakesim_operator.features.evaluate.optimise import Request, optimise
+from snakesim_operator.features.evaluate.optimize import Request, optimize
 
 PROPULSION = "control.propulsion_n"
 FIRST = {
@@ -23,7 +23,7 @@ FIRST = {
     "vary": [f"{PROPULSION}=5:40"],
     "set": ["duration_s=2"],
     "goal": "path_distance_m",
-    "minimise": False,
+    "minimize": False,
     "trials": 2,
     "seeds": 1,
     "seed": 1,
@@ -62,7 +62,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def searched(storage: Path, **other: Any) -> None:
-    assert optimise(Request(**{**FIRST, **other, "storage": storage})) == 0
+    assert optimize(Request(**{**FIRST, **other, "storage": storage})) == 0
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -72,7 +72,7 @@ def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
 @pytest.mark.parametrize(
     ("other", "difference"),
     [
-        ({"minimise": True}, "--minimise: not given there, given here"),
+        ({"minimize": True}, "--minimise: not given there, given here"),
         ({"goal": "advance_m"}, "--goal: path_distance_m there, advance_m here"),
         ({"set": ["duration_s=3"]}, "--set duration_s: 2 there, 3 here"),
         ({"set": []}, "--set duration_s: 2 there, not given here"),
@@ -89,7 +89,7 @@ def test_another_search_is_refused_with_every_difference(kept: Path, other: dict
         searched(kept, **other)
     assert f"--storage {kept}" in str(error.value) and difference in str(error.value)
     assert str(error.value).count(" there, ") == 1
-    assert "choose another file" in str(error.value) and "`snakesim optimise triplet --vary" in str(error.value)
+    assert "choose another file" in str(error.value) and "`snakesim optimize triplet --vary" in str(error.value)
     assert kept.read_bytes() == before
 
 

@@ -25,7 +25,8 @@ name = "as shipped"
 name = "pegs only"
 [row.set.scene]
 random_field = [
-    { low_m = [2, -1], high_m = [3, 1], density_per_m2 = 1, radius_m = [0.03, 0.03], clearance_m = 0.1, seed = 1 },
+    { min_corner_m = [2, -1], max_corner_m = [3, 1], density_per_m2 = 1, radius_m = [0.03, 0.03], clearance_m = 0.1,
+      seed = 1 },
 ]
 """
 
@@ -49,10 +50,10 @@ def test_every_row_in_every_combination(tmp_path: Path) -> None:
     assert len(cases) == 12 * 2 * 2
     assert len({case.id for case in cases}) == len(cases)
     last = config(cases[-1])
-    assert last.duration_s == 20 and last.pace == "lockstep" and last.controller == "path_following"
+    assert last.duration_s == 20 and last.clock_mode == "lockstep" and last.controller == "path_following"
     assert last.scene.ground.friction == pytest.approx(0.3)
     assert (last.seed, last.scene.random_field[0].seed) == (8, 8)
-    assert last.scene.random_field[0].density_per_m2 == 8 and last.scene.random_field[0].box_share == 0
+    assert last.scene.random_field[0].density_per_m2 == 8 and last.scene.random_field[0].box_fraction == 0
 
 
 def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_the_host_is_given_its_buses(tmp_path: Path, name: str) -> None:
     config = load_scenario(host).config
     given = {section: settings for section, settings in config.backends.items() if settings}
     assert given == BUSES[name]
-    assert config.pace == ("realtime" if BUSES[name] else "lockstep")
+    assert config.clock_mode == ("realtime" if BUSES[name] else "lockstep")
     control = service_parser.parse_args(command_of(files["ws1/systemd/snakesim-gnc.planar13-control.service"]))
     assert load_scenario(control).config == config
 

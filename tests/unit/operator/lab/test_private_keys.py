@@ -78,12 +78,12 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
     assert found.wrong == 1 and "every user of this computer may read this private key (mode 604)" in said[-1]
 
 
-@pytest.mark.parametrize("most_mb", [20, 30, 40, 100])
-def test_too_little_memory_is_one_line(tmp_path: Path, most_mb: int) -> None:
+@pytest.mark.parametrize("max_mb", [20, 30, 40, 100])
+def test_too_little_memory_is_one_line(tmp_path: Path, max_mb: int) -> None:
     typed = [*SNAKESIM, "deploy", "certs", str(EXAMPLE), "--out", str(tmp_path / "lab")]
-    limited = ["sh", "-c", f'ulimit -v {most_mb * 1024}; exec "$@"', "sh", *typed]
+    limited = ["sh", "-c", f'ulimit -v {max_mb * 1024}; exec "$@"', "sh", *typed]
     ended = call(limited, tmp_path, environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0)
     assert ended.code in (0, 1) and "Traceback" not in ended.err, ended.err
     if ended.code == 1:
         assert len(ended.err.splitlines()) == 1
-        assert f"needs more memory than `ulimit -v` allows, {most_mb} MB" in ended.err
+        assert f"needs more memory than `ulimit -v` allows, {max_mb} MB" in ended.err

@@ -248,7 +248,7 @@ def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
 
 def test_the_state_of_a_controller_that_fell_silent_is_not_shown_as_current() -> None:
     channels, robot = FoxgloveChannels("snake"), description()
-    control = ControlState(tick=0, stamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
+    control = ControlState(tick=0, timestamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
     seen: list[tuple[str, list[str]]] = []
     channels.take(keys.DESCRIPTION, encode(robot), 0)
     for time_s in (0, 4, 6, 8):

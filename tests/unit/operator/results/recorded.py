@@ -31,7 +31,7 @@ def triplet() -> RunRecord:
     record = simulate(load("triplet").config).record
     later_ns = round(ARMED_S * 1e9)
     reported = {
-        name: [msgspec.structs.replace(one, stamp_ns=one.stamp_ns + later_ns) for one in getattr(record, name)]
+        name: [msgspec.structs.replace(one, timestamp_ns=one.timestamp_ns + later_ns) for one in getattr(record, name)]
         for name in ("control", "worlds")
     }
     return dataclasses.replace(record, host=finished(1000), time_s=record.time_s + ARMED_S, **reported)

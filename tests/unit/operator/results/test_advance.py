@@ -25,7 +25,7 @@ def ran(controller: str, duration_s: float = 2.5, goal: str = "") -> Result:
     return simulate(load("peg_row", [Override(key, value, "--set") for key, value in asked.items()]).config)
 
 
-def centre_m(result: Result, row: int) -> float:
+def center_m(result: Result, row: int) -> float:
     """Along x; all links of this robot weigh the same."""
     nodes = result.record.nodes_w(row)
     assert nodes is not None
@@ -38,7 +38,7 @@ def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
     assert reported.crossed is True and reported.goal_m == reported.advance_m == 0.3
     assert reported.crossed_s is not None and reported.advance_m_s == pytest.approx(0.3 / reported.crossed_s)
     row = record.row_at(record.time_s[0] + reported.crossed_s)
-    assert centre_m(result, row) - centre_m(result, 0) == pytest.approx(0.3, abs=0.01)
+    assert center_m(result, row) - center_m(result, 0) == pytest.approx(0.3, abs=0.01)
     used_j = np.abs(record.torque_nm * record.velocity_rad_s)[: row + 1].sum() * 0.01
     assert reported.energy_j_per_m == pytest.approx(used_j / 0.3, rel=0.02)
     assert reported.stalled_s == 0

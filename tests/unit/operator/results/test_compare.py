@@ -49,7 +49,7 @@ def made_up(
     control = [
         ControlState(
             tick=row,
-            stamp_ns=round((start_s + t) * 1e9),
+            timestamp_ns=round((start_s + t) * 1e9),
             controller="obstacle_triplet",
             state="Locomoting",
             reason="pushing",

@@ -47,7 +47,7 @@ SIGNALS = {
 }
 MAY_BE_NULL = {
     *("path_s_m", "propulsion_n", "propulsion_torque_nm", "torque_headroom_nm", "condition"),
-    *("pose_stamp_ns", "contacts_stamp_ns", "last_seen_ns"),
+    *("pose_timestamp_ns", "contacts_timestamp_ns", "last_seen_ns"),
 }
 WRONG_NUMBERS = [math.nan, math.inf, -math.inf, 1e300]
 WRONG = st.sampled_from(WRONG_NUMBERS)
@@ -73,7 +73,7 @@ def write_record(folder: Path, record: RunRecord) -> None:
 
 
 def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int) -> None:
-    """A recording with these messages, and the set-points of so many ticks, of which only the number is read."""
+    """A recording with these messages, and the setpoints of so many ticks, of which only the number is read."""
     (folder / RECORDING).unlink(missing_ok=True)
     recording = Recording(folder / RECORDING)
     for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
@@ -91,8 +91,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(
         whole,
-        control=[state for state in whole.control if begin_ns <= state.stamp_ns <= end_ns],
-        worlds=[world for world in whole.worlds if begin_ns <= world.stamp_ns <= end_ns],
+        control=[state for state in whole.control if begin_ns <= state.timestamp_ns <= end_ns],
+        worlds=[world for world in whole.worlds if begin_ns <= world.timestamp_ns <= end_ns],
         host=msgspec.structs.replace(whole.host, ticks=LAST - FIRST),
         **kept,
     )

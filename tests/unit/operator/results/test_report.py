@@ -177,7 +177,7 @@ def drawn_edges(svg: str, kind: str) -> list[tuple[tuple[float, float], tuple[fl
 
 def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
     more = [
-        msgspec.structs.replace(one, solved_force_n=[1.3 * f for f in one.solved_force_n]) for one in record.control
+        msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n]) for one in record.control
     ]
     wrong = changed(record, control=more)
     assert balanced_instants(wrong) == [] and "whose forces balance" in read(wrong).text
@@ -188,7 +188,7 @@ def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: R
         if field.name not in ELSEWHERE:
             assert field.name in page.words, field.name
     assert {"N·m", "m/s", "µs", "J", "Hz"} <= set(page.words)
-    assert "torque_rate" in page.words and "41" in page.words  # limited by the gate
+    assert "torque_rate" in page.words and "41" in page.words  # limited by the limiter
     assert "stale" in page.words
 
 
@@ -217,7 +217,7 @@ def test_the_reference_is_the_target_in_position_mode_and_the_controllers_word_i
     assert np.array_equal(reference[~free], record.target[~free, 6])
     assert np.abs(reference[free] - record.target[free, 6]).max() > 1  # no torque is taken for an angle
     steps = np.abs(np.diff(reference))[np.diff(free.astype(int)) == 0]
-    assert steps.max() < 0.02  # smooth, but where the gate moves the target to what the torque implies
+    assert steps.max() < 0.02  # smooth, but where the limiter moves the target to what the torque implies
 
 
 def test_thinning_keeps_extremes_and_gaps() -> None:

@@ -45,7 +45,7 @@ def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
     long["time_s"] = ARMED_S + np.arange(len(long["time_s"])) / RATE_HZ
     later = [
         [
-            msgspec.structs.replace(one, stamp_ns=one.stamp_ns + round(k * SECONDS * 1e9))
+            msgspec.structs.replace(one, timestamp_ns=one.timestamp_ns + round(k * SECONDS * 1e9))
             for k in range(times)
             for one in reported
         ]
@@ -89,7 +89,7 @@ def test_without_a_contact_sensor(record: RunRecord) -> None:
 
 
 def test_a_controller_without_push_points(record: RunRecord) -> None:
-    nothing = {"push_points": [], "solved_force_n": [], "propulsion_joint": None, "propulsion_n": None}
+    nothing = {"push_points": [], "desired_force_n": [], "propulsion_joint": None, "propulsion_n": None}
     plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in record.control]
     config_ = msgspec.structs.replace(record.config, controller="hold")
     page = read(changed(record, control=plain, config=config_))
@@ -139,7 +139,7 @@ def test_a_run_that_jammed(record: RunRecord) -> None:
 def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
     stuck = [
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
-        if state.stamp_ns > (ARMED_S + 6.09) * 1e9
+        if state.timestamp_ns > (ARMED_S + 6.09) * 1e9
         else state
         for state in record.control
     ]
@@ -154,7 +154,7 @@ def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
     for column in held.values():
         column[row:] = column[row]
     since_ns = (float(record.time_s[0]) + at_s) * 1e9
-    control = [msgspec.structs.replace(one, **state) if one.stamp_ns > since_ns else one for one in record.control]
+    control = [msgspec.structs.replace(one, **state) if one.timestamp_ns > since_ns else one for one in record.control]
     return changed(record, control=control, **held)
 
 
@@ -192,7 +192,7 @@ def test_whether_it_moved_is_measured_whatever_control_reported(record: RunRecor
     """State and share of time are the same for a controller that reports nothing, falls silent, or claims to stand."""
     whole = summarise(record, "complete")
     assert whole.locomoting_fraction == pytest.approx(0.63, abs=0.01)
-    silent = [state for state in record.control if state.stamp_ns < (ARMED_S + 4.0) * 1e9]
+    silent = [state for state in record.control if state.timestamp_ns < (ARMED_S + 4.0) * 1e9]
     claims = [msgspec.structs.replace(one, state="NotLocomoting", reason="lost") for one in record.control]
     for control in (silent, [], claims):
         reported = summarise(changed(record, control=control), "complete")
@@ -215,7 +215,9 @@ def test_a_controller_that_says_it_stands_and_moves(record: RunRecord) -> None:
     """The verdict is that of the motion; what control reported is beside it, as a report."""
     since_ns = (ARMED_S + 2.2) * 1e9
     lost = [
-        msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost") if one.stamp_ns > since_ns else one
+        msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost")
+        if one.timestamp_ns > since_ns
+        else one
         for one in record.control
     ]
     found = judged(changed(record, control=lost))
@@ -229,7 +231,7 @@ def test_a_run_that_moves_to_its_end_says_so(record: RunRecord) -> None:
     rows = slice(0, 500)
     fields = [field.name for field in dataclasses.fields(record)]
     short = {name: getattr(record, name)[rows] for name in fields if isinstance(getattr(record, name), np.ndarray)}
-    cut = changed(record, **short, control=[one for one in record.control if one.stamp_ns < (ARMED_S + 5.0) * 1e9])
+    cut = changed(record, **short, control=[one for one in record.control if one.timestamp_ns < (ARMED_S + 5.0) * 1e9])
     found = judged(cut)
     assert found.kind == "good" and "along the path in 10.0 s, and was still moving at the end;" in found.words
     assert summarise(cut, "complete").locomoting_fraction == 1.0

@@ -92,7 +92,7 @@ def test_each_joint_keeps_its_own_limits_and_friction_on_the_way_there_and_back(
     assert text.count('lower="-0.4"') == 1
     edited.write_text(text.replace('lower="-0.4"', 'lower="-0.7"'))
     found = robot_of(edited, Order())
-    assert found.robot.joint_table[1].limits.least_rad == -0.7, "what was changed in the URDF counts"
+    assert found.robot.joint_table[1].limits.lower_rad == -0.7, "what was changed in the URDF counts"
     assert "angle_min_rad differs from that of the others: joint_2 (joint_2) -0.7 rad" in found.changed
 
 
@@ -100,7 +100,7 @@ def test_a_robot_from_elsewhere_has_exceptions_only_where_its_joints_differ() ->
     slider, hexa = robot_of(SLIDER, Order()).robot, robot_of(HEXA, HEXA_ORDER).robot
     assert slider.limits.torque_nm == 4.1 and len(slider.joints) == 1
     assert [joint.limits.torque_nm for joint in slider.joint_table].count(3.8) == 1
-    sides = [(joint.limits.least_rad, joint.limits.most_rad) for joint in hexa.joint_table]
+    sides = [(joint.limits.lower_rad, joint.limits.upper_rad) for joint in hexa.joint_table]
     assert sides == [(-1.5, 1.5), (-1.4, 1.6), *[(-1.5, 1.5)] * 4], "its angle is negated"
 
 
@@ -122,7 +122,7 @@ def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str)
         joint = theirs.joint(f"joint_{i + 1}")
         assert joint.axis.tolist() == ([0, 0, 1] if axis == "yaw" else [0, 1, 0])
         limits = robot.joint_table[i].limits
-        assert joint.range == pytest.approx([limits.least_rad, limits.most_rad])
+        assert joint.range == pytest.approx([limits.lower_rad, limits.upper_rad])
 
 
 def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:

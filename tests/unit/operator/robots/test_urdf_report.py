@@ -50,8 +50,8 @@ def _joint(i: int, section: str, field: str) -> Place:
 
 
 KEPT: dict[str, Place] = {
-    "joint[@name='j1']/limit@lower": _joint(0, "limits", "least_rad"),
-    "joint[@name='j1']/limit@upper": _joint(0, "limits", "most_rad"),
+    "joint[@name='j1']/limit@lower": _joint(0, "limits", "lower_rad"),
+    "joint[@name='j1']/limit@upper": _joint(0, "limits", "upper_rad"),
     "joint[@name='j1']/limit@effort": _joint(0, "limits", "torque_nm"),
     "joint[@name='j1']/limit@velocity": _joint(0, "limits", "speed_rad_s"),
     "joint[@name='j3']/limit@effort": _joint(2, "limits", "torque_nm"),
@@ -64,7 +64,7 @@ KEPT: dict[str, Place] = {
     "robot@name": lambda robot: robot.name,
     "gazebo[1]/sensor@name": lambda robot: robot.sensors.depth[0].name,
     "gazebo[1]/sensor/update_rate": lambda robot: robot.sensors.depth[0].rate_hz,
-    "gazebo[1]/sensor/camera/horizontal_fov": lambda robot: robot.sensors.depth[0].view_rad,
+    "gazebo[1]/sensor/camera/horizontal_fov": lambda robot: robot.sensors.depth[0].fov_rad,
     "gazebo[1]/sensor/camera/image/width": lambda robot: robot.sensors.depth[0].width,
     "gazebo[1]/sensor/camera/image/height": lambda robot: robot.sensors.depth[0].height,
     "gazebo[1]/sensor/camera/clip/near": lambda robot: robot.sensors.depth[0].range_min_m,
@@ -368,7 +368,7 @@ def test_limits_in_degrees_are_refused(old: str, new: str, tmp_path: Path) -> No
 
 def test_two_turns_are_cut_to_one_with_a_line_in_the_report(tmp_path: Path) -> None:
     found = _edited(tmp_path, ('lower="-1.2" upper="1.1"', 'lower="-6.28319" upper="6.28319"'))
-    assert found.robot.joint_table[0].limits.most_rad == pytest.approx(math.pi, abs=1e-5)
+    assert found.robot.joint_table[0].limits.upper_rad == pytest.approx(math.pi, abs=1e-5)
     cuts = [line for line in found.changed if "half a turn" in line]
     assert len(cuts) == 2
     assert all(line.endswith(f"j1 (line {_line('4.5')})") for line in cuts)

@@ -46,7 +46,7 @@ def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
     count = min(map(len, (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid)))
     joints = m.JointState(
         tick=0,
-        stamp_ns=0,
+        timestamp_ns=0,
         angle_rad=joints.angle_rad[:count],
         velocity_rad_s=joints.velocity_rad_s[:count],
         torque_nm=joints.torque_nm[:count],
@@ -98,7 +98,7 @@ def test_obstacles_have_their_shapes() -> None:
     ]
     world = m.World(
         tick=1,
-        stamp_ns=1,
+        timestamp_ns=1,
         base_position_w=(0, 0, 0),
         base_orientation_wxyz=(1, 0, 0, 0),
         base_confidence=1,
@@ -119,7 +119,7 @@ def image(kind: type[Any], **more: Any) -> Any:
     pose = {"position_l": (0.1, 0, 0), "orientation_l_wxyz": (1, 0, 0, 0)}
     limits = {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001} if kind is m.DepthImage else {}
     size = {"width": 4, "height": 3, "fx_px": 80.0, "fy_px": 81.0, "cx_px": 1.5, "cy_px": 1.0}
-    return kind(tick=0, stamp_ns=0, link=1, **{**pose, **limits, **size, **pixels, **more})
+    return kind(tick=0, timestamp_ns=0, link=1, **{**pose, **limits, **size, **pixels, **more})
 
 
 def test_depth_in_millimetres_or_metres() -> None:
@@ -134,8 +134,8 @@ def test_depth_in_millimetres_or_metres() -> None:
 
 
 def test_colour_and_intrinsics() -> None:
-    sent = image(m.ColourImage)
-    seen = read(ros.IMAGE, robot_in_ros.colour_image(STAMP_NS, "f", sent))
+    sent = image(m.ColorImage)
+    seen = read(ros.IMAGE, robot_in_ros.color_image(STAMP_NS, "f", sent))
     assert (seen.encoding, seen.step, seen.data.tobytes()) == ("rgb8", 12, sent.rgb)
     info = read(ros.CAMERA_INFO, robot_in_ros.camera_info(STAMP_NS, "f", sent))
     assert (info.width, info.height, info.distortion_model) == (4, 3, "plumb_bob")
@@ -145,10 +145,10 @@ def test_colour_and_intrinsics() -> None:
 
 
 def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
-    colour = image(m.ColourImage)
-    seen = read(ros.COMPRESSED_IMAGE, robot_in_ros.compressed_colour(STAMP_NS, "f", colour))
+    color = image(m.ColorImage)
+    seen = read(ros.COMPRESSED_IMAGE, robot_in_ros.compressed_color(STAMP_NS, "f", color))
     assert seen.format == "rgb8; png compressed bgr8"
-    assert np.asarray(Image.open(BytesIO(seen.data.tobytes()))).tobytes() == colour.rgb
+    assert np.asarray(Image.open(BytesIO(seen.data.tobytes()))).tobytes() == color.rgb
     for scale_m in (0.001, 0.01):
         sent = robot_in_ros.compressed_depth(STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m))
         seen = read(ros.COMPRESSED_IMAGE, sent)
@@ -160,7 +160,7 @@ def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
 def test_an_imu_has_no_orientation() -> None:
     sent = m.Imu(
         tick=0,
-        stamp_ns=0,
+        timestamp_ns=0,
         link=[3, 5],
         angular_velocity_rad_s=[(0, 0, 0), (1, 2, 3)],
         acceleration_m_s2=[(0, 0, 0), (4, 5, 6)],
@@ -202,9 +202,9 @@ def test_diagnostics(status: m.Status) -> None:
 
 
 @given(st.integers(0, 2**62))
-def test_clock_of_any_robot_time(stamp_ns: int) -> None:
-    seen = read(ros.CLOCK, ros.clock(stamp_ns)).clock
-    assert at(seen) == stamp_ns or stamp_ns >= 2**31 * 10**9
+def test_clock_of_any_robot_time(timestamp_ns: int) -> None:
+    seen = read(ros.CLOCK, ros.clock(timestamp_ns)).clock
+    assert at(seen) == timestamp_ns or timestamp_ns >= 2**31 * 10**9
 
 
 def test_text_and_marker_defaults() -> None:
@@ -238,11 +238,11 @@ class TestSteering:
     def test_a_twist_counts_from_when_it_was_sent_on_and_a_stop_whenever_it_comes(self) -> None:
         steering = Steering()
         fresh = steering.intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
-        assert fresh is not None and (fresh.stamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)
+        assert fresh is not None and (fresh.timestamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)
         assert steering.intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
         assert (steering.rejected, steering.why) == (1, "is older than 0.5 s by the times of its sender's messages")
         stop = steering.intent(self.twist(), 2 * 10**9, None, age_ns=60 * 10**9)
-        assert stop is not None and not stop.go and stop.stamp_ns == 2 * 10**9
+        assert stop is not None and not stop.go and stop.timestamp_ns == 2 * 10**9
 
     def test_direction_does_not_run_away_from_the_body(self) -> None:
         steering = Steering()

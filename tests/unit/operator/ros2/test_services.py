@@ -55,8 +55,8 @@ def test_values_of_parameters_keep_their_type(value: Any) -> None:
 
 
 def test_a_parameter_is_described_with_unit_and_range() -> None:
-    lead = Parameter("lead_s", 0.2, unit="s", about="how far ahead", least=0.0, most=1.0)
-    seen = _descriptor("control.lead_s", lead)
+    lead = Parameter("speed_kp_s", 0.2, unit="s", about="how far ahead", least=0.0, most=1.0)
+    seen = _descriptor("control.speed_kp_s", lead)
     assert (seen.description, seen.additional_constraints) == ("how far ahead [s]", ">= 0, <= 1")
     (span,) = seen.floating_point_range
     assert (span.from_value, span.to_value) == (0.0, 1.0)
@@ -75,28 +75,28 @@ class TestJointTargets:
         kind = "sensor_msgs/msg/JointState"
         return bytes(JAZZY.serialize_cdr(kinds[kind](header, names, *fields), kind))
 
-    def clock(self, stamp_ns: int, lifecycle: LifecycleState = "armed") -> Clock:
-        return msgspec.structs.replace(rig.clock(1), arming=1, stamp_ns=stamp_ns, lifecycle=lifecycle)
+    def clock(self, timestamp_ns: int, lifecycle: LifecycleState = "armed") -> Clock:
+        return msgspec.structs.replace(rig.clock(1), arm_session=1, timestamp_ns=timestamp_ns, lifecycle=lifecycle)
 
     def joints(self, angle_rad: float) -> JointState:
         return rig.state(self.robot, angle_rad)
 
     def test_named_joints_follow_and_the_others_stay(self) -> None:
         targets = JointTargets(self.robot)
-        targets.set_points(self.clock(0), self.joints(0.1))
+        targets.setpoints(self.clock(0), self.joints(0.1))
         assert targets.take(self.said(["joint_3"], position=[0.5]), 10) and targets.take(
             self.said(["joint_4"], effort=[-1.0]), 10
         )
-        points = targets.set_points(self.clock(20), self.joints(0.2))
+        points = targets.setpoints(self.clock(20), self.joints(0.2))
         assert (points.target[2], points.mode[3], points.target[3]) == (0.5, Mode.TORQUE, -1.0)
         assert set(points.target[4:]) == {0.1} and set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
 
     def test_silence_stops_where_the_joint_is(self) -> None:
         targets = JointTargets(self.robot)
         targets.take(self.said(["joint_3"], velocity=[1.0]), 0)
-        targets.set_points(self.clock(VALID_NS), self.joints(0.3))
+        targets.setpoints(self.clock(VALID_NS), self.joints(0.3))
         for angle_rad in (0.4, 0.45):
-            points = targets.set_points(self.clock(VALID_NS + 1), self.joints(angle_rad))
+            points = targets.setpoints(self.clock(VALID_NS + 1), self.joints(angle_rad))
         assert (points.mode[2], points.target[2]) == (Mode.POSITION, 0.4)
 
     @pytest.mark.parametrize(
@@ -116,24 +116,24 @@ class TestJointTargets:
         self, stamp_s: float, ros_now_s: float | None, age_s: float, why: str
     ) -> None:
         targets = JointTargets(self.robot)
-        targets.set_points(self.clock(0), self.joints(0.1))
+        targets.setpoints(self.clock(0), self.joints(0.1))
         message, now_ns = self.said(["joint_3"], stamp_s=stamp_s, position=[0.5]), 10 * 10**9
         ros_now_ns = None if ros_now_s is None else round(ros_now_s * 1e9)
         taken = targets.take(message, now_ns, ros_now_ns, round(age_s * 1e9))
         assert taken == (not why) and why in targets.why
-        assert targets.set_points(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
+        assert targets.setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
 
     def test_a_command_ends_half_a_second_after_it_was_sent(self) -> None:
         targets = JointTargets(self.robot)
         assert targets.take(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
-        assert targets.set_points(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
-        assert targets.set_points(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
+        assert targets.setpoints(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
+        assert targets.setpoints(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
 
     def test_what_was_said_before_arming_moves_nothing(self) -> None:
         targets = JointTargets(self.robot)
         targets.take(self.said(["joint_3"], position=[0.5]), 0)
-        targets.set_points(self.clock(1, "disarmed"), self.joints(0.1))
-        assert targets.set_points(self.clock(2), self.joints(0.1)).target[2] == 0.1
+        targets.setpoints(self.clock(1, "disarmed"), self.joints(0.1))
+        assert targets.setpoints(self.clock(2), self.joints(0.1)).target[2] == 0.1
 
     @pytest.mark.parametrize(
         ("names", "numbers", "why"),
@@ -149,4 +149,4 @@ class TestJointTargets:
         targets = JointTargets(self.robot)
         assert not targets.take(self.said(names, **numbers), 0) and targets.rejected == 1
         assert why in targets.why and not targets.take(b"\0\1\0\0\1", 0)
-        assert set(targets.set_points(self.clock(1), self.joints(0.1)).target) == {0.1}
+        assert set(targets.setpoints(self.clock(1), self.joints(0.1)).target) == {0.1}

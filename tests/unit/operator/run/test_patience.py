@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from snakesim_hal.wire.messages import Status
-from snakesim_operator.run.patience import Patience
+from snakesim_operator.run.patience import StartupTimeout
 from tests.unit.hal import rig
 
 ALL = ("guidance", "control")
@@ -13,18 +13,18 @@ def status(
     tick: int = 0, *, alive: Sequence[str] = ALL, ready: bool = False, waiting_for: Sequence[str] = ("guidance",)
 ) -> Status:
     return rig.status(
-        tick=tick, stamp_ns=tick * rig.PERIOD_NS, ready_to_arm=ready, alive=alive, waiting_for=waiting_for
+        tick=tick, timestamp_ns=tick * rig.PERIOD_NS, ready_to_arm=ready, alive=alive, waiting_for=waiting_for
     )
 
 
 def test_robot_time_is_counted_where_it_passes_however_slowly_the_computer_shows_it() -> None:
-    patience = Patience(ALL, 60.0)
+    patience = StartupTimeout(ALL, 60.0)
     assert not any(patience.ends(status(tick), now_s=100.0 * tick) for tick in range(1, 6001, 100))
     assert patience.ends(status(6102), now_s=0.0)
 
 
 def test_where_time_stands_still_only_that_counts_in_which_the_host_is_heard() -> None:
-    patience = Patience(ALL, 60.0)
+    patience = StartupTimeout(ALL, 60.0)
     assert not any(patience.ends(status(), now_s=3600.0 * hour) for hour in range(60))
     same = status()
     assert not any(patience.ends(same, now_s=3600.0 * hour) for hour in range(60, 160))
@@ -33,7 +33,7 @@ def test_where_time_stands_still_only_that_counts_in_which_the_host_is_heard() -
 
 
 def test_it_starts_again_with_whatever_comes() -> None:
-    patience = Patience(ALL, 60.0)
+    patience = StartupTimeout(ALL, 60.0)
     steps = [
         status(0),
         status(5000),

@@ -12,7 +12,16 @@ from snakesim_hal.wire.messages import Clock, ControlState
 from snakesim_operator.robot_commands import parameters
 from tests.unit.hal.rig import description
 
-CLOCK = Clock(tick=7, stamp_ns=70, period_ns=10, pace="lockstep", lifecycle="armed", arming=1, lease_epoch=1, newest={})
+CLOCK = Clock(
+    tick=7,
+    timestamp_ns=70,
+    period_ns=10,
+    clock_mode="lockstep",
+    lifecycle="armed",
+    arm_session=1,
+    lease_epoch=1,
+    newest={},
+)
 CHANGES = {"control.propulsion_n": 20}
 WHY = "controller obstacle_triplet (class ObstacleTriplet): update() raised ZeroDivisionError: division by zero"
 
@@ -43,7 +52,7 @@ class Control:
 
 def state(reason: str, *, failed: bool = False) -> ControlState:
     return ControlState(
-        tick=8, stamp_ns=80, controller="obstacle_triplet", state="NotLocomoting", reason=reason, failed=failed
+        tick=8, timestamp_ns=80, controller="obstacle_triplet", state="NotLocomoting", reason=reason, failed=failed
     )
 
 

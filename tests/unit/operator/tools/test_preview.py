@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Preview, SensorDescription
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Preview, SensorDescription
 from snakesim_operator.monitoring.preview import cameras_of, preview_of
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
@@ -29,7 +29,7 @@ CAMERA = {
 def depth(tick: int = 0) -> DepthImage:
     counts = np.arange(160 * 120, dtype="<u2").tobytes()
     limits = {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001}
-    return DepthImage(tick=tick, stamp_ns=tick, width=160, height=120, depth=counts, **limits, **CAMERA)
+    return DepthImage(tick=tick, timestamp_ns=tick, width=160, height=120, depth=counts, **limits, **CAMERA)
 
 
 def test_depth_keeps_its_values() -> None:
@@ -43,7 +43,7 @@ def test_depth_keeps_its_values() -> None:
 def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) -> None:
     ramp = np.zeros((120, 160, 3), dtype=np.uint8)
     ramp[..., 0] = np.linspace(0, 255, 160)
-    image = ColourImage(tick=0, stamp_ns=0, width=160, height=120, rgb=ramp.tobytes(), **CAMERA)
+    image = ColorImage(tick=0, timestamp_ns=0, width=160, height=120, rgb=ramp.tobytes(), **CAMERA)
     made = preview_of(image, width)
     seen = np.array(PIL.Image.open(io.BytesIO(made.data))).astype(int)
     assert (made.width, made.height) == expected and made.format == "jpeg" and made.scale_m is None

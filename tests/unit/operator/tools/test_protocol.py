@@ -12,7 +12,7 @@ import zenoh
 from snakesim_gnc.control.state_reports import TELEMETRY_S
 from snakesim_hal.host.host import STATUS_PERIOD_NS
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
-from snakesim_hal.safety import gate, lifecycle
+from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Description, Done, JointCommand, JointState, Mode
@@ -58,7 +58,7 @@ def test_the_modes_are_told_with_their_numbers_and_units() -> None:
 
 
 def test_every_refusal_is_told() -> None:
-    commands = {*get_args(gate.Refusal), "before_arming"}
+    commands = {*get_args(limiter.Refusal), "before_arming"}
     source = "".join(
         (REPOSITORY / name).read_text(encoding="utf-8")
         for name in (
@@ -90,7 +90,7 @@ def test_the_endpoint_is_the_default() -> None:
 ROWS = {
     "`actuator/joints`": (keys.JOINT_COMMAND, JointCommand),
     "`hal/clock`, `hal/done/*`": (keys.done("control"), Done),
-    "`sensor/depth/*`, `sensor/colour/*`": (keys.depth("head"), DepthImage),
+    "`sensor/depth/*`, `sensor/color/*`": (keys.depth("head"), DepthImage),
     "other streams": (keys.JOINTS, JointState),
     "`hal/description`, `hal/status`": (keys.DESCRIPTION, Description),
 }

@@ -26,7 +26,7 @@ def arrival(key: str, message: Message, at_ms: float) -> Arrival:
 def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     robot, traffic = description(), Traffic()
     for tick in range(100):
-        traffic.take(arrival("lab/worm/sensor/joints", state(robot, tick=tick, stamp_ns=tick * 10 * MS), 10 * tick))
+        traffic.take(arrival("lab/worm/sensor/joints", state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick))
         traffic.take(arrival("lab/worm/hal/clock", clock(tick + 2), 10 * tick + 1))
         answer = command(robot, tick=tick, sequence=tick)
         traffic.take(arrival("lab/worm/actuator/joints", answer, 10 * tick + 3))

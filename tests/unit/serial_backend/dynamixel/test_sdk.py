@@ -15,10 +15,10 @@ from dynamixel_sdk import (
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_hal.model.fault_kinds import parse
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.backend import twin_on
+from snakesim_serial_backend.dynamixel.backend import emulator_on
+from snakesim_serial_backend.dynamixel.emulator import FIRMWARE, MODEL, EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.dynamixel.twin import FIRMWARE, MODEL, DynamixelTwin
 from snakesim_serial_backend.wire import Pty
 from tests.unit.hal.rig import run_config
 
@@ -30,9 +30,9 @@ STEP_S = 0.01
 class Port(PortHandler):
     """The SDK's port; nothing more comes when all is read that the servos have said, however busy the computer is."""
 
-    def __init__(self, pty: Pty, twin: DynamixelTwin) -> None:
+    def __init__(self, pty: Pty, emulator: EmulatedDynamixel) -> None:
         super().__init__(pty.path)
-        self._pty, self._twin, self._read = pty, twin, 0
+        self._pty, self._emulator, self._read = pty, emulator, 0
         assert self.setBaudRate(1_000_000)
 
     def clearPort(self) -> None:  # noqa: N802
@@ -42,7 +42,7 @@ class Port(PortHandler):
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
         written = super().writePort(packet) or 0
         self._pty.due = (self._pty.due or 0) + written
-        self._twin()
+        self._emulator()
         return written
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
@@ -60,13 +60,15 @@ class Bench:
     def __init__(self) -> None:
         config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
         self.clock, self.pty = Clock(config), Pty()
-        self.twin: DynamixelTwin = twin_on(config, DynamixelSettings(plant="inertia"), [self.pty], self.clock, None)
-        self.port = Port(self.pty, self.twin)
+        self.emulator: EmulatedDynamixel = emulator_on(
+            config, DynamixelSettings(physics_model="inertia"), [self.pty], self.clock, None
+        )
+        self.port = Port(self.pty, self.emulator)
 
     def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
             self.clock.robot_ns += round(STEP_S * 1e9)
-            self.twin()
+            self.emulator()
 
     def enable(self) -> None:
         for servo in range(1, JOINTS + 1):
@@ -81,7 +83,7 @@ class Bench:
 
     def close(self) -> None:
         self.port.closePort()
-        self.twin.close()
+        self.emulator.close()
 
 
 @pytest.fixture
@@ -117,7 +119,7 @@ def test_goals_of_all_move_all_and_sync_reads_say_where_they_are(bench: Bench) -
 
 
 def test_whoever_is_silent_silences_all_behind_it(bench: Bench) -> None:
-    bench.twin.inject(parse("mute:joint_2@0-9"), begins=True)
+    bench.emulator.inject(parse("mute:joint_2@0-9"), begins=True)
     read = GroupSyncRead(bench.port, SDK, at.PRESENT, 10)
     for servo in (1, 2, 3):
         read.addParam(servo)
@@ -155,14 +157,14 @@ def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
 def test_an_alert_is_in_every_answer_until_a_restart_which_is_silent_for_a_while(bench: Bench) -> None:
     bench.enable()
     port = bench.port
-    bench.twin.inject(parse("overheat:joint_1@0-9"), begins=True)
+    bench.emulator.inject(parse("overheat:joint_1@0-9"), begins=True)
     bench.pass_time(0.1)
     errors, result, said = SDK.read1ByteTxRx(port, 1, at.HARDWARE_ERROR)
     assert (errors, result, said & ALERT) == (at.HardwareError.OVERHEATING, COMM_SUCCESS, ALERT)
     assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
     assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
-    bench.twin.inject(parse("overheat:joint_1@0-9"), begins=False)
-    bench.twin.body.thermal.winding_c[:] = 20.0
+    bench.emulator.inject(parse("overheat:joint_1@0-9"), begins=False)
+    bench.emulator.body.thermal.winding_c[:] = 20.0
     assert SDK.reboot(port, 1)[0] == COMM_SUCCESS
     assert SDK.ping(port, 1)[1] == COMM_RX_TIMEOUT
     bench.pass_time(0.6)

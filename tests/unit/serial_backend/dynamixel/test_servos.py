@@ -1,6 +1,6 @@
 """The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
 
-Hardware errors, restarts and lost joints are in `tests/unit/can_backend/family/test_every_family.py`.
+Hardware errors, restarts and lost joints are in `tests/unit/can_backend/can_drives/test_every_family.py`.
 """
 
 import math
@@ -15,8 +15,8 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
+from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
 from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
 
@@ -29,12 +29,12 @@ class Robot(DriveRig):
 
     def __init__(self, settings: DynamixelSettings | None = None, **dotted: Any) -> None:
         config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
-        settings = settings or DynamixelSettings(plant="inertia", bring_up_limit_s=0.5)
+        settings = settings or DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5)
         super().__init__(config, DynamixelBackend(config, settings))
 
     @property
-    def twin(self) -> DynamixelTwin:
-        return drives_of(self.backend)._twin
+    def emulator(self) -> EmulatedDynamixel:
+        return drives_of(self.backend)._emulator
 
 
 @pytest.fixture
@@ -49,8 +49,8 @@ def test_servos_stop_by_their_own_watchdog_when_the_driver_is_gone(robot: Robot)
     robot.mode, robot.target = Mode.TORQUE, 0.5
     robot.run(2, "armed")
     robot.backend._clock.robot_ns += 190_000_000
-    robot.twin()
-    assert {servo.table[at.WATCHDOG] for servo in robot.twin.servos} == {at.TRIPPED}
+    robot.emulator()
+    assert {servo.table[at.WATCHDOG] for servo in robot.emulator.servos} == {at.TRIPPED}
     found = robot.run(NOTICED, "armed")
     assert {fault.what for fault in found} == {"drive_fault"} and "watchdog" in found[0].cause
     robot.run(5, "fault")
@@ -66,9 +66,9 @@ def test_torque_mode_pushes_and_a_servo_that_is_left_alone_comes_to_a_stop_just_
     robot.run(8, "armed")
     assert robot.joints is not None
     assert robot.joints.torque_nm == pytest.approx([-0.05] * JOINTS, abs=0.004)
-    servo, twin = drives_of(robot.backend).servos[0], robot.twin.servos[0]
-    goal_rad = twin.get("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
-    assert servo.least_rad - 0.5 < goal_rad < servo.least_rad
+    servo, emulator = drives_of(robot.backend).servos[0], robot.emulator.servos[0]
+    goal_rad = emulator.get("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
+    assert servo.lower_rad - 0.5 < goal_rad < servo.lower_rad
 
 
 def test_wherever_in_its_turn_a_servo_wakes_up_its_angle_is_the_joints(robot: Robot) -> None:
@@ -87,17 +87,17 @@ def test_wherever_in_its_turn_a_servo_wakes_up_its_angle_is_the_joints(robot: Ro
 def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = DynamixelTwin.__init__
+    made = EmulatedDynamixel.__init__
 
-    def otherwise(twin: DynamixelTwin, *rest: Any) -> None:
-        made(twin, *rest)
-        first, second, third, fourth = twin.servos
+    def otherwise(emulator: EmulatedDynamixel, *rest: Any) -> None:
+        made(emulator, *rest)
+        first, second, third, fourth = emulator.servos
         first.table[7] = 9
         second.put("H", at.MODEL, 1060)
         third.put("i", at.HOMING_OFFSET, -100)
         fourth.put("H", at.CURRENT_LIMIT, 10)
 
-    monkeypatch.setattr(DynamixelTwin, "__init__", otherwise)
+    monkeypatch.setattr(EmulatedDynamixel, "__init__", otherwise)
     with pytest.raises(BackendError) as raised:
         Robot()
     words = str(raised.value)
@@ -127,13 +127,13 @@ def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_sta
 def test_a_servo_that_would_move_by_what_is_not_its_own_is_refused(
     robot: Robot, register: int, value: int, words: str
 ) -> None:
-    robot.twin.servos[2].table[register] = value
+    robot.emulator.servos[2].table[register] = value
     with pytest.raises(BackendError, match=rf"(?s)nothing was enabled.*joint_3 .*{words}"):
         drives_of(robot.backend).bring_up()
 
 
 def test_a_servo_outside_of_its_travel_is_refused() -> None:
-    elsewhere = DynamixelSettings(plant="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
+    elsewhere = DynamixelSettings(physics_model="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
     with pytest.raises(BackendError, match=r"joint_1 .*: woke up at .* rad, which no number of whole turns"):
         Robot(elsewhere)
 
@@ -142,7 +142,7 @@ def test_a_servo_outside_of_its_travel_is_refused() -> None:
     ("dotted", "words"),
     [
         ({"rate_hz": 250}, "4 servos at 250 Hz: a cycle of 282 bytes takes 4.8 ms at 1000000 baud"),
-        ({"rate_hz": 20}, "`backends.dynamixel.watchdog_s` = 0.1 s at `rate_hz` = 20: one lost set-point"),
+        ({"rate_hz": 20}, "`backends.dynamixel.watchdog_s` = 0.1 s at `rate_hz` = 20: one lost setpoint"),
         ({"robot__joints": {"joint_2": {"id": 253}}}, "joint_2: `id` = 253; ids of protocol 2.0 are 0 to 252"),
         ({"robot__joints": {"joint_2": {"port": "/dev/ttyUSB7"}}}, "joint_2: `port` = '/dev/ttyUSB7' is not among"),
         ({"robot__joints": {"joint_2": {"gear": 2.0}}}, "joint_2: its servo travels 6.00 rad, and forgets whole turns"),
@@ -168,7 +168,7 @@ SAME_DELAY, OTHER_DELAY = 250, 0  # of an answer, us / 2: a servo as delivered h
 def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int, words: str) -> None:
     """They have no serial numbers. With one return delay their answers collide, with two they follow each other."""
     robot.go_wrong("duplicate:joint_2@0-9")
-    robot.twin.servos[1].table[at.DELAY] = delay
+    robot.emulator.servos[1].table[at.DELAY] = delay
     with pytest.raises(BackendError, match=rf"(?s)not complete; .*joint_2 \(id 2 on .*\) {words}"):
         drives_of(robot.backend).bring_up()
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
@@ -185,7 +185,7 @@ def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int,
 )
 def test_a_second_servo_with_the_id_of_one_stops_the_robot(robot: Robot, delay: int, what: str, words: str) -> None:
     robot.run(20, "armed")
-    robot.twin.servos[1].table[at.DELAY] = delay
+    robot.emulator.servos[1].table[at.DELAY] = delay
     robot.go_wrong("duplicate:joint_2@0-9")
     fault = robot.run(NOTICED, "armed")[0]
     assert (fault.what, fault.joint) == (what, "joint_2") and re.search(words, fault.cause), fault

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire
+from snakesim_can_backend.emulator.firmware import Module
 from snakesim_can_backend.protocol.definitions import BROADCAST, Action, Frame, ModuleState, Opcode, node_of, opcode_of
-from snakesim_can_backend.twin.firmware import Module
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.frames import read
 from tests.unit.can_backend.loop import Loop, chain_of
@@ -59,7 +59,7 @@ def is_set_point(frame: Frame) -> bool:
 
 
 def words(frames: list[Frame]) -> list[str]:
-    """What the host said beside Syncs and set-points."""
+    """What the host said beside Syncs and setpoints."""
     found = []
     for frame in frames:
         opcode = Opcode(opcode_of(frame.id))

@@ -66,12 +66,14 @@ def test_poses_need_a_delay_that_somebody_has_stated() -> None:
 @pytest.mark.parametrize("delay_s", [0.0, 0.03])
 def test_a_pose_of_twins_is_as_old_as_the_robot_file_says(delay_s: float) -> None:
     """To the bit, in lockstep; and the description says so."""
-    with loop(config(robot__sensors__pose__delay_s=delay_s), plant="mujoco") as run:
+    with loop(config(robot__sensors__pose__delay_s=delay_s), physics_model="mujoco") as run:
         (sensor,) = [s for s in run.backend.describe().sensors if s.key == keys.POSE]
         assert sensor.delay_s == delay_s
         run.run(20)
         late = [
-            (s.joints.stamp_ns, pose.stamp_ns) for s in run.samples if isinstance(pose := s.others.get(keys.POSE), Pose)
+            (s.joints.timestamp_ns, pose.timestamp_ns)
+            for s in run.samples
+            if isinstance(pose := s.others.get(keys.POSE), Pose)
         ]
         assert {now_ns - captured_ns for now_ns, captured_ns in late} == {round(delay_s * 1e9)}
         assert len(late) == 20 - round(delay_s / 0.01)

@@ -1,4 +1,4 @@
-"""The whole driver on virtual buses with module twins: opening it, and a period."""
+"""The whole driver on virtual buses with emulated joint modules: opening it, and a period."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +10,8 @@ from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.modules import answer_limit_s
+from snakesim_can_backend.emulator.firmware import Module
+from snakesim_can_backend.emulator.server import InProcessEmulators, here
 from snakesim_can_backend.protocol.commands import command, emergency
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
@@ -23,9 +25,7 @@ from snakesim_can_backend.protocol.definitions import (
     opcode_of,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.firmware import Module
-from snakesim_can_backend.twin.server import InProcessTwins, here
-from snakesim_hal.backend import SetPoints
+from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
@@ -73,14 +73,14 @@ def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch:
 
 
 def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[Module], None]) -> None:
-    """When a driver opens its bus, one of the twins is not as new."""
+    """When a driver opens its bus, one of the emulators is not as new."""
 
-    def twins(*given: Any, **more: Any) -> InProcessTwins:
+    def emulators(*given: Any, **more: Any) -> InProcessEmulators:
         end = here(*given, **more)
         change(end.server.chain.slots[node - 1].module)
         return end
 
-    monkeypatch.setattr(modules, "twins_here", twins)
+    monkeypatch.setattr(modules, "emulators_here", emulators)
 
 
 def left_behind(module: Module, kind: str) -> None:
@@ -127,10 +127,10 @@ def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest
     asked: list[str] = []
     monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", asked.append)
     assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
-    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], twins="process")) == ("lockstep", "realtime")
+    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], emulators="process")) == ("lockstep", "realtime")
     assert asked == ["can0", "can1", "vcan0"]
     with pytest.raises(ConfigError, match="needs a bus"):
-        CanBackend.check(config(), CanSettings(twins="none"))
+        CanBackend.check(config(), CanSettings(emulators="none"))
     with pytest.raises(ConfigError, match="hold"):
         CanBackend.check(config(robot__safety__action="hold"), CanSettings())
     assert WIRES == []
@@ -144,7 +144,7 @@ def test_joints_are_described_with_the_serials_and_the_firmware_that_their_modul
 
 
 def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
-    triplet = load_scenario("triplet", [parse_set("pace=realtime")]).config
+    triplet = load_scenario("triplet", [parse_set("clock_mode=realtime")]).config
     assert answer_limit_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
     two = CanSettings(channels=["can0", "can1"])
     assert answer_limit_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
@@ -158,11 +158,11 @@ def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> 
     speeds = []
     for torque_nm in (0.0, 1.0):
         with loop() as run:
-            run.wanted = SetPoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
+            run.wanted = Setpoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
             run.arm()
 
-            def wish(tick: int, torque_nm: float = torque_nm) -> SetPoints:
-                return SetPoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
+            def wish(tick: int, torque_nm: float = torque_nm) -> Setpoints:
+                return Setpoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
 
             run.run(change_at + 5 - run.tick, wish)
             speeds.append(np.array([samples.joints.velocity_rad_s for samples in run.samples]))

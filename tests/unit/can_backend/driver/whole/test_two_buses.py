@@ -9,12 +9,12 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
 from snakesim_can_backend.protocol.commands import question
 from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, node_of, opcode_of
 from snakesim_can_backend.settings import CanSettings
-from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import InProcessTwins, TwinServer
-from snakesim_drivers.emulation.inertia import InertiaPlant, InertiaSettings
+from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
 from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire, go, is_action, is_set_point, words
@@ -24,7 +24,7 @@ from tests.unit.can_backend.loop import Loop, config
 
 
 class NoProcess:
-    """Instead of a child with the twins in it."""
+    """Instead of a child with the emulators in it."""
 
     started: list[tuple[Any, ...]] = []
     stopped = 0
@@ -42,18 +42,18 @@ class NoProcess:
 
 @pytest.fixture
 def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], Loop]]:
-    """Opens a driver for two buses with so many joints each, on twins with three and one."""
+    """Opens a driver for two buses with so many joints each, on emulators with three and one."""
     run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
-    real = CanSettings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
-    chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
-    end = InProcessTwins(TwinServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
+    real = CanSettings(channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia")
+    chain = ModuleChain(run, real, InertiaModel(run, InertiaSettings()), stepped=True)
+    end = InProcessEmulators(EmulatorServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
     monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", lambda _channel: None)
     monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
-    monkeypatch.setattr(modules, "TwinProcess", NoProcess)
+    monkeypatch.setattr(modules, "EmulatorProcess", NoProcess)
     opened: list[CanBackend] = []
 
     def open_with(joints: list[int], **settings: Any) -> Loop:
-        asked = CanSettings(channels=channels, joints_per_channel=joints, twins="process", **settings)
+        asked = CanSettings(channels=channels, joints_per_channel=joints, emulators="process", **settings)
         opened.append(CanBackend(run, asked))
         return Loop(opened[-1], run)
 

@@ -17,7 +17,7 @@ def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:
     for _ in range(9):
         steering.faster(-1, 0.0)
     intent = steering.intent(8)
-    assert (intent.speed_m_s, intent.go, intent.stamp_ns, intent.valid_for_ns) == (-0.12, True, 8, VALID_NS)
+    assert (intent.speed_m_s, intent.go, intent.timestamp_ns, intent.valid_for_ns) == (-0.12, True, 8, VALID_NS)
     steering.stop(1.0)
     assert not steering.intent(9).go
 

@@ -50,7 +50,7 @@ def test_a_stick_that_falls_silent_asks_for_nothing_any_more(monkeypatch: pytest
         intents, ticks = list[Intent](), itertools.count(1)
 
         def speeds_at_last(count: int) -> set[float | None]:
-            clocks.put(clock(next(ticks), arming=1, pace="realtime"))
+            clocks.put(clock(next(ticks), arm_session=1, clock_mode="realtime"))
             time.sleep(0.02)
             intents.extend(heard.drain())
             return {intent.speed_m_s for intent in intents[-count:]}
@@ -84,7 +84,7 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
         def be_a_robot_and_a_hand() -> None:
             os.write(write, event(time.monotonic(), ABS_Y, 0))
             for tick in itertools.takewhile(lambda tick: tick < 60, itertools.count(1)):
-                clocks.put(clock(tick, arming=1, pace="realtime"))
+                clocks.put(clock(tick, arm_session=1, clock_mode="realtime"))
                 time.sleep(0.01)
             os.close(write)
 
@@ -97,5 +97,5 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
         intents = heard.drain()
         wait_until(lambda: intents.extend(heard.drain()) or not intents[-1].go, "the stop, which is asked for last")
     assert len(intents) > 3 and {intent.speed_m_s for intent in intents[:-1]} == {0.2}
-    assert all(a.stamp_ns <= b.stamp_ns for a, b in itertools.pairwise(intents))
+    assert all(a.timestamp_ns <= b.timestamp_ns for a, b in itertools.pairwise(intents))
     assert "the joystick is gone" in capsys.readouterr().out

@@ -1,0 +1,154 @@
+"""Emulated joint modules that a driver starts itself: in its own process on a virtual bus, or as a child on vcan."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import msgspec
+
+from snakesim_can_backend.bus.bus import VirtualPeer
+from snakesim_can_backend.settings import CanSettings
+from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.terminal import print_stderr
+from snakesim_hal.model.fault_kinds import KINDS, Injection
+from snakesim_hal.model.fault_plan import check_backend_can
+from snakesim_hal.model.scenario import RunConfig, write
+from snakesim_hal.service import START_LIMIT_S
+
+READY = "modules ready"
+STOP_LIMIT_S = 5.0
+POLL_S = 0.02
+
+
+def check_emulators(config: RunConfig, settings: CanSettings) -> None:
+    """Raise ConfigError for impossible settings of the emulators."""
+    from snakesim_can_backend.emulator.faults import parse
+
+    if settings.emulators_run == "here" and settings.channels:
+        raise ConfigError(
+            f'`backends.can.emulators` = "here" is a virtual bus inside the driver, and `channels` = '
+            f"{settings.channels} "
+            f'names real ones: leave `channels` empty, or set emulators = "process"'
+        )
+    if settings.emulators_run != "here" and not settings.channels:
+        raise ConfigError(
+            f'`backends.can.emulators` = "{settings.emulators_run}" needs a bus: name it in '
+            "`backends.can.channels`, such as "
+            f'["vcan0"]'
+        )
+    if settings.faults and settings.emulators_run == "none":
+        raise ConfigError("`backends.can.faults` are for emulators; give them to `snakesim modules --fault` instead")
+    for text in settings.faults:
+        parse(text, config.robot.chain.modules)
+
+
+def check_faults(config: RunConfig, settings: CanSettings) -> None:
+    """Check that the planned faults of joints and buses are possible. Raises ConfigError."""
+    from snakesim_can_backend.emulator.faults import ABOUT
+
+    own, virtual = settings.emulators_run != "none", not settings.channels
+    does = {*KINDS["bus"]} - {"slow", "" if virtual else "full"} | ({*ABOUT} if own else set())
+    because = f"its modules support {', '.join(ABOUT)}" if own else "its modules are not the driver's own emulators"
+    because += "" if virtual else "; and a program cannot fill the queue of a kernel interface"
+    check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)
+
+
+def modules_know(injection: Injection, joints: int) -> bool:
+    """Whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
+    from snakesim_can_backend.emulator.faults import ABOUT, checked
+
+    if injection.target_type != "joint" or injection.kind not in ABOUT:
+        return False
+    checked(injection, joints)
+    return True
+
+
+def emulators_here(
+    config: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
+) -> VirtualPeer:
+    """Emulators at the other end of a virtual bus; the returned function runs them."""
+    from snakesim_can_backend.emulator.server import here
+
+    return here(config, settings, channel, pose, stepped=stepped)
+
+
+class EmulatorProcess:
+    """`snakesim modules` as a child that dies with this process."""
+
+    def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
+        """Start it, and wait until its modules are on the bus. Raises BackendError."""
+        changed = msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)})
+        arguments = ["--parent", str(os.getpid()), "--pose", pose or "none"]
+        for channel in settings.channels:
+            arguments += ["--channel", channel]
+        arguments += ["--stepped"] if stepped else []
+        try:
+            self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-", ignore_cleanup_errors=True)
+            self._said = Path(self._folder.name, "modules.log")
+            self._process = self._started(changed, arguments)
+        except OSError as error:
+            raise BackendError(f"the emulated joint modules cannot be started: {error}") from error
+        self._await_ready()
+
+    def _started(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
+        run = Path(self._folder.name, "config.json")
+        write(config, run)
+        with self._said.open("wb") as output:
+            return subprocess.Popen(
+                python_command("-m", "snakesim_can_backend.emulator.command", str(run), *arguments, "--interactive"),
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=child_environment({"PYTHONUNBUFFERED": "1"}),
+                start_new_session=True,
+            )
+
+    def how_it_ended(self) -> str | None:
+        """Its exit as text; None while it runs."""
+        code = self._process.poll()
+        return None if code is None else f"the emulated joint modules have ended, with exit code {code}"
+
+    def inject(self, fault: Injection, *, begins: bool) -> None:
+        """Begin or end a fault of a module. Raises BackendError when the child is gone."""
+        from snakesim_can_backend.emulator.faults import typed
+
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{typed(fault, begins=begins)}\n".encode())
+            self._process.stdin.flush()
+        except (OSError, ValueError) as error:  # the latter when it was stopped
+            raise BackendError(f"the emulated joint modules do not accept {fault}: {error}") from error
+
+    def stop(self) -> None:
+        """Terminate it, then kill it. Its output goes to this process's stderr."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(STOP_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        with contextlib.suppress(OSError):  # an unreadable log does not prevent ending
+            for line in self._said.read_text(encoding="utf-8", errors="replace").splitlines():
+                print_stderr(line)
+        self._folder.cleanup()
+
+    def _await_ready(self) -> None:
+        end = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < end:
+            with contextlib.suppress(OSError):
+                if READY in self._said.read_text(encoding="utf-8", errors="replace"):
+                    return
+            if self._process.poll() is not None:
+                break
+            time.sleep(POLL_S)
+        self.stop()
+        raise BackendError("the emulated joint modules did not start; see their output above")

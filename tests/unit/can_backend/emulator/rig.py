@@ -1,0 +1,139 @@
+"""One module, and whole chains, for the tests of the emulators."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from snakesim_can_backend.emulator.bus_time import Traffic
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.firmware import Module
+from snakesim_can_backend.emulator.parameters import Parameters, from_factory
+from snakesim_can_backend.emulator.reports import Readings
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command, sync
+from snakesim_can_backend.protocol.definitions import (
+    Action,
+    Frame,
+    ModuleState,
+    Opcode,
+    Operation,
+    Parameter,
+    node_of,
+    opcode_of,
+)
+from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.thermal import HeatLimits
+from snakesim_hal.wire.messages import Mode
+from tests.unit.can_backend.frames import read
+from tests.unit.can_backend.loop import config
+
+NODE = 3
+SERIAL = 0xC0FFEE
+MS = 1000.0
+BOOTED = 100 * MS
+HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
+QUIET = Readings(0, 0, 0)
+
+
+def setpoint(count: int, mode: Mode = Mode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE) -> Frame:
+    signal = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque", Mode.PASSIVE: "torque"}[mode]
+    values: dict[str, float] = {"mode": mode, "count": count % 16, signal: target, "torque_limit": limit}
+    return codec()[Opcode.SET_POINT].frame(node, **values)
+
+
+def parameter(index: int, value: float = 0.0, operation: int = Operation.WRITE, node: int = NODE) -> Frame:
+    frame = codec()[Opcode.PARAMETER_REQUEST].frame(node, index=index, value=value)
+    return Frame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])  # also operations that there are not
+
+
+def only(frames: Sequence[Frame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
+    return [read(f) for f in frames if opcode_of(f.id) == opcode and node in (None, node_of(f.id))]
+
+
+def new_module(**flash: float) -> Module:
+    values = from_factory(5.0, 6.0) | {Parameter[name.upper()]: value for name, value in flash.items()}
+    return Module(NODE, SERIAL, Parameters(values), HEAT)
+
+
+def booted(**flash: float) -> Module:
+    module = new_module(**flash)
+    module.poll(BOOTED)
+    module.frames.clear()
+    assert module.state == ModuleState.DISARMED
+    return module
+
+
+def armed(**flash: float) -> Module:
+    module = booted(**flash)
+    module.receive(command(Action.ARM), BOOTED)
+    module.frames.clear()
+    assert module.state == ModuleState.ARMED
+    return module
+
+
+def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -> ModuleChain:
+    """On the inertia physics model, with the robot's gains in every flash."""
+    run = run or config()
+    physics_model = given.pop("physics_model", None) or InertiaModel(run, InertiaSettings())
+    settings = CanSettings(**{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__})
+    made = ModuleChain(run, settings, physics_model, stepped=stepped, **given)
+    motor = run.robot.motor
+    for slot in made.slots:
+        slot.module.parameters.values |= {
+            Parameter.STIFFNESS: motor.stiffness_nm_per_rad,
+            Parameter.DAMPING: motor.damping_nm_s_per_rad,
+            Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
+        }
+    return made
+
+
+class Host:
+    """Ticks of a stepped chain with one bus: Sync, answers, setpoints."""
+
+    def __init__(self, made: ModuleChain) -> None:
+        self.chain, self.count = made, -1
+        made.take(0)
+
+    def arm(self) -> None:
+        self.tick()
+        self.chain.receive(0, command(Action.ARM))
+
+    def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+        self.count += 1
+        self.chain.receive(0, sync(self.count, self.count * 10_000))
+        frames = self.chain.take(0)
+        if target is not None:
+            for node in range(1, self.chain.count + 1):
+                self.chain.receive(0, setpoint(self.count, mode, target, 4.0, node))
+        return frames
+
+    def ticks(self, count: int, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+        """So many; the frames of the last."""
+        return [self.tick(target, mode) for _ in range(count)][-1]
+
+    def states(self) -> list[ModuleState]:
+        return [slot.module.state for slot in self.chain.slots[: self.chain.count]]
+
+
+def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], Traffic, Traffic, int]:
+    """A whole bus for some time; how late each joint state came, in periods, and the traffic."""
+    emulators = chain(config(joints, rate_hz=rate_hz), stepped=False)
+    emulators.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
+    for slot in emulators.slots:
+        slot.module.parameters.values |= {Parameter.CONTACT_EVERY: 1.0, Parameter.IMU_EVERY: 20.0}
+    emulators.advance_to(110_000.0)
+    emulators.receive(0, command(Action.ARM))
+    period_us, before = 1e6 / rate_hz, emulators.traffic()[0]
+    late: list[int] = []
+    backlog = 0
+    for tick in range(round(seconds * rate_hz)):
+        emulators.advance_to(110_000.0 + tick * period_us)
+        for answer in emulators.take(0):
+            if opcode_of(answer.id) == Opcode.JOINT_STATE:
+                late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
+        emulators.receive(0, sync(tick, 0))
+        for node in range(1, joints + 1):
+            emulators.receive(0, setpoint(tick, node=node, target=0.0))
+        backlog = max(backlog, sum(map(len, emulators.buses[0]._waiting.values())))
+    return late, before, emulators.traffic()[0], backlog

@@ -1,0 +1,201 @@
+"""All modules together: stepped and wall-clock time, what they feel, and that a run repeats."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_can_backend.emulator.chain import MAX_AT_ONCE_US
+from snakesim_can_backend.emulator.reports import ALONG, ANGLE, FORCE
+from snakesim_can_backend.protocol.commands import command, sync
+from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
+from snakesim_drivers.motion_capture.mocap_sample import MocapSample
+from snakesim_hal.physics.physics_model import LinkLoad
+from snakesim_hal.wire.messages import Imu, Mode
+from tests.unit.can_backend.emulator.rig import Host, chain, only, setpoint
+from tests.unit.can_backend.loop import config
+from tests.unit.hal.rig import pose
+
+G = 9.81
+POSE = pose(position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5))
+
+
+class Pushed:
+    """A physics model that stands still and is pushed at two links."""
+
+    step_s = 0.001
+
+    def __init__(self, joints: int) -> None:
+        self.angle_rad, self.velocity_rad_s = np.linspace(-0.5, 0.5, joints), np.zeros(joints)
+        self.steps = 0
+
+    def advance(self, torque_nm) -> None:
+        self.steps += 1
+
+    def shaft_torque_nm(self):
+        return np.full(len(self.angle_rad), 0.25)
+
+    def loads(self):
+        return [LinkLoad(0, (0.02, 0.03, 0.0), (0.0, -5.0, 0.0)), LinkLoad(2, (0.05, -0.03, 0.0), (1.0, 12.0, 999.0))]
+
+    def imu(self):
+        links = list(range(len(self.angle_rad) + 1))
+        return Imu(
+            tick=0,
+            timestamp_ns=0,
+            link=links,
+            angular_velocity_rad_s=[(float(i), 0.0, 0.0) for i in links],
+            acceleration_m_s2=[(0.0, 0.0, G)] * len(links),
+        )
+
+    def pose(self):
+        return POSE
+
+
+SENSORS: dict[str, Any] = {"robot__sensors": {"contacts": {"threshold_n": 0.1}, "imu": {}, "pose": {}}}
+
+
+ROUND = 1 << 32
+SYNCS = {  # times of Syncs in us, and steps of 1 ms that have passed by then
+    "later ones, also across the round of 32 bits": [
+        (ROUND - 15_000, 0),
+        (ROUND - 15_000, 0),
+        (ROUND - 5_000, 10),
+        (ROUND + 5_000, 20),
+        (ROUND - 5_000, 20),
+    ],
+    "a latecomer on another bus takes none, and a new host begins at its own zero": [
+        (0, 0),
+        (5_010_000, 5010),
+        (5_000_000, 5010),
+        (5_010_000, 5010),
+        (5_020_000, 5020),
+        (0, 5020),
+        (10_000, 5030),
+    ],
+    "a stray one of another clock, half an hour ahead, would be half an hour of physics": [
+        (0, 0),
+        (10_000, 10),
+        (60_010_000, 60_010),
+        (2_000_000_000, 60_010),
+        (2_000_010_000, 60_020),
+    ],
+}
+
+
+@pytest.mark.parametrize("syncs", SYNCS.values(), ids=list(SYNCS))
+def test_time_passes_only_from_sync_to_later_sync(syncs: list[tuple[int, int]]):
+    physics_model = Pushed(4)
+    made = chain(physics_model=physics_model)
+    for time_us, steps in syncs:
+        made.receive(0, sync(0, time_us))
+        made.receive(0, command(Action.IDENTIFY))
+        assert physics_model.steps == steps
+
+
+def test_two_buses_with_one_sync_time_share_one_step_of_time():
+    physics_model = Pushed(5)
+    made = chain(config(5), physics_model=physics_model, channels=["vcan0", "vcan1"])
+    for tick in range(3):
+        for channel in (0, 1):
+            made.receive(channel, sync(tick, tick * 10_000))
+    assert physics_model.steps == 20 and made.counts == [3, 2]
+    assert [s["count"] for s in only(made.take(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
+    made.receive(1, command(Action.ARM))
+    assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
+    made.receive(0, setpoint(0, node=4))
+    assert made.slots[3].module._pending is None, "node 4 is on the other bus"
+
+
+def test_forces_are_felt_by_the_link_in_front_and_the_tail():
+    made = chain(config(**SENSORS), physics_model=Pushed(4))
+    made.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
+    made.receive(0, sync(0, 0))
+    frames = made.take(0)
+    contacts = only(frames, Opcode.CONTACT)
+    assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
+    assert contacts[1]["force_y"] == pytest.approx(12.0) and contacts[1]["force_z"] == pytest.approx(204.75)
+    assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(-np.pi), (
+        "half a turn"
+    )
+    [tail] = only(frames, Opcode.TAIL_CONTACT)
+    assert tail["force_y"] == pytest.approx(-5.0) and tail["bearing"] == 0.0
+
+
+def test_neighbours_take_turns_with_their_imus():
+    made = chain(config(**SENSORS), physics_model=Pushed(4))
+    for slot in made.slots:
+        slot.module.parameters.values[Parameter.IMU_EVERY] = 4.0
+    for tick in range(4):
+        made.receive(0, sync(tick, 0))
+        gyros = only(made.take(0), Opcode.GYRO)
+        assert len(gyros) == 1 and gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
+    made.receive(0, sync(4, 0))
+    frames = made.take(0)
+    assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
+    assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
+
+
+def test_the_pose_is_sent_once_a_sync_before_the_answers():
+    sent: list[bytes] = []
+    made = chain(config(6, **SENSORS), physics_model=Pushed(6), channels=["a", "b"], send_pose=sent.append)
+    for tick in range(3):
+        for channel in (0, 1):
+            made.receive(channel, sync(tick, tick * 10_000))
+    assert len(sent) == 3
+    sample = msgspec.json.decode(sent[0], type=MocapSample)
+    assert sample.position_w == POSE.position_w and sample.angular_velocity_w == POSE.angular_velocity_w
+
+
+def run_of(seed: int) -> tuple[list, list]:
+    noisy: dict[str, Any] = {"robot__sensors": {"joints": {"angle_noise_rad": 1e-3}}, "seed": seed}
+    host = Host(chain(config(**noisy)))
+    host.arm()
+    return [host.tick(0.3 if k < 50 else -0.3) for k in range(100)], host.states()
+
+
+def test_the_same_commands_give_the_same_frames():
+    frames, states = run_of(1)
+    assert (frames, states) == run_of(1) and states == [ModuleState.ARMED] * 4
+    assert frames != run_of(2)[0]
+    angles = [s["angle"] for s in only(frames[49], Opcode.JOINT_STATE)]
+    assert angles == pytest.approx([0.3] * 4, abs=0.01)
+
+
+def test_the_watchdog_ends_within_the_step_in_stepped_time_too():
+    host = Host(chain())
+    host.arm()
+    for _ in range(5):
+        host.tick(2.0, Mode.TORQUE)
+    frames = [f for _ in range(12) for f in host.tick()]
+    assert host.states() == [ModuleState.FAULT] * 4
+    ups = [b["uptime"] for b in only(frames, Opcode.HEARTBEAT, 1) if b["last_stop"] == 3]
+    assert ups[0] == pytest.approx(0.1 + 0.05 + 0.1, abs=0.0011)
+
+
+def test_in_wall_clock_time_a_hiccup_is_caught_up_but_not_a_long_one():
+    physics_model = Pushed(4)
+    made = chain(physics_model=physics_model, stepped=False)
+    made.advance_to(150_000.0)
+    assert physics_model.steps == 150
+    made.advance_to(1_150_000.0)
+    assert physics_model.steps == 350 and made.skipped_us == 1e6 - MAX_AT_ONCE_US
+    made.advance_to(1_160_000.0)
+    assert physics_model.steps == 360
+
+
+def test_overheating_fades_torque_before_it_stops():
+    host = Host(chain(physics_model=Pushed(4)))
+    host.arm()
+    host.chain.thermal.winding_c[1] = 95.0
+    frames = host.ticks(10, 4.0, Mode.TORQUE)
+    states = only(frames, Opcode.JOINT_STATE)
+    assert [s["derated"] for s in states] == [0, 1, 0, 0]
+    assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01) and states[0]["torque"] > 3.9
+
+
+def test_what_is_out_of_range_ends_at_the_end_of_the_range_and_nothing_raises():
+    assert ANGLE.one(99.0) == 32767 and ANGLE.one(-99.0) == -32768
+    assert ANGLE.many(np.array([np.nan, np.inf, -np.inf, 0.1])) == [0, 32767, -32768, 1000]
+    assert FORCE.one(float("inf")) == 4095 and ALONG.one(float("nan")) == 0

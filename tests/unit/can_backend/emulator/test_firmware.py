@@ -1,0 +1,257 @@
+"""The rules of one module's firmware, one by one, and what holds whatever a host sends."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesim_can_backend.emulator.firmware import Module
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command, emergency, sync
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    Action,
+    LastStop,
+    ModuleFault,
+    ModuleState,
+    Opcode,
+    Parameter,
+)
+from snakesim_hal.wire.messages import Mode
+from tests.unit.can_backend.emulator.rig import (
+    BOOTED,
+    MS,
+    NODE,
+    QUIET,
+    armed,
+    booted,
+    new_module,
+    only,
+    parameter,
+    setpoint,
+)
+from tests.unit.can_backend.frames import corrupted
+
+WITHOUT_KEY = codec()[Opcode.COMMAND].frame(BROADCAST, action=Action.ARM)
+
+
+def drive(module: Module, count: int, now_us: float, **how: Any) -> None:
+    """A setpoint, and the Sync that enacts it."""
+    module.receive_setpoint(setpoint(count, **how), now_us)
+    module.sync(count, QUIET)
+
+
+def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
+    module = new_module()
+    module.poll(0.0)
+    module.receive(command(Action.IDENTIFY), 50 * MS)
+    module.receive(command(Action.ARM), 50 * MS)
+    module.sync(1, QUIET)
+    module.poll(99 * MS)
+    assert module.frames == [] and module.state == ModuleState.BOOT
+    module.poll(100 * MS)
+    [beat] = only(module.frames, Opcode.HEARTBEAT)
+    assert beat["state"] == ModuleState.DISARMED and beat["uptime"] == pytest.approx(0.1)
+    assert len(module.frames) == 1
+
+
+def test_it_beats_ten_times_a_second_and_tells_its_health_twice():
+    module = booted()
+    for k in range(1, 1001):
+        module.poll(BOOTED + k * MS)
+    assert len(only(module.frames, Opcode.HEARTBEAT)) == 10
+    assert len(only(module.frames, Opcode.HEALTH)) == 2
+
+
+def test_position_targets_end_at_the_angle_limit():
+    module = armed(angle_limit=0.5)
+    drive(module, 0, BOOTED, mode=Mode.POSITION, target=-1.0)
+    assert module.demand.target == -0.5
+
+
+@pytest.mark.parametrize(("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)])
+def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault: ModuleFault):
+    module = armed()
+    module.inside.leak, module.inside.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
+    module.poll(BOOTED + MS)
+    [beat] = only(module.frames, Opcode.HEARTBEAT)
+    assert beat[f"fault_{fault.name.lower()}"] == 1 and beat["last_stop"] == LastStop[fault.name]
+    module.inside.winding_c = 80.0 if sensed == "hot" else 20.0
+    module.receive(command(Action.CLEAR), BOOTED + 2 * MS)
+    assert module.state == ModuleState.FAULT
+    module.inside.leak, module.inside.winding_c = False, 79.0
+    module.poll(BOOTED + 3 * MS)
+    assert module.state == ModuleState.FAULT, "latched"
+    module.receive(command(Action.CLEAR), BOOTED + 3 * MS)
+    assert module.state == ModuleState.DISARMED and module.faults == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "taken"),
+    [
+        (15, 0, True),  # the first may be anything, the next is one more
+        (0, 2, True),  # one is lost, or two: that costs nothing but themselves
+        (0, 3, True),
+        (0, 4, False),  # too far ahead
+        (0, 8, False),
+        (0, 0, False),  # repeated
+        (0, 15, False),  # of before
+    ],
+)
+def test_a_set_point_that_is_no_next_one_is_dropped_and_counting_goes_on_from_it(first: int, count: int, taken: bool):
+    module = armed()
+    drive(module, first, BOOTED, target=1.0)
+    drive(module, count, BOOTED, target=2.0)
+    assert module.demand.target == pytest.approx(2.0 if taken else 1.0) and module.refused == (not taken)
+    drive(module, count + 1, BOOTED, target=3.0)
+    assert module.demand.target == pytest.approx(3.0) and module.state == ModuleState.ARMED
+
+
+def test_set_points_without_syncs_do_not_keep_a_module_alive():
+    module = armed()
+    drive(module, 0, BOOTED)
+    for k in range(1, 30):
+        module.receive_setpoint(setpoint(k, Mode.PASSIVE), BOOTED + k * 10 * MS)
+        module.poll(BOOTED + k * 10 * MS)
+    assert module.state == ModuleState.FAULT and module.last_stop == LastStop.WATCHDOG
+    assert module.demand.mode == Mode.PASSIVE
+
+
+def test_a_wrong_checksum_is_as_if_nothing_had_come():
+    module = armed()
+    drive(module, 0, BOOTED, target=1.0)
+    module.receive_setpoint(corrupted(setpoint(1, target=2.0)), BOOTED + 50 * MS)
+    module.sync(1, QUIET)
+    assert module.demand.target == pytest.approx(1.0) and module._fed_us == BOOTED and module.refused == 1
+
+
+def test_stopping_damps_until_at_rest():
+    module = armed()
+    drive(module, 0, BOOTED)
+    module.inside.speed_rad_s = 3.0
+    module.receive(command(Action.STOP), BOOTED)
+    assert module.state == ModuleState.STOPPING and module.demand[:2] == (Mode.VELOCITY, 0.0)
+    assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == Mode.VELOCITY
+    module.poll(BOOTED + 50 * MS)
+    assert module.state == ModuleState.STOPPING
+    module.inside.speed_rad_s = 0.04
+    module.poll(BOOTED + 51 * MS)
+    assert module.state == ModuleState.DISARMED and module.demand.mode == Mode.PASSIVE
+    assert module.last_stop == LastStop.STOP
+
+
+def test_stopping_ends_after_the_watchdog_s_time_and_may_be_passive():
+    module = armed(stop_mode=0, watchdog=0.05)
+    module.inside.speed_rad_s = 3.0
+    module.receive(command(Action.STOP), BOOTED)
+    assert module.demand.mode == Mode.PASSIVE
+    module.poll(BOOTED + 50 * MS)
+    assert module.state == ModuleState.DISARMED
+
+
+@pytest.mark.parametrize("frame", [WITHOUT_KEY, corrupted(command(Action.ARM))])
+def test_commands_need_key_and_checksum(frame):
+    module = booted()
+    module.receive(frame, BOOTED)
+    assert module.state == ModuleState.DISARMED
+
+
+def test_a_reboot_forgets_what_was_not_saved():
+    module = armed()
+    module.receive(command(Action.DISARM), BOOTED)
+    module.receive(parameter(Parameter.STIFFNESS, 12.0), BOOTED)
+    module.receive(parameter(Parameter.DAMPING, 2.0), BOOTED)
+    module.receive(parameter(Parameter.DAMPING, operation=2), BOOTED)
+    module.receive(command(Action.REBOOT, NODE), BOOTED)
+    assert module.state == ModuleState.BOOT
+    module.frames.clear()
+    module.poll(BOOTED + 100 * MS)
+    [beat] = only(module.frames, Opcode.HEARTBEAT)
+    assert beat["uptime"] == pytest.approx(0.1)
+    values = module.parameters.values
+    assert values[Parameter.STIFFNESS] == 0.0 and values[Parameter.DAMPING] == 2.0
+
+
+def test_the_uptime_of_a_module_stays_at_the_end_of_its_range() -> None:
+    """The protocol forbids a number that wraps around: an uptime of 0 would look like a restart."""
+    module = booted()
+    module._booted_us = -(2**32 - 50) * MS
+    beats = [codec()[Opcode.HEARTBEAT].values(module.heartbeat(at_us).data) for at_us in (0.0, 100 * MS, 500 * MS)]
+    assert [beat["uptime"] for beat in beats] == pytest.approx([4294967.246, 4294967.295, 4294967.295], abs=1e-6)
+
+
+def test_every_sync_is_answered_with_its_own_count():
+    module = booted(contact_every=4, imu_every=5, tail=1)
+    for count in range(20):
+        module.sync(count, QUIET)
+    states = only(module.frames, Opcode.JOINT_STATE)
+    assert [s["count"] for s in states] == [c % 16 for c in range(20)]
+    assert [c["count"] for c in only(module.frames, Opcode.CONTACT)] == [0, 4, 8, 12, 0]
+    assert len(only(module.frames, Opcode.TAIL_CONTACT)) == 5
+
+
+def test_a_hanging_module_repeats_its_last_state_and_hardware_opens_the_bridge():
+    module = armed()
+    drive(module, 3, BOOTED)
+    module.hangs = True
+    module.frames.clear()
+    module.sync(4, QUIET)
+    [state] = only(module.frames, Opcode.JOINT_STATE)
+    assert state["count"] == 3 and module.demand.mode == Mode.TORQUE
+    for k in range(1, 300):
+        module.poll(BOOTED + k * MS)
+        assert (module.demand.mode == Mode.PASSIVE) == (k >= 100)
+    assert not only(module.frames, Opcode.HEARTBEAT)
+    module.hangs = False
+    module.poll(BOOTED + 301 * MS)
+    assert module.last_stop == LastStop.WATCHDOG
+
+
+# --- whatever a host sends ---------------------------------------------------------------------------------
+
+ANYTHING = st.one_of(
+    st.sampled_from(list(Action)).map(command),
+    st.just(emergency()),
+    st.builds(setpoint, st.integers(0, 15), st.sampled_from(list(Mode))),
+    st.builds(corrupted, st.builds(setpoint, st.integers(0, 15))),
+    st.builds(corrupted, st.just(command(Action.ARM))),
+    st.builds(parameter, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)),
+    st.builds(sync, st.integers(0, 255), st.just(0)),
+)
+PAUSES = st.sampled_from([0.0, 1.0 * MS, 20 * MS, 120 * MS])
+
+
+def give(module: Module, frame, now_us: float) -> None:
+    opcode = frame.id >> 6
+    if opcode == Opcode.SYNC:
+        module.sync(frame.data[0], QUIET)
+    elif opcode == Opcode.SET_POINT:
+        module.receive_setpoint(frame, now_us)
+    else:
+        module.receive(frame, now_us)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(ANYTHING, PAUSES, st.booleans()), max_size=60))
+def test_only_armed_and_stopping_modules_drive_and_only_valid_set_points_feed(sent):
+    module, now_us = booted(), BOOTED
+    module.inside.speed_rad_s = 1.0
+    for frame, pause_us, leak in sent:
+        now_us += pause_us
+        module.inside.leak = leak and pause_us > 0
+        module.poll(now_us)
+        before, state, refused = module._fed_us, module.state, module.refused
+        give(module, frame, now_us)
+        if module._fed_us != before and state == ModuleState.ARMED and module.state == ModuleState.ARMED:
+            assert frame.id >> 6 == Opcode.SET_POINT and module.refused == refused
+        if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
+            assert module.demand.mode == Mode.PASSIVE
+
+
+@pytest.mark.parametrize(("voltage_v", "faults"), [(18.0, 0), (17.99, 1 << ModuleFault.VOLTAGE)])
+def test_it_is_driven_down_to_18_v_and_not_below(voltage_v: float, faults: int) -> None:
+    module = armed()
+    module.inside.voltage_v = voltage_v
+    module.poll(BOOTED + 10 * MS)
+    assert (module.faults, module.state) == (faults, ModuleState.FAULT if faults else ModuleState.ARMED)

@@ -1,0 +1,54 @@
+"""The physics model without a world."""
+
+import numpy as np
+import pytest
+
+from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
+from tests.unit.can_backend.loop import config
+
+INERTIA = 0.005 + 0.2 * 0.1**2 / 12  # of the middle joints of the test robot
+
+
+def physics_model(**settings: float) -> InertiaModel:
+    return InertiaModel(config(3), InertiaSettings(**{"drag_nm": 0.0, **settings}))
+
+
+def push(made: InertiaModel, torque_nm: float, seconds: float) -> None:
+    for _ in range(round(seconds / made.step_s)):
+        made.advance(np.full(3, torque_nm))
+
+
+def test_a_torque_speeds_up_an_inertia():
+    made = physics_model()
+    push(made, 0.1, 0.1)
+    assert made.velocity_rad_s[0] == pytest.approx(0.1 * 0.1 / INERTIA)
+    assert made.angle_rad[0] == pytest.approx(0.5 * 0.1 / INERTIA * 0.1**2, rel=0.02)
+
+
+def test_a_joint_that_is_let_go_comes_to_rest_and_never_turns_round():
+    made = physics_model(drag_nm=0.1)
+    push(made, 0.5, 0.02)
+    speeds = []
+    for _ in range(200):
+        made.advance(np.zeros(3))
+        speeds.append(made.velocity_rad_s[0])
+    assert min(speeds) == 0.0 and speeds[-1] == 0.0
+
+
+def test_an_end_stop_takes_all_motion():
+    made = physics_model()
+    push(made, 4.0, 0.5)
+    assert made.angle_rad == pytest.approx([1.5] * 3) and made.velocity_rad_s == pytest.approx([0.0] * 3)
+    push(made, -4.0, 0.005)
+    assert (made.velocity_rad_s < 0).all()
+
+
+def test_a_whole_number_of_steps_makes_a_period():
+    run = config(3, rate_hz=300)
+    steps = run.period_ns * 1e-9 / InertiaModel(run, InertiaSettings()).step_s
+    assert steps == pytest.approx(4.0)
+
+
+def test_there_is_no_world():
+    made = physics_model()
+    assert made.loads() == [] and made.imu() is None and made.pose() is None

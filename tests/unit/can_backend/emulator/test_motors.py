@@ -1,0 +1,138 @@
+"""The motors' law, and that the simulator's motors have the same one."""
+
+import numpy as np
+import pytest
+
+from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
+from snakesim_hal.backend import Setpoints
+from snakesim_hal.model.scenario import load
+from snakesim_hal.physics.motors import Motors
+from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.physics_model import MujocoPhysicsModel
+from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
+from tests.unit.can_backend.loop import config
+
+STEP_S, RESPONSE_S, RATED_NM, SPEED = 1e-3, 0.01, 4.0, 5.0
+REST = np.zeros(1)
+
+
+def motor(**robot):
+    run = config(1, **{f"robot__{key}": value for key, value in robot.items()})
+    return Motors(run.robot, STEP_S), run
+
+
+def drive(motors, mode, target, limit=RATED_NM):
+    motors.drive(0, mode, target, limit, 40.0, 1.0, SPEED)
+
+
+def test_torque_mode_follows_as_a_first_order_lag():
+    motors, _ = motor()
+    drive(motors, Mode.TORQUE, 2.0)
+    for k in range(1, 40):
+        assert motors.step(REST, REST)[0] == pytest.approx(2.0 * (1 - np.exp(-k * STEP_S / RESPONSE_S)))
+
+
+def test_a_motor_without_response_time_answers_at_once():
+    motors, _ = motor(motor__response_time_s=0.0)
+    drive(motors, Mode.TORQUE, 2.0)
+    assert motors.step(REST, REST)[0] == pytest.approx(2.0)
+    drive(motors, Mode.PASSIVE, 0.0)
+    assert motors.step(REST, REST)[0] == 0.0
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_change_of_mode_moves_torque_only_as_the_motor_responds(mode):
+    motors, _ = motor()
+    drive(motors, Mode.TORQUE, 3.0)
+    for _ in range(100):
+        motors.step(REST, REST)
+    drive(motors, mode, -3.0)
+    after = motors.step(REST, REST)[0]
+    assert abs(after - 3.0) <= 2 * RATED_NM * (10 + 1) * (1 - np.exp(-STEP_S / RESPONSE_S)) and after > -RATED_NM
+    motors, _ = motor()
+    drive(motors, Mode.TORQUE, 3.0)
+    motors.torque_nm[:] = 3.0
+    drive(motors, Mode.PASSIVE, 0.0)
+    assert motors.step(REST, REST)[0] == pytest.approx(3.0 * np.exp(-STEP_S / RESPONSE_S))
+
+
+def test_torque_stays_within_rated_and_the_set_point_s_limit_which_takes_hold_as_the_motor_can_follow():
+    motors, _ = motor()
+    drive(motors, Mode.TORQUE, 30.0, limit=9.0)
+    for _ in range(200):
+        assert motors.step(REST, REST)[0] <= RATED_NM
+    drive(motors, Mode.TORQUE, 30.0, limit=1.0)
+    first = motors.step(REST, REST)[0]
+    assert first == pytest.approx(RATED_NM * np.exp(-STEP_S / RESPONSE_S))
+    for _ in range(50):
+        motors.step(REST, REST)
+    assert motors.torque_nm[0] == 1.0
+
+
+def test_torque_fades_to_nothing_at_the_limit_of_speed_and_is_full_below_nine_tenths():
+    motors, _ = motor()
+    drive(motors, Mode.TORQUE, RATED_NM)
+    for speed, torque in ((0.89 * SPEED, RATED_NM), (SPEED, 0.0), (0.95 * SPEED, 0.5 * RATED_NM)):
+        for _ in range(200):
+            motors.step(REST, np.array([speed]))
+        assert motors.torque_nm[0] == pytest.approx(torque, abs=1e-6)
+    motors, _ = motor()
+    assert motors.step(REST, np.array([3 * SPEED]))[0] == 0.0, "and none when passive"
+
+
+def test_position_mode_of_the_shipped_robot_is_stable_at_1_ms_and_arrives():
+    run = load("triplet").config
+    physics_model = InertiaModel(run, InertiaSettings())
+    motors, m = Motors(run.robot, physics_model.step_s), run.robot.motor
+    for i in range(13):
+        motors.drive(i, Mode.POSITION, 0.4, 7.0, m.stiffness_nm_per_rad, m.damping_nm_s_per_rad, 7.5)
+    for _ in range(1000):
+        physics_model.advance(motors.step(physics_model.angle_rad, physics_model.velocity_rad_s))
+    assert physics_model.angle_rad == pytest.approx([0.4] * 13, abs=0.1 / 60 + 1e-4)
+    assert np.abs(physics_model.velocity_rad_s).max() < 1e-3
+
+
+def test_heat_bounds_the_torque_and_says_so():
+    motors, _ = motor()
+    drive(motors, Mode.TORQUE, 3.0)
+    motors.step(REST, REST)
+    motors.derate(np.array([0.5]))
+    assert motors.derated()[0]
+    for _ in range(100):
+        motors.step(REST, REST)
+    assert motors.torque_nm[0] == RATED_NM / 2
+    drive(motors, Mode.TORQUE, 1.0)
+    motors.step(REST, REST)
+    assert not motors.derated()[0]
+    drive(motors, Mode.TORQUE, 3.0, limit=RATED_NM / 4)
+    for _ in range(100):
+        motors.step(REST, REST)
+    assert motors.torque_nm[0] == RATED_NM / 4, "what is asked for is not reduced once more"
+
+
+def test_the_simulator_s_motors_do_the_same():
+    run = load("triplet").config
+    count, motor, limits = run.robot.chain.modules, run.robot.motor, run.robot.limits
+    fine_s = 2e-4
+    sim = SimBackend(run, SimSettings(timestep_s=fine_s))
+    physics_model = MujocoPhysicsModel(run, PhysicsModelSettings(timestep_s=fine_s))
+    motors = Motors(run.robot, physics_model.step_s)
+    swing = 0.1 * np.sin(np.arange(count))
+    for mode, target in (
+        (Mode.POSITION, physics_model.angle_rad + swing),
+        (Mode.VELOCITY, 3 * swing),
+        (Mode.TORQUE, 5 * swing),
+    ):
+        damping = motor.damping_nm_s_per_rad if mode == Mode.POSITION else motor.velocity_gain_nm_s_per_rad
+        for i in range(count):
+            gains = (motor.stiffness_nm_per_rad, damping, limits.speed_rad_s)
+            motors.drive(i, mode, float(target[i]), limits.torque_nm, *gains)
+        for _ in range(4):
+            sim.enact(Setpoints([mode] * count, target.tolist(), [limits.torque_nm] * count), "armed")
+            sim.advance()
+            for _ in range(round(run.period_ns * 1e-9 / physics_model.step_s)):
+                physics_model.advance(motors.step(physics_model.angle_rad, physics_model.velocity_rad_s))
+        truth = sim.true_state()
+        assert physics_model.angle_rad == pytest.approx(truth.angles_rad, abs=1e-3)
+        assert motors.torque_nm == pytest.approx(truth.torques_nm, abs=0.05)

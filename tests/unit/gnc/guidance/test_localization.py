@@ -1,0 +1,92 @@
+"""Where the robot is: with and without a pose sensor, with late, noisy and jumping poses; the covariance is honest."""
+
+import math
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.guidance.body_history import Base, BodyHistory
+from snakesim_gnc.guidance.perceived_world import quaternion_of
+from snakesim_hal.model.kinematics import rotation_from_quaternion
+from tests.unit.gnc.guidance.drive import STEP_NS, Drive, random_field
+from tests.unit.gnc.guidance.rendered import turned
+
+
+def errors_m(drive: Drive, places) -> list[float]:
+    return [math.dist(drive.world.localizer.base.planar_w[:2], here.base_w[:2]) for here in places]
+
+
+def test_with_a_pose_sensor_it_is_at_least_as_sure_as_that():
+    drive = Drive([])
+    off = errors_m(drive, drive.turns(100, images=False))
+    assert np.median(off[5:]) < 0.0008 and drive.world.localizer.position_sd_m < 0.001
+
+
+def test_dead_reckoning_knows_how_wrong_it_is():
+    drive = Drive([])
+    off = errors_m(drive, drive.turns(250, pose=False, images=False))
+    sd = drive.world.localizer.position_sd_m
+    assert off[-1] < 0.15 and off[-1] < 3 * sd  # of 1 m that it has gone
+    assert drive.world.localizer.position_sd_m > 0.02
+    assert abs(drive.world.localizer.base.planar_w[2] - drive.place(drive.turn - 1).base_w[2]) < 0.02
+
+
+def test_a_snake_that_does_not_move_its_joints_stays():
+    drive = Drive([], speed_m_s=0.0)
+    off = errors_m(drive, drive.turns(250, pose=False, images=False))
+    assert max(off) < 0.005
+
+
+def test_the_map_corrects_dead_reckoning():
+    off: dict[bool, float] = {}
+    for images in (False, True):
+        drive = Drive(random_field(1))
+        list(drive.turns(20))  # it begins with a pose
+        drive.world.localizer.pose_timestamp_ns = None
+        off[images] = errors_m(drive, drive.turns(250, pose=False, images=images))[-1]
+        assert off[images] < 4 * drive.world.localizer.position_sd_m
+    assert off[True] < 0.5 * off[False] and off[True] < 0.03
+
+
+def test_a_pose_that_jumps_is_not_believed_until_it_stays():
+    drive = Drive([])
+    *_, here = drive.turns(50, images=False)
+    for here in drive.turns(10, pose=False, images=False):
+        drive.world.take_pose(drive.pose(here, off_m=0.3))
+    assert abs(drive.world.localizer.base.planar_w[0] - here.base_w[0]) < 0.03 and drive.world.localizer.refused == 10
+    for here in drive.turns(20, pose=False, images=False):
+        drive.world.take_pose(drive.pose(here, off_m=0.3))
+    assert drive.world.localizer.base.planar_w[0] == pytest.approx(here.base_w[0] + 0.3, abs=0.005)
+
+
+def test_a_late_pose_corrects_what_has_happened_since():
+    drive = Drive([])
+    late: list = []
+    for here in drive.turns(150, pose=False, images=False):
+        late.append(drive.pose(here))
+        if len(late) > 10:  # 0.2 s, in which it goes 4 cm
+            drive.world.take_pose(late.pop(0))
+    assert math.dist(drive.world.localizer.base.planar_w[:2], drive.place(drive.turn - 1).base_w[:2]) < 0.012
+
+
+def test_the_history_gives_the_body_at_any_stamp_it_has_and_no_other():
+    drive = Drive([])
+    history = BodyHistory(drive.robot)
+    places = [drive.place(k) for k in range(60)]
+    for k, here in enumerate(places):
+        history.add(k * STEP_NS, Base(np.array(here.base_w), 0.04, np.eye(3)), here.angles_rad.tolist())
+    assert history.body_at(0) is None  # longer ago than it remembers
+    half = history.body_at(int(40.5 * STEP_NS))
+    assert half is not None
+    middle = 0.5 * (places[40].head_w + places[41].head_w)
+    assert np.abs(half.head_w - middle).max() < 1e-4
+    assert history.body_at(59 * STEP_NS + 10 * STEP_NS) is None
+    history.move(np.array(places[50].base_w[:2]), np.array([0.1, 0.0, 0.0]))
+    moved = history.base_at(55 * STEP_NS)
+    assert moved is not None and moved.planar_w[0] == pytest.approx(places[55].base_w[0] + 0.1)
+
+
+def test_quaternions_go_there_and_back():
+    for angles in ((0.3, 0.2, -0.1), (3.1, 0.0, 0.0), (-2.0, 1.2, 3.0), (0.0, -1.5, 1.0)):
+        rotation = turned(*angles)
+        assert rotation_from_quaternion(quaternion_of(rotation)) == pytest.approx(rotation)

@@ -1,0 +1,171 @@
+"""The limiter: what is refused and why, what is changed and how that is named."""
+
+from typing import Any, get_args
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.safety.lease import Lease
+from snakesim_hal.safety.limiter import JointLimits, Refusal, as_setpoints, refuse
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
+from tests.unit.hal.rig import LEASE_NS, command, description
+from tests.unit.hal.safety.gate_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
+
+
+def judge(given: JointCommand, **changes: Any) -> Refusal | None:
+    values: dict[str, Any] = {"lease": LEASE, "now_ns": 900, "tick": 5, "last_sequence": 0, "age_ns": 0} | changes
+    limits = values.pop("limits", LIMITS)
+    return refuse(given, limits=limits, **values)
+
+
+# --- refusals --------------------------------------------------------------------------------------------------
+
+SERVOS = JointLimits.of(description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}}))
+NAN, INF = float("nan"), float("inf")
+REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
+    "no_lease": [({}, {"lease": Lease(epoch=1)}), ({}, {"now_ns": 1001})],
+    "wrong_epoch": [({"lease_epoch": 0}, {}), ({"lease_epoch": 2}, {})],
+    "replayed": [({"sequence": 1}, {"last_sequence": 1}), ({"sequence": 1}, {"last_sequence": 2})],
+    "from_the_future": [({"tick": 6}, {})],
+    "stale": [
+        ({"valid_for_ns": 10}, {"age_ns": 11}),
+        ({"valid_for_ns": 2**62}, {"age_ns": LEASE_NS + 1}),  # nobody may ask for more than a lease term
+        ({"valid_for_ns": 2**62}, {"age_ns": 2**61}),
+    ],
+    "wrong_layout": [({"layout": "of another robot"}, {})],
+    "wrong_length": [
+        ({"target": [0.0] * (JOINTS - 1)}, {}),
+        ({"target": [0.0] * (JOINTS + 1)}, {}),
+        ({"target": []}, {}),
+        ({"mode": [Mode.POSITION] * (JOINTS + 1)}, {}),
+        ({"mode": [], "target": []}, {}),
+        ({"torque_limit_nm": [1.0]}, {}),
+        ({"torque_limit_nm": []}, {}),
+    ],
+    "wrong_mode": [
+        ({"mode": [Mode.POSITION, Mode.TORQUE, Mode.POSITION]}, {"limits": SERVOS}),
+        ({"mode": [Mode.VELOCITY] * JOINTS}, {"limits": SERVOS}),
+    ],
+    "not_finite": [
+        ({"target": [0.0, NAN, 0.0]}, {}),
+        ({"target": [INF, 0.0, 0.0]}, {}),
+        ({"target": [0.0, 0.0, -INF]}, {}),
+        ({"target": [NAN] * JOINTS, "mode": [Mode.PASSIVE] * JOINTS}, {}),
+        ({"torque_limit_nm": [1.0, NAN, 1.0]}, {}),
+        ({"torque_limit_nm": [1.0, INF, 1.0]}, {}),
+    ],
+}
+
+
+def test_a_good_command_passes() -> None:
+    assert judge(command(ROBOT)) is None
+    assert judge(command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
+    assert judge(command(ROBOT, tick=5), now_ns=1000) is None
+    assert judge(command(ROBOT, valid_for_ns=10), age_ns=10) is None
+    assert judge(command(ROBOT, valid_for_ns=0), age_ns=0) is None
+    assert judge(command(ROBOT, mode=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]), limits=SERVOS) is None
+
+
+@pytest.mark.parametrize(("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases])
+def test_refused_with_its_reason(reason: Refusal, case: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    changes, circumstances = case
+    assert judge(command(ROBOT, **changes), **circumstances) == reason
+
+
+def test_every_reason_is_tried() -> None:
+    assert list(REFUSED) == list(get_args(Refusal))
+
+
+def test_what_is_checked_first_is_told_first() -> None:
+    worse: list[tuple[Refusal, dict[str, Any], dict[str, Any]]] = [
+        ("not_finite", {"target": [NAN] * JOINTS}, {}),
+        ("wrong_length", {"torque_limit_nm": [1.0]}, {}),
+        ("wrong_layout", {"layout": "other"}, {}),
+        ("stale", {"valid_for_ns": 10}, {"age_ns": 11}),
+        ("from_the_future", {"tick": 6}, {}),
+        ("replayed", {}, {"last_sequence": 1}),
+        ("wrong_epoch", {"lease_epoch": 0}, {}),
+        ("no_lease", {}, {"now_ns": 1001}),
+    ]
+    worst: dict[str, Any] = {}
+    around: dict[str, Any] = {}
+    for reason, changes, circumstances in worse:
+        worst |= changes
+        around |= circumstances
+        assert judge(command(ROBOT, **worst), **around) == reason
+
+
+# --- heat ------------------------------------------------------------------------------------------------------
+
+
+def test_heat_bounds_the_torque_limit_and_is_named() -> None:
+    share = np.array([1.0, 0.5, 0.25])
+
+    def judged(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
+        applied = limited(asked, every(), before(Mode.TORQUE, 2.0), share)
+        return applied.torque_limit_nm.tolist(), words(asked, applied, every(), share)
+
+    assert judged(command(ROBOT, 2.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"})
+    assert judged(command(ROBOT, 9.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {0: "torque", 1: "thermal", 2: "thermal"})
+    assert judged(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[2.0] * 3)) == ([2.0, 2.0, 1.0], {2: "thermal"})
+    assert judged(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[1.0] * 3))[1] == dict.fromkeys(range(3), "torque")
+    far = judged(command(ROBOT, 9.0, Mode.POSITION))[1]
+    assert far == dict.fromkeys(range(3), "angle")  # a target that was changed is named by what changed it
+    assert judged(command(ROBOT, 9.0, Mode.PASSIVE))[1] == {}
+
+
+# --- words -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "wanted", "word"),
+    [
+        (Mode.POSITION, 2.0, "angle"),
+        (Mode.POSITION, -2.0, "angle"),
+        (Mode.POSITION, 1.0, "angle_rate"),
+        (Mode.POSITION, 1.5, "angle_rate"),
+        (Mode.POSITION, -1.5, "angle_rate"),
+        (Mode.VELOCITY, 6.0, "speed"),
+        (Mode.VELOCITY, -4.0, "acceleration"),
+        (Mode.VELOCITY, 5.0, "acceleration"),
+        (Mode.TORQUE, 5.0, "torque"),
+        (Mode.TORQUE, 4.0, "torque_rate"),
+        (Mode.TORQUE, -3.0, "torque_rate"),
+        (Mode.POSITION, 0.01, None),
+        (Mode.VELOCITY, 0.5, None),
+        (Mode.TORQUE, 0.5, None),
+        (Mode.PASSIVE, 3.0, None),
+    ],
+)
+def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word: str | None) -> None:
+    asked = command(ROBOT, [0.0, wanted, 0.0], mode)
+    applied = limited(asked, every(), before(mode))
+    assert words(asked, applied, every()) == ({} if word is None else {1: word})
+
+
+def test_set_points_for_the_backend_are_plain_python() -> None:
+    applied = applied_for(command(ROBOT, 0.01))
+    points = as_setpoints(applied, frozenset({1}))
+    assert points.isolated == {1}
+    assert points.mode == [Mode.POSITION] * JOINTS and all(type(m) is Mode for m in points.mode)
+    assert all(type(value) is float for value in points.target + points.torque_limit_nm)
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "delay_ms", "oldest_ms"),
+    [(10, 0, 30), (1, 0, 30), (20, 0, 60), (40, 0, 100), (10, 5, 35), (10, 40, 50)],
+)
+def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: int) -> None:
+    """Three periods, or 30 ms, and its delay; never longer than the lease."""
+    period_ns = period_ms * 1_000_000
+    sensor = SensorDescription(key=keys.JOINTS, rate_hz=100.0, delay_s=delay_ms * 1e-3)
+    lease_ns = min(max(5 * period_ns, 50_000_000), 100_000_000)
+    robot = msgspec.structs.replace(ROBOT, period_ns=period_ns, lease_ns=lease_ns, sensors=[sensor])
+    assert JointLimits.of(robot).oldest_state_ns == oldest_ms * 1_000_000
+
+
+def test_a_robot_that_lists_no_joint_sensor_has_none_that_is_late() -> None:
+    robot = msgspec.structs.replace(ROBOT, sensors=[])
+    assert JointLimits.of(robot).oldest_state_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns

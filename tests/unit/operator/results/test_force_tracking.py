@@ -1,0 +1,58 @@
+"""Solved against measured forces: aligned in time, judged only while the body locomotes, and in a run's summary."""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.wire.messages import ControlState, WorldContact
+from snakesim_operator.results.force_tracking import force_tracking
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.summary import summarise
+
+EVERY_NS = 50_000_000
+
+
+def state(
+    k: int, desired_force_n: list[float], measured_force_n: list[float | None], *, moves: bool = True
+) -> ControlState:
+    points = [
+        WorldContact(
+            link=0, obstacle=f"peg_{i}", body_s_m=0.1 * i, position_w=(0.0, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+            tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 1.0, 0.0),
+        )
+        for i in range(len(desired_force_n))
+    ]  # fmt: skip
+    return ControlState(
+        tick=5 * k, timestamp_ns=k * EVERY_NS, controller="any", state="Locomoting" if moves else "NotLocomoting",
+        reason="", push_points=points, desired_force_n=desired_force_n, measured_force_n=measured_force_n,
+    )  # fmt: skip
+
+
+def test_forces_that_come_a_moment_after_they_were_solved_for_have_come_true():
+    solved = np.random.default_rng(1).uniform(2.0, 20.0, (60, 3)).tolist()
+    found = force_tracking([state(k, solved[k], solved[k - 2] if k > 1 else [0.0] * 3) for k in range(60)])
+    assert found is not None and found.correlation == pytest.approx(1.0)
+    assert found.median_error == pytest.approx(0.0) and found.empty == 0.0
+
+
+def test_empty_push_points_count_and_what_nobody_can_judge_does_not():
+    moving = [state(k, [4.0, 10.0, 0.2], [3.0, 0.0, 9.0]) for k in range(20)]
+    found = force_tracking(moving)
+    assert found is not None and found.empty == 0.5 and found.median_error == pytest.approx((0.25 + 1.0) / 2)
+    assert (
+        force_tracking([state(k, [4.0], [0.0], moves=False) for k in range(20)]) is None
+    )  # friction may take all of it
+    assert force_tracking([state(k, [4.0], []) for k in range(20)]) is None  # no sensor tells
+    assert force_tracking([state(k, [4.0], [None]) for k in range(20)]) is None
+
+
+def test_the_summary_of_a_run_tells_how_well_its_forces_came_true(record: RunRecord):
+    assert any(one.measured_force_n and max(n or 0.0 for n in one.measured_force_n) > 1.0 for one in record.control)
+    summary = summarise(record, "complete")
+    assert summary.desired_force_correlation is not None and -1.0 <= summary.desired_force_correlation <= 1.0
+    assert summary.desired_force_error is not None and summary.empty_push_points is not None
+    assert summary.desired_force_error > 0.0 and 0.0 < summary.empty_push_points < 0.5
+    blind = [msgspec.structs.replace(one, measured_force_n=[]) for one in record.control]
+    assert summarise(dataclasses.replace(record, control=blind), "complete").desired_force_error is None
