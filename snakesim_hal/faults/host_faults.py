@@ -26,6 +26,6 @@ class HostFaults(Injector):
         self._tick = stamp_ns // self._period_ns
         return super().turn(stamp_ns, arming, lifecycle)
 
-    def _note(self, text: str, _now_s: float) -> None:
+    def _note(self, text: str, now_s: float) -> None:
         if len(self.noted) < MAX_KEPT:
             self.noted.append(f"tick {self._tick}: {text}")
