@@ -17,7 +17,8 @@ class Braking:
 
     def __init__(self, limits_ns: Sequence[int], *, holds: bool) -> None:
         """limits_ns: of every joint; holds: the stop mode is `hold`, which has no end."""
-        self._limits_ns, self._holds = limits_ns, holds
+        self._limits_ns = limits_ns
+        self._holds = holds
         self._began_ns: int | None = None
         self._done: set[int] = set()  # joints, in this fault
 
@@ -35,8 +36,10 @@ class Braking:
         """
         if self._began_ns is None:
             self._began_ns = now_ns
+        braked_ns = now_ns - self._began_ns
         for i in following:
-            if modes[i] == Mode.PASSIVE or self._is_over(i, abs(float(velocity_rad_s[i])), now_ns - self._began_ns):
+            speed_rad_s = abs(float(velocity_rad_s[i]))
+            if modes[i] == Mode.PASSIVE or self._is_over(i, speed_rad_s, braked_ns):
                 self._done.add(i)
         return following - self._done
 

@@ -22,7 +22,10 @@ class DriveGuard:
             gap_ns: A pause of the driver after which watchdogs of drives may have expired.
             grace_ns: Time after a reset in which drives may still report an error from before it.
         """
-        self._clock_ns, self._gap_ns, self._grace_ns = clock_ns, gap_ns, grace_ns
+        self._clock_ns = clock_ns
+        self._gap_ns = gap_ns
+        self._grace_ns = grace_ns
+        # The driver's own times.
         self._active_ns: int | None = None  # when the driver last used the bus
         self._reset_ns: int | None = None
         self._away = False

@@ -27,6 +27,5 @@ class HostFaults(Injector):
         return super().turn(timestamp_ns, arm_session, lifecycle)
 
     def _note(self, text: str, now_s: float) -> None:
-        del now_s
         if len(self.noted) < MAX_KEPT:
             self.noted.append(f"tick {self._tick}: {text}")

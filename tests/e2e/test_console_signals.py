@@ -12,12 +12,16 @@ import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report import page
+from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
-from tests.browser import CHROMIUM, MISSING, Tab, chromium
+from tests.browser import CHROMIUM, MISSING, Browser, Tab, chromium
 from tests.harness.wait import wait_until
 from tests.screenshots import recording
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
+
+READABLE_PX = 9.0  # height of a text
 
 
 def searched(tab: Tab, words: str, then: str) -> None:
@@ -78,6 +82,7 @@ def test_signals_are_searched_put_beside_each_other_pointed_at_and_saved(tmp_pat
         assert not tab.errors, tab.errors
         with pytest.raises(HTTPError):  # as an image of another site would ask
             urlopen(f"{address.rstrip('/')}/signals/go?time_s=1")
+        labels_of_the_report_are_read_on_a_phone(browser, record, tmp_path)
     with (tmp_path / "signals.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     column = [float(row["angle_rad.joint_5 [rad]"]) for row in rows if row["angle_rad.joint_5 [rad]"]]
@@ -86,6 +91,19 @@ def test_signals_are_searched_put_beside_each_other_pointed_at_and_saved(tmp_pat
     words = "".join(drawing.itertext())
     assert measured in words and "torque_nm.joint_6, N·m" in words
     assert (tmp_path / "signals.png").read_bytes().startswith(b"\x89PNG")
+
+
+def labels_of_the_report_are_read_on_a_phone(browser: Browser, record: RunRecord, folder: Path) -> None:
+    """Those of the scales in its drawings; a browser is there, and so is a run."""
+    (folder / "report.html").write_text(page(record, summarise(record, "complete")), encoding="utf-8")
+    phone = browser.open((folder / "report.html").as_uri(), 400, 900)
+    phone.size(400, 900, mobile=True)
+    phone.wait_for("Playback")
+    heights = phone.value(
+        "[...document.querySelectorAll('.figure text.small')]"
+        ".filter(label => /^\\d+ (cm|m|N)$/.test(label.textContent)).map(label => label.getBoundingClientRect().height)"
+    )
+    assert len(heights) >= 2 and min(heights) >= READABLE_PX
 
 
 AXIS = "document.querySelector('.plot').layout.yaxis.range"

@@ -68,7 +68,7 @@ def test_a_service_of_a_file_publishes_a_pose_in_processes_and_in_one(home: Path
 WRONG = {
     "no such class": ("MotionCaptuer", "no 'MotionCaptuer', as in", "classes in it are MotionCapture, Another, Bare"),
     "another name": ("Another", "calls itself 'another'", "[services.another]"),
-    "no service": ("Bare", "has no urgent, configure, outputs, silence, pause", "snakesim_hal/service.py"),
+    "no service": ("Bare", "has no urgent, too_slow, configure, outputs, silence, pause", "snakesim_hal/service.py"),
 }
 
 

@@ -44,5 +44,5 @@ def test_drives_without_torque_mode_push_by_their_shape():
 def test_a_body_that_nothing_can_push_moves_on_towards_its_goal():
     alone = {"scene.random_field": [], "scene.pegs_along_route": [], "start.on_route": False}
     found = snakesim.run("surveyed_clutter", controller="obstacle_aided", duration=6, set=alone).summary
-    assert "in search of contacts" in (found.last_reason or "")
+    assert "in search of contacts" in (found.reported_reason or "")
     assert (found.advance_m or 0.0) > 0.2  # 0.00 with a wave that travels to the tail

@@ -1,8 +1,8 @@
-"""Hidden faults of emulated robots, one trial of each kind; `python -m tests.harness.commissioning_trials` has more."""
+"""Hidden faults of emulated robots, one trial of each kind; `python -m tests.commissioning_trials` has more."""
 
 import pytest
 
-from tests.harness.commissioning_trials import NONE, check_trial, identify_trials
+from tests.commissioning_trials import NONE, check_trial, identify_trials
 
 
 @pytest.mark.parametrize("fault", ["backlash", NONE])

@@ -103,7 +103,8 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
     written(tmp_path / "a.mcap", damaged)
     ended = snakesim(*command, cwd=tmp_path)
     assert ended.code == INCOMPLETE, ended
-    assert ended.err.startswith("snakesim: incomplete: a.mcap lacks ") and len(ended.err.splitlines()) == 1
+    said = [line for line in ended.err.splitlines() if "update() took" not in line]  # a busy computer
+    assert len(said) == 1 and said[0].startswith("snakesim: incomplete: a.mcap lacks ")
     assert ("breaks off at" if damage == "halved" else "actuator/joints") in ended.err
     if "--json" in command:
         assert json.loads(ended.out)["lacks"]["a"] and not json.loads(ended.out)["lacks"]["b"]

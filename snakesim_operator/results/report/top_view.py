@@ -27,6 +27,8 @@ from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGES
 
 MAX_POINTS = 1500  # of the route
 ROUND = 12  # corners of a circle
+LARGEST_TEXT = 25.0  # of a scale's label on a phone, in page.css
+BETWEEN_SCALES = 40.0
 
 
 def top_view(record: RunRecord, instant: Instant, view: View) -> str:
@@ -157,9 +159,10 @@ def scales(view: View) -> str:
     """Bars of length and of force, and which way the axes point."""
     y = view.height - 10
     metres = round_below(0.25 * (view.width - 2 * EDGE) / view.scale)
+    length = f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m"
     x = EDGE
-    parts = [scale_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
-    x += metres * view.scale + text_width(f"{metres * 100:g} cm") + 34
+    parts = [scale_bar(x, y, metres * view.scale, length)]
+    x += metres * view.scale + text_width(length, LARGEST_TEXT) + BETWEEN_SCALES
     if view.force_scale > 0:
         newtons = round_below(0.8 * LONGEST_ARROW / view.force_scale)
         parts.append(scale_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))

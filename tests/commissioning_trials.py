@@ -1,6 +1,6 @@
 """Emulated robots with a hidden fault, and what the joint check and the system identification find of it.
 
-    python -m tests.harness.commissioning_trials check|identify --first 1000 --trials 70
+    python -m tests.commissioning_trials check|identify --first 1000 --trials 70
 
 Every trial is a robot of its own, by its number, which is its seed: the joint, the size of its fault, the friction of
 the floor, how straight a person laid the robot, and what its motors are. It prints each trial in which something was
