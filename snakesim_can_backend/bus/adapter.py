@@ -150,7 +150,7 @@ def hear_own_group(bus: can.BusABC) -> None:
     the computer has joined.
     """
     with socket.socket(fileno=os.dup(bus.fileno())) as own:
-        if own.driver_type == socket.AF_INET:
+        if own.family == socket.AF_INET:
             level, option = socket.IPPROTO_IP, IP_MULTICAST_ALL
         else:
             level, option = socket.IPPROTO_IPV6, IPV6_MULTICAST_ALL

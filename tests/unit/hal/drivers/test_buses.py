@@ -256,7 +256,7 @@ def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened:
     [
         (
             {"robot__drive": {}},
-            "joint_1: `driver` is not given, and the backend `mixed` drives each joint by its driver_type",
+            "joint_1: `driver` is not given, and the backend `mixed` drives each joint by its driver type",
         ),
         (
             {"robot__joints": {"joint_2": {"driver": "odriv"}}},

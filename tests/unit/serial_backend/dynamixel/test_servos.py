@@ -1,6 +1,6 @@
 """The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
 
-Hardware errors, restarts and lost joints are in `tests/unit/can_backend/can_drives/test_every_family.py`.
+Hardware errors, restarts and lost joints are in `tests/unit/can_backend/can_drives/test_every_driver_type.py`.
 """
 
 import math

@@ -86,7 +86,7 @@ FAMILIES = {
         "overheating",
     ),
 }
-on_can = pytest.mark.parametrize("driver", ["odrive", "moteus"], indirect=True)
+on_can = pytest.mark.parametrize("driver_type", ["odrive", "moteus"], indirect=True)
 
 
 class Robot(DriveRig):
