@@ -80,7 +80,7 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
         overrides.append(Override("mission.until_goal", True, "--until-goal"))
     for key, value in flags.items():
         if value is not None:
-            flag = f"--{key.removesuffix('_s')} {short(str(value))}"
+            flag = f"--{key.removesuffix('_s').replace('_', '-')} {short(str(value))}"
             overrides.append(Override(key, value, flag))
     if faults := getattr(arguments, "fault", None):
         overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))

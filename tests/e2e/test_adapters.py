@@ -68,7 +68,7 @@ def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: M
 
 
 @pytest.mark.parametrize(
-    ("driver", "command", "of"),
+    ("driver_type", "command", "of"),
     [pytest.param("odrive", "odrives", "axes", marks=pytest.mark.slow), ("moteus", "moteus", "controllers")],
 )
 def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_says_they_are_mounted(

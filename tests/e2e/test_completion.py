@@ -19,7 +19,7 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
     "command": (["ru"], {"run"}),
     "all commands": ([""], {"run", "echo", "fault", "can", "modules", "completion"}),
     "scenario": (["run", ""], set(shipped("scenarios"))),
-    "flag": (["run", "triplet", "--pa"], {"--clock-mode"}),
+    "flag": (["run", "triplet", "--clo"], {"--clock-mode"}),
     "value of a flag": (["run", "triplet", "--clock-mode", "l"], {"lockstep"}),
     "controller": (["run", "--controller", ""], set(installed(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.harness.wait import wait_until
 
-SERVICE = re.compile(r"snakesim_hal\.serve\0(\w+)\0")
+SERVICE = re.compile(r"snakesim_hal\.programs\.service_program\0(\w+)\0")
 PROGRAMS = {
     "snakesim_hal.programs.host_program": "host",
     "snakesim_hal.programs.router_program": "router",

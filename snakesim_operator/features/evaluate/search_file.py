@@ -58,7 +58,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
             words += ["--set", setting]
         words += ["--goal", self.goal]
         if self.direction == "minimize":
-            words.append("--minimise")
+            words.append("--minimize")
         words += ["--seeds", str(self.seeds), "--seed", str(self.seed), "--storage", str(storage)]
         return shlex.join(words)
 
@@ -157,7 +157,7 @@ def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
         yield f"--goal: {there.goal} there, {here.goal} here"
     if there.direction != here.direction:
         given = {"minimize": "given", "maximize": "not given"}
-        yield f"--minimise: {given[there.direction]} there, {given[here.direction]} here"
+        yield f"--minimize: {given[there.direction]} there, {given[here.direction]} here"
     if there.seeds != here.seeds:
         yield f"--seeds: {there.seeds} there, {here.seeds} here"
     if there.seed != here.seed:

@@ -48,7 +48,7 @@ def test_bus_off_stays_off_wherever_an_interface_is_configured() -> None:
     commands: dict[str, str] = {}
     for page in (*(ROOT / "docs").glob("*.md"), *(ROOT / "deploy").rglob("*.md")):
         commands[page.name] = "".join(re.findall(r"^```\w*\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL))
-    for file in (UP, ROOT / "snakesim_operator" / "lab" / "templates" / "can.j2"):
+    for file in (UP, ROOT / "snakesim_operator" / "features" / "lab" / "templates" / "can.j2"):
         commands[file.name] = file.read_text()
     found = {name: set(re.findall(r"restart-ms\W+(\d+)", text)) for name, text in commands.items()}
     assert {name for name, values in found.items() if values} >= {"up.sh", "can.j2", "moteus.md"}

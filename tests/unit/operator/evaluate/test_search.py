@@ -72,7 +72,7 @@ def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
 @pytest.mark.parametrize(
     ("other", "difference"),
     [
-        ({"minimize": True}, "--minimise: not given there, given here"),
+        ({"minimize": True}, "--minimize: not given there, given here"),
         ({"goal": "advance_m"}, "--goal: path_distance_m there, advance_m here"),
         ({"set": ["duration_s=3"]}, "--set duration_s: 2 there, 3 here"),
         ({"set": []}, "--set duration_s: 2 there, not given here"),

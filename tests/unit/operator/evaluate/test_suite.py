@@ -23,11 +23,13 @@ duration_s = 20
 name = "as shipped"
 [[row]]
 name = "pegs only"
-[row.set.scene]
-random_field = [
-    { min_corner_m = [2, -1], max_corner_m = [3, 1], density_per_m2 = 1, radius_m = [0.03, 0.03], clearance_m = 0.1,
-      seed = 1 },
-]
+[[row.set.scene.random_field]]
+min_corner_m = [2, -1]
+max_corner_m = [3, 1]
+density_per_m2 = 1
+radius_m = [0.03, 0.03]
+clearance_m = 0.1
+seed = 1
 """
 
 
