@@ -116,7 +116,7 @@ def _checked(*sets: str) -> list[Judged]:
         reader = run.network.session().reader(keys.IMU, Imu)
         box = run.host.black_box
         rows = b""
-        for _ in run.turns():
+        for _ in run.iterate_ticks():
             imus += reader.drain()
             rows += box.rows_from(len(rows) // box.layout.row_bytes)[1]
         columns = box.layout.arrays(rows)

@@ -146,7 +146,7 @@ def _deciding_us() -> float:
 
         for name in ("offer", "expire", "decide"):
             setattr(authority, name, timed(getattr(Authority, name).__get__(authority)))
-        for _ in ran.turns():
+        for _ in ran.iterate_ticks():
             pass
         return spent / max(ran.host.statistics.ticks, 1) * 1e6
 

@@ -45,7 +45,7 @@ class AssistedRobot:
             self._joints = session.reader(keys.JOINTS, JointState)
             self._applied = session.reader(keys.APPLIED, AppliedCommand)
             self._sensors = {key: session.reader(key, message) for key, message in SENSED.items()}
-            self._turns = self._run.turns(before_services=True)
+            self._turns = self._run.iterate_ticks(before_services=True)
             opening.callback(self._turns.close)
             self.description: Description = self._run.host.description
             self._index = {joint.name: i for i, joint in enumerate(self.description.joints)}

@@ -1,7 +1,7 @@
-"""Input of the HAL host: queued by other threads, decoded and handed over in the host's own.
+"""Input of the HAL host: other threads queue it, and the host's own thread decodes and handles it.
 
-It has lanes, and a lower lane has priority: an emergency stop waits for nothing, and no number of lease
-requests delays a command. Each lane is bounded, so a flood costs no memory and blocks no other lane.
+Each kind of input has a lane of its own. Emergency stops are handled first, and no number of lease requests delays a
+command. Every lane is bounded, so a flood costs no memory and blocks no other lane.
 """
 
 import time
@@ -9,9 +9,10 @@ import weakref
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from queue import Empty
-from typing import Any, Protocol
+from typing import Protocol
 
 from snakesim_hal.base.errors import WireError
+from snakesim_hal.host.request_handler import Reply, Request
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Question, Session
 from snakesim_hal.wire import keys
@@ -26,54 +27,114 @@ from snakesim_hal.wire.messages import (
     SimulatorRequest,
 )
 
-STOPS, PRESENCE, SAMPLES, REQUESTS = range(4)  # lanes
-LIMITS = (64, None, 4096, 64)  # presence is limited to known services, so that lane needs no bound
+# The lanes, the most urgent first.
+STOPS = 0
+PRESENCE = 1
+SAMPLES = 2
+REQUESTS = 3
+LIMITS = (64, None, 4096, 64)  # presence comes from known services only, so its lane needs no bound
 
-Request = LeaseRequest | LifecycleRequest | EstopRequest | SimulatorRequest
-Reply = Callable[[Answer], None]
+
+class Receiver(Protocol):
+    """Handles the input, in the host's thread."""
+
+    def on_command(self, command: JointCommand, monotonic_ns: int) -> None:
+        """Handle a command that arrived at `monotonic_ns`."""
+        ...
+
+    def on_done(self, service: str, tick: int) -> None:
+        """Handle the message that a service has completed a tick."""
+        ...
+
+    def on_presence(self, service: str, present: bool) -> None:
+        """Handle that a service's liveliness token has appeared or vanished."""
+        ...
+
+    def on_request(self, request: Request, reply: Reply) -> None:
+        """Handle a request, and reply once, from any thread."""
+        ...
+
+    def on_undecodable(self, error: WireError) -> Answer:
+        """Count a message that cannot be decoded, and return the answer for the case that it was a query."""
+        ...
+
+
+class QueuedInput(Protocol):
+    """One item of a lane."""
+
+    def deliver(self, receiver: Receiver) -> None:
+        """Decode the item and hand it to the receiver. Raises WireError."""
+        ...
 
 
 @dataclass(frozen=True)
-class LocalRequest:
+class CommandArrival:
+    """A joint command that came over Zenoh."""
+
+    arrival: Arrival
+    decoder: Decoder[JointCommand]
+
+    def deliver(self, receiver: Receiver) -> None:
+        command = self.decoder.decode(self.arrival.payload, self.arrival.encoding)
+        receiver.on_command(command, self.arrival.monotonic_ns)
+
+
+@dataclass(frozen=True)
+class _Done:
+    arrival: Arrival
+    decoder: Decoder[Done]
+
+    def deliver(self, receiver: Receiver) -> None:
+        done = self.decoder.decode(self.arrival.payload, self.arrival.encoding)
+        receiver.on_done(keys.service_of(self.arrival.key), done.tick)
+
+
+@dataclass(frozen=True)
+class _Presence:
+    service: str
+    present: bool
+
+    def deliver(self, receiver: Receiver) -> None:
+        receiver.on_presence(self.service, self.present)
+
+
+@dataclass(frozen=True)
+class _LocalRequest:
     """A request that did not come over Zenoh."""
 
     request: Request
     reply: Reply
 
+    def deliver(self, receiver: Receiver) -> None:
+        receiver.on_request(self.request, self.reply)
 
-class Receiver(Protocol):
-    """Handles the input."""
 
-    def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
-        """A command, and its time of arrival."""
-        ...
+@dataclass(frozen=True)
+class _Query:
+    """A request that came over Zenoh."""
 
-    def take_done(self, service: str, tick: int) -> None:
-        """A service has completed a tick."""
-        ...
+    question: Question
+    decoder: Decoder[LeaseRequest] | Decoder[LifecycleRequest] | Decoder[EstopRequest] | Decoder[SimulatorRequest]
+    send_answer: Callable[[Question, Answer], None]
 
-    def presence_changed(self, service: str, present: bool) -> None:
-        """A service's liveliness token has appeared or vanished."""
-        ...
-
-    def answer(self, request: Request, reply: Reply) -> None:
-        """A request; reply once, from any thread."""
-        ...
-
-    def refuse(self, error: WireError) -> Answer:
-        """A message cannot be decoded; returns the answer if it was a query."""
-        ...
+    def deliver(self, receiver: Receiver) -> None:
+        try:
+            request = self.decoder.decode(self.question.payload, self.question.encoding)
+        except WireError as error:
+            self.send_answer(self.question, receiver.on_undecodable(error))
+        else:
+            receiver.on_request(request, lambda answer: self.send_answer(self.question, answer))
 
 
 class Inbox:
-    """Queues filled by other threads and emptied by the host."""
+    """Lanes that other threads fill and the host empties."""
 
     def __init__(
         self,
         session: Session,
         receiver: Receiver,
         services: Collection[str],
-        reply: Callable[[Question, Answer], None],
+        send_answer: Callable[[Question, Answer], None],
     ) -> None:
         """Declare all subscriptions of the host.
 
@@ -81,104 +142,88 @@ class Inbox:
             session: The host's session.
             receiver: Handles the input. It must live as long as anything is taken from this inbox.
             services: Services whose presence matters.
-            reply: Answers a query.
+            send_answer: Answers a query.
         """
         # The receiver owns its inbox. A reference back that counts would keep a whole run in memory after its end.
         self._receiver: Receiver = weakref.proxy(receiver)
-        self._reply = reply
-        self._queue: Mailbox[Any] = Mailbox(LIMITS)
-        self._command_decoder = Decoder(JointCommand)
-        self._done_decoder = Decoder(Done)
-        self._request_decoders: dict[str, Decoder[Any]] = {
-            keys.LEASE: Decoder(LeaseRequest),
-            keys.LIFECYCLE: Decoder(LifecycleRequest),
-            keys.ESTOP: Decoder(EstopRequest),
-            keys.SIMULATOR: Decoder(SimulatorRequest),
-        }
         self._services = frozenset(services)
+        self._lanes: Mailbox[QueuedInput] = Mailbox(LIMITS)
         self.dropped = 0
-        session.on_urgent_arrival(keys.JOINT_COMMAND, self._put_sample)
-        session.on_urgent_arrival(keys.DONE_ALL, self._put_sample)
-        session.on_question(keys.ESTOP, self._put_stop)
-        for key in (keys.LEASE, keys.LIFECYCLE, keys.SIMULATOR):
-            session.on_question(key, self._put_request)
+
+        command_decoder = Decoder(JointCommand)
+        done_decoder = Decoder(Done)
+        session.on_urgent_arrival(
+            keys.JOINT_COMMAND, lambda arrival: self._put_sample(CommandArrival(arrival, command_decoder))
+        )
+        session.on_urgent_arrival(keys.DONE_ALL, lambda arrival: self._put_sample(_Done(arrival, done_decoder)))
+
+        estop_decoder = Decoder(EstopRequest)
+        session.on_question(
+            keys.ESTOP,
+            lambda question: self._lanes.put(_Query(question, estop_decoder, send_answer), STOPS),
+        )
+        for key, decoder in (
+            (keys.LEASE, Decoder(LeaseRequest)),
+            (keys.LIFECYCLE, Decoder(LifecycleRequest)),
+            (keys.SIMULATOR, Decoder(SimulatorRequest)),
+        ):
+            session.on_question(
+                key,
+                lambda question, decoder=decoder: self._put_request(_Query(question, decoder, send_answer)),
+            )
         session.on_alive(self._put_presence)
 
     def waiting(self) -> int:
-        """Number of queued items."""
-        return self._queue.qsize()
+        """Return the number of queued items."""
+        return self._lanes.qsize()
 
-    def ask(self, request: Request, reply: Reply) -> None:
-        """Put a request that did not come over Zenoh; from any thread."""
-        self._queue.put(LocalRequest(request, reply), STOPS)
+    def put_local_request(self, request: Request, reply: Reply) -> None:
+        """Queue a request that did not come over Zenoh, before all other input; from any thread."""
+        self._lanes.put(_LocalRequest(request, reply), STOPS)
 
     def wait(self, timeout_s: float) -> None:
-        """Until an item is there, at most so long."""
-        self._queue.wait(timeout_s)
+        """Wait until an item is queued, for at most `timeout_s`."""
+        self._lanes.wait(timeout_s)
 
-    def take(self, timeout_s: float) -> bool:
-        """Handle the next item; False when none came in time."""
+    def handle_next(self, timeout_s: float) -> bool:
+        """Handle the next item. Returns False when none arrives in time."""
         try:
-            item = self._queue.get(timeout=timeout_s)
+            item = self._lanes.get(timeout=timeout_s)
         except Empty:
             return False
         self.handle(item)
         return True
 
-    def take_until(self, monotonic_ns: int) -> None:
+    def handle_until(self, monotonic_ns: int) -> None:
         """Handle all items that arrive until a point in time."""
-        while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.take(left_ns * 1e-9):
+        while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.handle_next(left_ns * 1e-9):
             pass
 
-    def take_all(self, limit_ns: float) -> None:
-        """Handle queued items, for at most this long: the rest of a flood waits for the next tick."""
+    def handle_queued(self, limit_ns: float) -> None:
+        """Handle the items that are queued now, for at most `limit_ns`. The rest of a flood waits for the next tick."""
         stop_ns = time.monotonic_ns() + limit_ns
-        for _ in range(self._queue.qsize()):
-            if not self.take(0.0) or time.monotonic_ns() > stop_ns:
+        for _ in range(self._lanes.qsize()):
+            if not self.handle_next(0.0) or time.monotonic_ns() > stop_ns:
                 return
 
-    def handle(self, item: Any) -> None:
-        """Decode one item, and hand it over."""
-        receiver = self._receiver
-        if isinstance(item, LocalRequest):
-            receiver.answer(item.request, item.reply)
-        elif isinstance(item, Question):
-            self._answer(item)
-        elif not isinstance(item, Arrival):
-            receiver.presence_changed(*item)
-        else:
-            try:
-                if item.key == keys.JOINT_COMMAND:
-                    command = self._command_decoder.decode(item.payload, item.encoding)
-                    receiver.take_command(command, item.monotonic_ns)
-                else:
-                    done = self._done_decoder.decode(item.payload, item.encoding)
-                    receiver.take_done(keys.service_of(item.key), done.tick)
-            except WireError as error:
-                receiver.refuse(error)
-
-    def _answer(self, question: Question) -> None:
+    def handle(self, item: QueuedInput) -> None:
+        """Decode one item and hand it over."""
         try:
-            request = self._request_decoders[question.key].decode(question.payload, question.encoding)
+            item.deliver(self._receiver)
         except WireError as error:
-            self._reply(question, self._receiver.refuse(error))
-        else:
-            self._receiver.answer(request, lambda answer: self._reply(question, answer))
+            self._receiver.on_undecodable(error)
 
     # --- in Zenoh's threads ----------------------------------------------------------------------------------
 
-    def _put_stop(self, question: Question) -> None:
-        self._queue.put(question, STOPS)
+    def _put_request(self, item: QueuedInput) -> None:
+        self.dropped += self._lanes.full(REQUESTS)  # the requester gets no answer, and may ask again
+        self._lanes.put(item, REQUESTS)
 
-    def _put_request(self, question: Question) -> None:
-        self.dropped += self._queue.full(REQUESTS)  # the requester gets no answer, and may ask again
-        self._queue.put(question, REQUESTS)
-
-    def _put_sample(self, arrival: Arrival) -> None:
-        self.dropped += self._queue.full(SAMPLES)
-        self._queue.put(arrival, SAMPLES)
+    def _put_sample(self, item: QueuedInput) -> None:
+        self.dropped += self._lanes.full(SAMPLES)
+        self._lanes.put(item, SAMPLES)
 
     def _put_presence(self, key: str, present: bool) -> None:
         service = keys.service_of(key)
         if service in self._services:
-            self._queue.put((service, present), PRESENCE)
+            self._lanes.put(_Presence(service, present), PRESENCE)

@@ -25,7 +25,7 @@ from snakesim_hal.base.terminal import exit_code, print_stderr
 from snakesim_hal.faults.allowed import faults_of_host
 from snakesim_hal.host.cable_file import kept_at
 from snakesim_hal.host.guarded_backend import GuardedBackend
-from snakesim_hal.host.host import Host
+from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.model.checked import CHECK, why_unchecked
 from snakesim_hal.model.fault_plan import check_without_run
@@ -91,21 +91,22 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
             unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
         folder = robot_folder(described.robot, described.backend, described.hardware)
         backend, faults = faults_of_host(config, backend, session)
-        host = Host(
-            config,
-            backend,
-            session,
+        options = HostOptions(
+            # The end of the run.
             max_ticks=round(config.duration_s * config.rate_hz) if wanted.once else None,
             end_after_fault_s=wanted.end_after_fault,
             stay=wanted.end_after_fault is None,
+            # What connects the host with its surroundings.
             latch=EstopLatch(folder),
             starter=HostEnd.of(wanted.channel),
             realtime_warnings=realtime_warnings,
+            # The robot.
             faults=faults,
             unchecked=unchecked,
             cables=kept_at(folder, config.robot.joint_table, described),
         )
-        serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
+        host = Host(config, backend, session, options)
+        serve_stops(stop_port, given.link.namespace or described.robot, host.request_estop)
         on_stop_signal(host.stop)
         tune_garbage_collector()
         memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)

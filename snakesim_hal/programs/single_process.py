@@ -1,7 +1,7 @@
 """A whole run in one process and one thread, without a network: host, guidance, navigation and control take turns.
 
     with InProcessRun(config) as run:
-        for _ in run.turns():
+        for _ in run.iterate_ticks():
             ...  # once a tick; run.host.authority, run.network.session() for readers, run.stop()
     record_of(run.host).command_digest
 
@@ -22,7 +22,7 @@ from snakesim_hal.base.errors import ConfigError, RefusedError, ServiceError, Sn
 from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, place_of
 from snakesim_hal.base.terminal import report_error
 from snakesim_hal.faults.allowed import faults_of_host
-from snakesim_hal.host.host import Host
+from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
@@ -112,16 +112,14 @@ class InProcessRun:
         session = self.network.session()
         opened.callback(session.close)
         faulty, faults = faults_of_host(config, backend, session)
-        self.host = Host(
-            config,
-            faulty,
-            session,
+        options = HostOptions(
             max_ticks=round(config.duration_s * config.rate_hz),
             end_after_fault_s=AFTER_FAULT_S,
-            pace_after_fault="free",
+            clock_mode_after_fault="free",
             faults=faults,
         )
-        self.network.answer = self.host.take_in
+        self.host = Host(config, faulty, session, options)
+        self.network.answer = self.host.handle_queued_input
         opened.callback(self.network.close)
         for name in config.services:
             part = self._parts[name] = opened.enter_context(ExitStack())
@@ -130,7 +128,7 @@ class InProcessRun:
             loop = self._loops[name] = ServiceLoop(find_service(config, name), config, session)
             part.callback(loop.close)
 
-    def turns(self, *, before_services: bool = False) -> Generator[None]:
+    def iterate_ticks(self, *, before_services: bool = False) -> Generator[None]:
         """Run. Yields after each turn of all parts, also before the arming. Raises SnakesimError when it cannot begin.
 
         before_services: yields instead when the samples of a tick are out, and no service has acted on them.
@@ -139,7 +137,7 @@ class InProcessRun:
         """
         limit_s = min(ARM_LIMIT_S, self.config.start_limit_s)
         give_up = time.monotonic() + limit_s
-        with closing(self.host.turns()) as turns:
+        with closing(self.host.iterate_ticks()) as turns:
             for turn in itertools.count():
                 with self._limit:  # the backend may be third-party code, and turns this into an error of its own
                     if next(turns, OVER) is OVER:
@@ -155,7 +153,7 @@ class InProcessRun:
                     if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
                         raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.why}")
                     if status.ready_to_arm:
-                        self.host.ask(request_to_arm(self.host.description, WHO), lambda _answer: None)
+                        self.host.submit_request(request_to_arm(self.host.description, WHO), lambda _answer: None)
                 if not before_services:
                     yield
 

@@ -219,7 +219,7 @@ def _go(
             HostRecordWriter(host.black_box, host.description, partial(record_of, host), files.folder),
             _recording(session, files, recorded, None if raw_only else config.robot.name) as recording,
         ):
-            for turn, _ in enumerate(run.turns()):
+            for turn, _ in enumerate(run.iterate_ticks()):
                 if turn % TAKEN_EVERY == 0:
                     if recording is not None:
                         recording.flush_when_due()

@@ -62,7 +62,7 @@ def test_so_does_a_robot_with_a_camera_like_the_robot_without(tmp_path: Path) ->
         client = Client(run.network.session(), "onlooker")
         images, client_ticks = client.subscribe(keys.depth("head"), DepthImage), client.ticks(0.0)
         read: list[tuple[int, int]] = []
-        for _ in run.turns():
+        for _ in run.iterate_ticks():
             while (clock := next(client_ticks)) is not None:
                 image = client.read(images)
                 if image is not None and clock.newest[keys.depth("head")] == clock.tick:

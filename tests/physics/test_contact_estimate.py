@@ -80,7 +80,7 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
             return samples
 
     with offered(BACKENDS, "sim", Watched), InProcessRun(config) as run:
-        for _ in run.turns():
+        for _ in run.iterate_ticks():
             pass
         return run.host.description, seen
 

@@ -30,7 +30,7 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
         request = SettingsRequest(
             who="ada", controller=config.controller, settings='{"propulsion_n": 20, "damping_nm_s_per_rad": 0.9}'
         )
-        for turn, _ in enumerate(run.turns()):
+        for turn, _ in enumerate(run.iterate_ticks()):
             if turn == CHANGED_AT:
                 session.put_question(keys.SETTINGS, request)
         recording.close({})

@@ -15,7 +15,7 @@ from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.faults.allowed import faults_of_host
 from snakesim_hal.host.guarded_backend import GuardedBackend
-from snakesim_hal.host.host import Host
+from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.model.scenario import RunConfig, description_of
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.network.session import Link, Reader, Session, open_session
@@ -237,7 +237,7 @@ def running(config: RunConfig, **host: Any) -> Iterator[Running]:
     link = Link(endpoint, "lab/worm")
     with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
         faulty, faults = faults_of_host(config, GuardedBackend(backend), own)
-        made = Host(config, faulty, own, faults=faults, **host)
+        made = Host(config, faulty, own, HostOptions(faults=faults, **host))
         thread = threading.Thread(target=made.run, name="host")
         statuses = watcher.latched_reader(keys.STATUS, Status)
         thread.start()

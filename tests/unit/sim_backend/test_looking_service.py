@@ -33,7 +33,7 @@ def images_of(config: RunConfig) -> list[DepthImage]:
     with offered(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
         onlooker = Client(run.network.session(), "onlooker")
         images, ticks = onlooker.subscribe(HEAD, DepthImage), onlooker.ticks(0.0)
-        for _ in run.turns():
+        for _ in run.iterate_ticks():
             while (clock := next(ticks)) is not None:
                 image = onlooker.read(images)
                 if image is not None and clock.arm_session:

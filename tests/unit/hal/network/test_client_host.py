@@ -12,7 +12,7 @@ import zenoh
 from snakesim_hal.backend import Setpoints
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
-from snakesim_hal.host.inbox import LIMITS, SAMPLES
+from snakesim_hal.host.inbox import LIMITS, SAMPLES, CommandArrival
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Arrival, open_session
 from snakesim_hal.wire import keys
@@ -222,7 +222,7 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
         for epoch, done_tick in ((0, -1), (own + 6, -1), (own, 0)):
             sent = command(host.description, 0.1, lease_epoch=epoch)
             arrival = Arrival(keys.JOINT_COMMAND, encode(sent), encoding_of(JointCommand), time.monotonic_ns())
-            host._inbox.handle(arrival)
+            host._inbox.handle(CommandArrival(arrival, Decoder(JointCommand)))
             assert host.participants["control"].done_tick == done_tick
         assert host.authority.rejected["wrong_epoch"] == 2
 

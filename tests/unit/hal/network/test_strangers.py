@@ -191,11 +191,11 @@ def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_t
     config, answers = run_config(clock_mode="realtime", services={}), list[Answer]()
     with meeting("worm") as (session,):
         host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
-        host.answer(LeaseRequest(action="acquire", holder="control"), answers.append)
+        host.on_request(LeaseRequest(action="acquire", holder="control"), answers.append)
         host.authority.observe(state(ROBOT))
         host.authority.state = "armed"
         time.sleep(1.5e-9 * host.description.lease_ns)
-        host.answer(LeaseRequest(action="acquire", holder="stranger"), answers.append)
+        host.on_request(LeaseRequest(action="acquire", holder="stranger"), answers.append)
     assert [answer.ok for answer in answers] == [True, True]
     assert host.authority.state == "fault" and host.authority.faults[-1].what == "lease_expired"
 

@@ -1,0 +1,153 @@
+"""The status that a host publishes."""
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from snakesim_hal.host.host_state import HostState
+from snakesim_hal.host.outbox import Outbox
+from snakesim_hal.host.readiness import Readiness
+from snakesim_hal.network.private_channel import HostEnd, HostMessage
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import LifecycleState, Status
+
+STATUS_PERIOD_NS = 200_000_000
+MIN_STATUS_PERIOD_NS = 10_000_000  # for frequent changes, such as a contested lease
+HELD_UP_AFTER_NS = 500_000_000  # a tick that waits longer for answers is shown as held up
+
+
+class _Mark(NamedTuple):
+    """What a status is published early for, when it changes."""
+
+    lifecycle: LifecycleState
+    lease_epoch: int
+    fault_count: int
+    is_paused: bool
+    speed: float
+
+
+class StatusReporter:
+    """Builds the status, and publishes it a few times a second, or at once when the lifecycle changes."""
+
+    def __init__(
+        self,
+        state: HostState,
+        readiness: Readiness,
+        outbox: Outbox,
+        starter: HostEnd,
+        realtime_warnings: Sequence[str],
+    ) -> None:
+        """Publish nothing yet.
+
+        Args:
+            state: The host's state.
+            readiness: What the host waits for.
+            outbox: Sends the status over the network.
+            starter: Sends it to the process that started this host.
+            realtime_warnings: Real-time measures that the operating system refused.
+        """
+        self._state = state
+        self._readiness = readiness
+        self._outbox = outbox
+        self._starter = starter
+        self._realtime_warnings = list(realtime_warnings)
+        self._published_mark: _Mark | None = None
+        self._due_ns = 0  # monotonic
+
+    def publish(self, *, force: bool = False) -> None:
+        """Publish the status if it is due. `force` publishes it in any case."""
+        now_ns = time.monotonic_ns()
+        mark = self._mark()
+        if not force and not self._is_due(mark, now_ns):
+            return
+        self._published_mark = mark
+        self._due_ns = now_ns + STATUS_PERIOD_NS
+        status = self.build()
+        self._outbox.put((keys.STATUS, status, None))
+        self._starter.say(HostMessage(status=status))
+
+    def build(self) -> Status:
+        """Return the present status of the robot."""
+        state = self._state
+        authority = state.authority
+        robot = state.description
+        clock = state.clock
+        simulated = clock.simulated
+        missing = self._readiness.missing_services()
+        differing = self._readiness.differing_processes()
+        refusals = authority.against_arming(clock.safety_ns())
+        slow_backend = state.backend_time.too_slow() if clock.clock_mode == "realtime" else []
+
+        why = authority.why
+        if authority.state == "disarmed" and (refusals or missing or differing):
+            waits = self._readiness.describe_missing(missing)
+            why = "; ".join([why, *slow_backend, *differing, *waits, *refusals])[:500]
+
+        return Status(
+            # The robot and its time.
+            tick=clock.tick,
+            timestamp_ns=clock.tick * robot.period_ns,
+            robot=robot.robot,
+            backend=robot.backend,
+            host=robot.host,
+            clock_mode=clock.clock_mode,
+            rate_hz=1e9 / robot.period_ns,
+            paused_by=simulated.paused_by if simulated.stands else None,
+            speed=simulated.speed,
+            real_time_factor=simulated.factor,
+            # The lifecycle.
+            lifecycle=authority.state,
+            why=why,
+            ready_to_arm=not refusals and not missing and not differing,
+            unchecked=authority.unchecked[:500],
+            derated=authority.derated,
+            isolated=authority.isolated,
+            # Faults.
+            faults=authority.faults,
+            faults_left_out=authority.since_clear.left_out,
+            injected=list(state.faults.on),
+            # Commands.
+            lease_holder=authority.lease.holder,
+            lease_epoch=authority.lease.epoch,
+            commands_accepted=authority.accepted,
+            commands_standby=authority.standby,
+            commands_rejected=dict(authority.rejected),
+            commands_limited=dict(authority.limited),
+            # Services.
+            alive=state.participants.present(),
+            waiting_for=missing,
+            held_up=self._describe_wait()[:500],
+            # Timing.
+            overruns=state.statistics.overruns,
+            tick_times=state.statistics.times.timings(),
+            realtime_warnings=[*self._realtime_warnings, *slow_backend, *simulated.slow()],
+        )
+
+    def _mark(self) -> _Mark:
+        state = self._state
+        return _Mark(
+            lifecycle=state.authority.state,
+            lease_epoch=state.authority.lease.epoch,
+            fault_count=len(state.authority.faults),
+            is_paused=state.clock.simulated.stands,
+            speed=state.clock.simulated.speed,
+        )
+
+    def _is_due(self, mark: _Mark, now_ns: int) -> bool:
+        published = self._published_mark
+        if published is None or mark.lifecycle != published.lifecycle:
+            return True
+        if mark != published:
+            return now_ns >= self._due_ns - STATUS_PERIOD_NS + MIN_STATUS_PERIOD_NS
+        return now_ns >= self._due_ns
+
+    def _describe_wait(self) -> str:
+        """Return what lockstep has been waiting for, if it has waited for long; otherwise an empty text."""
+        state = self._state
+        if state.waiting_since_ns is None:
+            return ""
+        waited_ns = time.monotonic_ns() - state.waiting_since_ns
+        if waited_ns < HELD_UP_AFTER_NS:
+            return ""
+        tick = state.clock.tick
+        return f"tick {tick} waits for {state.participants.awaited(tick)}, for {waited_ns * 1e-9:.1f} s"
