@@ -16,6 +16,7 @@ BESIDE = ("--set", "services.control.place=host")
 REALTIME = ("triplet", "--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "60", *BESIDE)
 
 
+@pytest.mark.slow
 def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
     """As in a process of its own, and as in the one of all: test_in_process.py."""
     arguments = ("triplet", "--duration", "2", "--clock-mode", "lockstep")

@@ -97,6 +97,7 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
             assert page.value("ends") == count
 
 
+@pytest.mark.slow
 def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_all_else() -> None:
     """And a wide screen shows the tabs in one line."""
     config, log = load("triplet").config, Log()

@@ -72,6 +72,7 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
     assert run.said().count("; restart in") == 1
 
 
+@pytest.mark.slow
 def test_nobody_there(tmp_path: Path) -> None:
     for arguments in (["estop"], ["clear"], ["arm", "planar13", "sim"], ["fault", "mute", "joint_1"], ["status"]):
         ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)

@@ -50,6 +50,7 @@ def sighted_live(address: str, origin: str | None = None) -> list[str]:
         return [frame.child_frame_id for frame in FrameTransforms.FromString(reported[13:]).transforms]
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG) as run:
         time.sleep(1.0)

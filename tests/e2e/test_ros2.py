@@ -182,6 +182,7 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
             wait_until(lambda: not RosSide(session).tokens(), "the node gone from the ROS graph", 10.0)
 
 
+@pytest.mark.slow
 def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     late = ("run", "triplet", "--clock-mode", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)

@@ -159,6 +159,7 @@ class Silent(MotionCapture):
 """
 
 
+@pytest.mark.slow
 def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Path) -> None:
     (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
     flags = [*SHORT, "--set", "services.sensor.code=./lab/silent.py:Silent", "--set", "start_limit_s=3"]

@@ -44,6 +44,7 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
     assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT).read_text()
 
 
+@pytest.mark.slow
 def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path) -> None:
     """The others, one by one, are rows of the fault table."""
     key, limit_s = "guidance/world", 0.22

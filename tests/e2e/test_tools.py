@@ -43,6 +43,7 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     assert seen.err == "" and seen.out.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
     run = f"{' '.join(SNAKESIM)} run triplet --in-process --duration 1 --no-record --out"
     for number, unread in enumerate(("| head -0", ">&-", "> /dev/full 2>&1")):
@@ -146,6 +147,7 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         assert run.interrupt() == 130
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace, which needs root")
 def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) -> None:
     """In a network namespace of its own, which has nothing but loopback."""

@@ -41,6 +41,7 @@ def test_drives_without_torque_mode_push_by_their_shape():
     assert Mode.TORQUE not in found.record.mode
 
 
+@pytest.mark.slow
 def test_a_body_that_nothing_can_push_moves_on_towards_its_goal():
     alone = {"scene.random_field": [], "scene.pegs_along_route": [], "start.on_route": False}
     found = snakesim.run("surveyed_clutter", controller="obstacle_aided", duration=6, set=alone).summary

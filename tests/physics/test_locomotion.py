@@ -138,6 +138,7 @@ def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushin
     assert ["peg_0_1", "peg_0_2", "peg_0_3"] in [[p.obstacle for p in report.push_points] for report in whole.reports]
 
 
+@pytest.mark.slow
 def test_on_a_wave_too_steep_for_neighbours_contacts_further_apart_push():
     whole = run(configure("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
     assert whole.moved_m > 1.0
@@ -203,6 +204,7 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
     assert not any(report.jammed for report in whole.reports)
 
 
+@pytest.mark.slow
 def test_a_robot_with_pitch_joints_moves_on_hills_among_random_pegs():
     whole = run(configure("mamba_hills", "controller=obstacle_triplet"))
     assert whole.moved_m >= 0.3

@@ -12,6 +12,7 @@ def test_a_hidden_fault_is_named_and_no_sound_joint_is_blamed_or_unknown(fault: 
     assert fault == NONE or trial.found, [row.verdict for row in trial.rows]
 
 
+@pytest.mark.slow
 def test_backlash_spoils_no_values_of_other_joints() -> None:
     named, unnamed = identify_trials(4, "duration_s=12", backlash=True)
     assert named.named == [named.loose]

@@ -12,6 +12,7 @@ pytest.importorskip("pyarrow", reason="needs the extra `export`")
 PEAK_MB, CPU_S = 700, 20.0  # MuJoCo's renderer takes 260 MB; what a bomb may unpack to takes a few seconds
 
 
+@pytest.mark.slow
 def test_no_recording_harms_a_command_and_none_keeps_a_loss_to_itself(tmp_path: Path) -> None:
     verdict = fuzz(tmp_path, copies=len(DAMAGES), seed=1, commands=2)
     assert not verdict.violations, table(verdict)

@@ -38,6 +38,7 @@ def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     assert 0 < light.count(white) < out.read_text().count(white)
 
 
+@pytest.mark.slow
 def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Path) -> None:
     """A notebook's window library, and TeX without a TeX."""
     (run / "matplotlibrc").write_text("text.usetex: True\n")

@@ -275,6 +275,7 @@ def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> No
     assert not left, left
 
 
+@pytest.mark.slow
 def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
     study = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "study.py" in s.files).files["study.py"]

@@ -22,6 +22,7 @@ def test_no_payload_brings_a_decoder_or_what_stands_behind_it_down() -> None:
     assert report.growth_mb < 16
 
 
+@pytest.mark.slow
 def test_no_file_flag_or_datagram_does_more_than_be_refused(tmp_path: Path) -> None:
     with inputs.all_inputs(tmp_path) as found:
         outcomes = inputs.run(found, PAYLOADS_EACH, seed=4)

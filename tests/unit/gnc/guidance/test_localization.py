@@ -37,6 +37,7 @@ def test_a_snake_that_does_not_move_its_joints_stays():
     assert max(off) < 0.005
 
 
+@pytest.mark.slow
 def test_the_map_corrects_dead_reckoning():
     off: dict[bool, float] = {}
     for images in (False, True):

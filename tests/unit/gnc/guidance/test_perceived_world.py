@@ -46,12 +46,14 @@ def test_so_it_is_on_hills():
     assert total.misses <= 0.1 * total.visible and total.ghosts <= 0.05 * total.reported
 
 
+@pytest.mark.slow
 def test_without_a_pose_sensor_it_is_right_as_the_robot_sees_it():
     total = scored(Drive(random_field(3)), 300, pose=False)
     assert np.median(total.position_m) < 0.02
     assert total.ghosts <= 0.1 * total.reported
 
 
+@pytest.mark.slow
 def test_an_image_counts_where_it_was_taken_not_where_it_arrives():
     """At 0.4 m/s an image is 16 mm old, and the head turns meanwhile."""
     drive = Drive(random_field(1), speed_m_s=0.4)

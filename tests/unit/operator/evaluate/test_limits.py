@@ -3,6 +3,8 @@
 import time
 from pathlib import Path
 
+import pytest
+
 from snakesim_operator.features.evaluate.case import GAVE_UP, Outcome, code_digest, run_case
 from snakesim_operator.features.evaluate.suite import Suite, cases_of
 
@@ -26,12 +28,14 @@ def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s
     return run_case(case.config, code_digest(), case.give_up_s, case.limit_s)
 
 
+@pytest.mark.slow
 def test_who_comes_no_further_is_given_up() -> None:
     reported = ran("hold", give_up_s=1.0).numbers
     assert reported[GAVE_UP] is True and reported["crossed"] is False
     assert isinstance(reported["duration_s"], float) and 1.0 <= reported["duration_s"] < 2.0
 
 
+@pytest.mark.slow
 def test_who_comes_on_is_not() -> None:
     reported = ran("path_following", give_up_s=1.0).numbers
     assert reported[GAVE_UP] is False and reported["crossed"] is True
