@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.physics import open_simulator
 from snakesim.environments import SnakeEnv
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.scenario import load
 from snakesim_hal.wire.messages import Mode
 
@@ -68,7 +68,7 @@ def physics(scenario: str, *, ground: bool) -> Step:
     wave, steps = Wave(joints), backend.sim.steps_per_tick
 
     def step() -> None:
-        backend.enact(Setpoints(modes, wave.next().tolist(), full_nm), "armed")
+        backend.enact(SafeSetpoints(modes, wave.next().tolist(), full_nm), "armed")
         for _ in range(SKIP):
             if ground:
                 backend.physics.step(steps)

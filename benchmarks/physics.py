@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.session import Link, Publisher, Session, open_session
@@ -54,7 +54,7 @@ class BareLoop:
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
 
-    def tick_us(self, points: Sequence[Setpoints]) -> float:
+    def tick_us(self, points: Sequence[SafeSetpoints]) -> float:
         """Mean time of a control period over these setpoints; handing them over is not counted."""
         physics, steps = self._backend.physics, self._backend.sim.steps_per_tick
         spent = 0.0
@@ -65,7 +65,7 @@ class BareLoop:
             spent += time.perf_counter() - begin
         return spent / len(points) * 1e6
 
-    def mujoco_us(self, points: Sequence[Setpoints]) -> float:
+    def mujoco_us(self, points: Sequence[SafeSetpoints]) -> float:
         """The same for `mj_step`, from the states of that motion: without ground and friction, which are ours."""
         model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
         whole = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -83,12 +83,12 @@ class BareLoop:
         return spent / len(points) * 1e6
 
 
-def motion(config: RunConfig) -> tuple[list[Setpoints], float]:
+def motion(config: RunConfig) -> tuple[list[SafeSetpoints], float]:
     """Every setpoint of a run of the scenario, and the mean µs of the controller alone; all in this process."""
     whole = run_in_process(config)
     limits = [joint.torque_limit_nm for joint in whole.record.description.joints]
     points = [
-        Setpoints([Mode(code) for code in mode], target, limits)
+        SafeSetpoints([Mode(code) for code in mode], target, limits)
         for mode, target in zip(whole.record.mode.tolist(), whole.record.target.tolist(), strict=True)
     ]
     return points, sum(whole.update_us) / len(whole.update_us)

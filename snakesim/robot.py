@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Self
 
 from snakesim_gnc.control.controller import positions
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, did_you_mean
 from snakesim_hal.base.process import user_name
 from snakesim_hal.network.commanding import READ, Commanding
@@ -34,6 +33,7 @@ from snakesim_hal.wire.messages import (
     request_to_arm,
 )
 from snakesim_hal.wire.own_sample import message_of
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots
 from snakesim_operator.recording.process import record
@@ -176,12 +176,14 @@ class Robot:
             raise RefusedError(f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.why}")
         return clock.timestamp_ns * 1e-9
 
-    def command(self, angles_rad: Sequence[float] | Setpoints) -> None:
-        """Command every joint, tail to head, in this tick: angles, or `Setpoints` with modes and torque limits.
+    def command(self, angles_rad: Sequence[float] | RequestedSetpoints) -> None:
+        """Command every joint, tail to head, in this tick: by angles, or by `RequestedSetpoints` with modes and limits.
 
         Raises ConfigError for what is no such command, RefusedError without the right to command.
         """
-        points = angles_rad if isinstance(angles_rad, Setpoints) else positions(self.description, list(angles_rad))
+        points = (
+            angles_rad if isinstance(angles_rad, RequestedSetpoints) else positions(self.description, list(angles_rad))
+        )
         count = len(self.names)
         for what, values in (("target", points.target), ("torque_limit_nm", points.torque_limit_nm)):
             wanted = f"{what} is {values!r:.80}, must be {count} finite numbers, tail to head"

@@ -42,7 +42,7 @@ class Mounting:
         return joint_torque_nm / self._turns
 
     def drive_targets(self, modes: Sequence[Mode], targets: Sequence[float]) -> Floats:
-        """Setpoints in the unit of each joint's mode; of a passive joint 0."""
+        """SafeSetpoints in the unit of each joint's mode; of a passive joint 0."""
         mode, target = np.array(modes, dtype=np.intp), np.array(targets)
         choices = (
             np.zeros(len(target)),

@@ -18,13 +18,17 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Setpoints:
-    """Setpoints of all joints from now on, tail to head; already inside every limit."""
+class SafeSetpoints:
+    """SafeSetpoints of all joints from now on, tail to head, after the limiter.
+
+    Only the limiter creates them, so the type checker proves that no backend gets setpoints that were not limited.
+    Controllers return `snakesim_hal.wire.setpoints.RequestedSetpoints` instead.
+    """
 
     mode: list[Mode]
     target: list[float]  # rad, rad/s or N·m, as the mode says
     torque_limit_nm: list[float]
-    isolated: frozenset[int] = frozenset()  # isolated joints: passive here, and to be switched off
+    isolated: frozenset[int] = frozenset()  # indices of isolated joints, which are passive here and to be switched off
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Backend(Protocol):
         """Read every sensor that is due at `tick`. Raises BackendError when it has no valid state any more."""
         ...
 
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Hand setpoints to the motors; they hold until the next call.
 
         The setpoints are safe in every state, so a simulator needs no more. A robot whose modules have states of their

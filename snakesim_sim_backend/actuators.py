@@ -16,7 +16,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.joints import Joint
@@ -87,7 +87,7 @@ class Motors:
         self._slots = np.empty(0, dtype=np.intp)
         self.switch_off()
 
-    def enact(self, setpoints: Setpoints) -> None:
+    def enact(self, setpoints: SafeSetpoints) -> None:
         """Take setpoints, tail to head; they hold until the next call."""
         if setpoints.mode != self._mode:
             self._change_modes(setpoints.mode)
@@ -106,7 +106,7 @@ class Motors:
     def switch_off(self) -> None:
         """All joints passive."""
         zeros = [0.0] * self.count
-        self.enact(Setpoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
+        self.enact(SafeSetpoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
 
     def before_steps(self) -> None:
         """Once a tick: apply a lowered limit as fast as the motor can follow, and end wind-up above it."""

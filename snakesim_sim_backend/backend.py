@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.fault_plan import check_backend_can
@@ -94,7 +94,7 @@ class SimBackend:
             raise BackendError(CLOSED)
         return self._sensors.sample(tick, timestamp_ns)
 
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Give the motors new setpoints. While disarmed they are off, whatever the setpoints."""
         if lifecycle in OFF:
             self._motors.switch_off()

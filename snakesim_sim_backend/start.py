@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
@@ -83,7 +83,7 @@ def _settle(
 ) -> None:
     count = motors.count
     limits = [joint.limits.torque_nm for joint in config.robot.joint_table]
-    motors.enact(Setpoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
+    motors.enact(SafeSetpoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
     physics.grip(GRIP)
     steps = max(round(ROUND_S / model.opt.timestep), 1)
     at_rest = 0

@@ -9,7 +9,6 @@ import msgspec
 
 from snakesim_gnc.control.controller import Action, Controller, View
 from snakesim_gnc.control.service import SENSED
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
 from snakesim_hal.model.scenario import CONTROL, RunConfig
@@ -23,6 +22,7 @@ from snakesim_hal.wire.messages import (
     Message,
     Mode,
 )
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SPARE_S = 1.0  # the run must not be over before the episode is
 OVER = object()
@@ -123,6 +123,6 @@ def _corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:
                 asked + by if by and mode is Mode.POSITION else asked  # by nothing: to the bit what was asked
                 for asked, by, mode in zip(points.target, residual_rad, points.mode, strict=True)
             ]
-            return Action(Setpoints(points.mode, target, points.torque_limit_nm), action.report)
+            return Action(RequestedSetpoints(points.mode, target, points.torque_limit_nm), action.report)
 
     return Corrected

@@ -5,9 +5,11 @@ Lifecycle, lease, limits and the latency of commands are those of a run in locks
 
 import msgspec
 
-from snakesim_hal.backend import Backend, Samples, Setpoints
+from snakesim.environments.no_limiter import NoLimiter
+from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.base.errors import BackendError, ConfigError, RefusedError
 from snakesim_hal.faults.allowed import Faults, faults_of_host
+from snakesim_hal.host.control_cycle import ControlCycle
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.fault_plan import planned
@@ -16,9 +18,9 @@ from snakesim_hal.model.scenario import RunConfig, Service
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.preflight import backend_settings
 from snakesim_hal.run_log.black_box import BlackBox
-from snakesim_hal.safety.authority import Authority, Decision
-from snakesim_hal.wire import keys
+from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire.messages import (
+    Description,
     Fault,
     JointCommand,
     JointState,
@@ -26,146 +28,165 @@ from snakesim_hal.wire.messages import (
     LifecycleState,
     Message,
     Mode,
-    Power,
     request_to_arm,
 )
 
-WHO = "an environment"
-INJECTED = ("joint", "bus", "simulator")  # faults that need neither services nor processes
+REQUESTER = "an environment"
+LEASE_PRIORITY = 100
+FAULT_TARGETS = ("joint", "bus", "simulator")  # faults of these need neither services nor processes
 
 
 class SteppedRobot:
     """A simulated robot, armed."""
 
     def __init__(self, config: RunConfig, *, safe: bool) -> None:
-        """safe: behind the limiter; otherwise the motors get every target as it is, and nothing stops the robot.
+        """Open the backend and arm the robot.
 
-        Raises ConfigError; RefusedError for a backend that moves something real, and when it cannot be armed.
+        Args:
+            config: Configuration of the run.
+            safe: Whether targets pass the limiter. Otherwise motors get them unchanged, and nothing stops the robot.
+
+        Raises:
+            ConfigError: A planned fault needs a controller.
+            RefusedError: The backend moves something real, or the robot cannot be armed.
         """
-        for injection in planned(config):
-            if injection.target_type not in INJECTED:
-                raise ConfigError(
-                    f"fault {str(injection)!r} is one of a {injection.target_type}: without a controller there are "
-                    f"only faults of {', '.join(INJECTED)}; take action='residual:...', or leave it out"
-                )
-        config = _without_looking_around(config)
-        factory = find_plugin(BACKENDS, config.backend)
-        self._backend: Backend = factory(config, backend_settings(config, factory))
-        self.description = self._backend.describe()
-        if not self.description.emulated:
-            self._backend.close()
-            raise RefusedError(f"backend {config.backend!r} moves real hardware; environments are for simulated robots")
+        _check_planned_faults(config)
+        config = _without_cameras_and_lidars(config)
+        backend = _open_simulated_backend(config)
+        self.description: Description = backend.describe()
         self._faults: Faults | None = None
         if config.faults:
             session = LocalNetwork().session()
-            self._backend, self._faults = faults_of_host(config, GuardedBackend(self._backend), session)
+            backend, self._faults = faults_of_host(config, GuardedBackend(backend), session)
+        self._backend = backend
+        self._authority = Authority(self.description) if safe else None
+        self._no_limiter = NoLimiter(self.description)
+        self._cycle = ControlCycle(backend, self._authority or self._no_limiter)
+
         self._period_ns = config.period_ns
         self._service = config.services.get(CONTROL, Service())
         self._black_box = BlackBox(self.description, memory_bytes=0)
-        self._authority = Authority(self.description) if safe else None
-        self._failed = ""
-        self._tick = self._sequence = 0
-        self._full_nm = [joint.torque_limit_nm for joint in self.description.joints]
-        self.newest: dict[str, Message] = {}  # of every sensor besides the joints that has had a sample, by key
-        self.limited: dict[int, str] = {}  # joint -> which limit changed its target in the last tick
+        self._full_torque_nm = [joint.torque_limit_nm for joint in self.description.joints]
+        self._tick = 0
+        self._sequence = 0
+        self.newest: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
+        self.limited: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
         self._samples = self._sample()
         if self._authority is not None:
             self._arm(self._authority)
 
     @property
     def joints(self) -> JointState:
-        """Of this tick."""
+        """The joint states of this tick."""
         return self._samples.joints
 
     @property
     def lifecycle(self) -> LifecycleState:
-        """As a host would publish it."""
-        if self._authority is not None:
-            return self._authority.state
-        return "fault" if self._failed else "armed"
+        """The lifecycle state, as a host would publish it."""
+        return self._cycle.safety.state
 
     @property
     def why(self) -> str:
-        """Why it is in this state."""
-        return self._failed or ("no limiter" if self._authority is None else self._authority.why)
+        """Why the robot is in this state."""
+        return self._cycle.safety.why
 
     @property
     def digest(self) -> str:
-        """As `command_digest` of a run."""
+        """The digest of all setpoints, as the `command_digest` of a run."""
         return self._black_box.command_digest
 
     def step(self, mode: Mode, target: list[float]) -> None:
-        """One tick. A command for the present samples goes to the limiter, as the host would do it in lockstep."""
-        decision = self._decided([mode] * len(target), target)
+        """Run one tick. A command for the present samples goes to the limiter, as a host does it in lockstep.
+
+        Args:
+            mode: Mode of all joints.
+            target: One target per joint, tail to head; rad, rad/s or N·m as the mode says.
+        """
+        self._command([mode] * len(target), target)
+        now_ns = self._tick * self._period_ns
+        decision = self._cycle.decide(now_ns, self._tick, self._service.used_output_tick(self._tick + 1))
         self.limited = decision.limited
-        self._black_box.record(self._tick, self._tick * self._period_ns, self._samples, decision)
+        self._black_box.record(self._tick, now_ns, self._samples, decision)
         try:
-            self._backend.enact(decision.setpoints, self.lifecycle)
-            self._backend.advance()
-            for fault in self._backend.faults():
-                self._fault(fault)
+            self._cycle.enact(decision)
+            self._cycle.advance()
             self._tick += 1
             self._samples = self._sample()
         except BackendError as error:
-            self._fault(Fault(tick=self._tick, what="backend_failed", cause=str(error)[:500], reach="robot"))
+            fault = Fault(tick=self._tick, what="backend_failed", cause=str(error)[:500], reach="robot")
+            self._cycle.safety.fault(fault)
 
     def close(self) -> None:
         """Close the backend."""
         self._backend.close()
 
-    def _decided(self, modes: list[Mode], target: list[float]) -> Decision:
-        authority = self._authority
-        if authority is None:
-            return Decision(Setpoints(modes, target, self._full_nm), None, {})
-        if authority.state == "armed":
-            self._offer(authority, modes, target)
-        authority.expire(self._tick * self._period_ns, self._tick)
-        return authority.decide(self._service.used_output_tick(self._tick + 1))
+    def _command(self, modes: list[Mode], target: list[float]) -> None:
+        """Hand a command to whatever decides on the setpoints."""
+        if self._authority is None:
+            self._no_limiter.command(modes, target)
+        elif self._authority.state == "armed":
+            self._offer(self._authority, modes, target)
 
     def _sample(self) -> Samples:
+        """Read the sensors of this tick and let them be judged."""
         now_ns = self._tick * self._period_ns
         if self._faults is not None:
             arm_session = 1 if self._authority is None else self._authority.arm_session
             self._faults.turn(now_ns, arm_session, self.lifecycle)
-        samples = self._backend.sample(self._tick, now_ns)
+        samples = self._cycle.sample(self._tick, now_ns)
         self.newest.update(samples.others)
-        if self._authority is not None:
-            self._authority.observe(samples.joints, now_ns)
-            if isinstance(power := samples.others.get(keys.POWER), Power):
-                self._authority.observe_power(power, now_ns)
+        self._cycle.observe(samples, now_ns)
         return samples
 
     def _arm(self, authority: Authority) -> None:
-        authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=100), 0)
-        self._offer(authority, [Mode.POSITION] * len(self._full_nm), list(self.joints.angle_rad))
-        answer = authority.on_lifecycle(request_to_arm(self.description, WHO), 0)
+        """Arm at the present pose."""
+        authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
+        self._offer(authority, [Mode.POSITION] * len(self._full_torque_nm), list(self.joints.angle_rad))
+        answer = authority.on_lifecycle(request_to_arm(self.description, REQUESTER), 0)
         if not answer.ok:
             self._backend.close()
             raise RefusedError(f"not ready to arm: {answer.reason}")
 
     def _offer(self, authority: Authority, modes: list[Mode], target: list[float]) -> None:
+        """Send a command that answers the present samples."""
         self._sequence += 1
         command = JointCommand(
+            # What it answers, and on whose behalf.
             tick=self._tick,
-            arm_session=authority.arm_session,
             sequence=self._sequence,
+            arm_session=authority.arm_session,
             lease_epoch=authority.lease.epoch,
             layout=self.description.layout,
             valid_for_ns=self.description.lease_ns,
+            # The setpoints.
             mode=modes,
             target=target,
-            torque_limit_nm=self._full_nm,
+            torque_limit_nm=self._full_torque_nm,
         )
         authority.offer(command, now_ns=self._tick * self._period_ns, tick=self._tick, age_ns=0)
 
-    def _fault(self, fault: Fault) -> None:
-        if self._authority is not None:
-            self._authority.fault(fault)
-        elif fault.reach == "robot":
-            self._failed = fault.cause
+
+def _check_planned_faults(config: RunConfig) -> None:
+    """Raise ConfigError for a planned fault that needs a controller."""
+    for injection in planned(config):
+        if injection.target_type not in FAULT_TARGETS:
+            raise ConfigError(
+                f"fault {str(injection)!r} is one of a {injection.target_type}: without a controller there are "
+                f"only faults of {', '.join(FAULT_TARGETS)}; take action='residual:...', or leave it out"
+            )
 
 
-def _without_looking_around(config: RunConfig) -> RunConfig:
-    """Without cameras and lidars, which nobody reads here. Each has noise of its own, so all else stays as it is."""
+def _open_simulated_backend(config: RunConfig) -> Backend:
+    """Open the backend. Raises RefusedError when it moves something real."""
+    factory = find_plugin(BACKENDS, config.backend)
+    backend = factory(config, backend_settings(config, factory))
+    if not backend.describe().emulated:
+        backend.close()
+        raise RefusedError(f"backend {config.backend!r} moves real hardware; environments are for simulated robots")
+    return backend
+
+
+def _without_cameras_and_lidars(config: RunConfig) -> RunConfig:
+    """Leave out sensors that nothing reads here. Each has noise of its own, so all else stays as it is."""
     sensors = msgspec.structs.replace(config.robot.sensors, depth=[], range=[])
     return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, sensors=sensors))

@@ -200,7 +200,7 @@ class CanDrives(ABC):
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """Setpoints; enable, let go, remind."""
+        """SafeSetpoints; enable, let go, remind."""
         if not may_enable:
             following &= self.following.enabled()
         for i in sorted(following):

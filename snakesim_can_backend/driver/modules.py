@@ -25,7 +25,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import Readings
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
@@ -179,7 +179,7 @@ class Modules:
         self._arms = False
         if self._lifecycle != "armed":
             return
-        points = Setpoints(modes, targets.tolist(), limits_nm.tolist(), self._isolated)
+        points = SafeSetpoints(modes, targets.tolist(), limits_nm.tolist(), self._isolated)
         for i, frame in enumerate(self._setpoints.frames(points)):
             if i not in following:
                 continue

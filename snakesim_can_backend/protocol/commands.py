@@ -23,7 +23,7 @@ from snakesim_can_backend.protocol.definitions import (
     Operation,
     Parameter,
 )
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import LifecycleState
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
@@ -42,7 +42,7 @@ class SetpointWriter:
         self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; the bits of a passive one are 0
         self._limit_steps = 1.0 / layout.signals["torque_limit"].scale
 
-    def frames(self, setpoints: Setpoints) -> list[Frame]:
+    def frames(self, setpoints: SafeSetpoints) -> list[Frame]:
         """One frame a joint, tail to head."""
         modes = np.array(setpoints.mode, dtype=np.intp)
         target = _steps(np.array(setpoints.target) * self._steps_per_unit[modes], -MAX_RAW, MAX_RAW)

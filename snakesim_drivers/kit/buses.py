@@ -54,7 +54,7 @@ class Bus:
 
 
 class Told(NamedTuple):
-    """Setpoints of the drives of a bus, at their shafts."""
+    """SafeSetpoints of the drives of a bus, at their shafts."""
 
     following: frozenset[int]
     modes: list[Mode]
@@ -97,7 +97,7 @@ class BusInTurn:
         readings.take(self.readings, self.bus.joints)
 
     def tell(self, told: Told) -> None:
-        """Setpoints; any earlier ones need not be sent any more."""
+        """SafeSetpoints; any earlier ones need not be sent any more."""
         self._read_states_after_a_pause()
         self.drives.command(
             self._guard.drives_to_command(told.following, may_enable=told.may_enable),

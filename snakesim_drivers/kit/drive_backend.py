@@ -15,7 +15,7 @@ from snakesim_drivers.kit.braking import Braking
 from snakesim_drivers.kit.findings import Finding, Told
 from snakesim_drivers.kit.readings import Readings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
@@ -53,7 +53,7 @@ class Drives(Protocol):
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """Setpoints of the drives that follow; any other is to be idle, and is told again if it is not.
+        """SafeSetpoints of the drives that follow; any other is to be idle, and is told again if it is not.
 
         A drive that begins to follow is enabled after it has its setpoint. may_enable: the robot is armed; otherwise
         a drive that is not on stays off. emergency: by the drives' own stop.
@@ -154,7 +154,7 @@ class DriveBackend:
         self._drives.read()
         return self._samples(tick, timestamp_ns)
 
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Armed: all that are not isolated follow. At fault those go on that did, while they brake."""
         if not self._open:
             return

@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, JointState
 from snakesim_hal.wire.quantities import about, above
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 Blend = Annotated[float, above(10, "s"), about("over which the command changes smoothly to a new reference")]
 
@@ -76,7 +76,7 @@ class BumplessReference:
         self._hand_over = HandOver(robot)
         self.reference_rad: Floats | None = None  # of the tick before; None before the first
 
-    def to(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> Setpoints:
+    def to(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> RequestedSetpoints:
         """Follow a reference. restarted: it may have jumped."""
         if self.reference_rad is None:
             self._hand_over.start(view.joints, reference_rad)

@@ -11,10 +11,10 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, start_of
 from snakesim_hal.wire.messages import Description, JointState, Message, Mode, Trajectory, World, WorldContact
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Report:
 class Action:
     """A controller's answer to a view."""
 
-    setpoints: Setpoints
+    setpoints: RequestedSetpoints
     report: Report = field(default_factory=Report)
 
 
@@ -96,7 +96,7 @@ class Controller(Protocol):
     def __init__(self, robot: Description, settings: Any) -> None: ...
 
     def update(self, view: View) -> Action:
-        """Setpoints for the next period, in the order of `robot.joints`."""
+        """RequestedSetpoints for the next period, in the order of `robot.joints`."""
         ...
 
 
@@ -105,9 +105,9 @@ def motion_wanted(view: View) -> bool:
     return view.world is not None and view.trajectory is not None and view.trajectory.speed_m_s != 0.0
 
 
-def positions(robot: Description, angles_rad: Sequence[float]) -> Setpoints:
+def positions(robot: Description, angles_rad: Sequence[float]) -> RequestedSetpoints:
     """Every joint to an angle, tail to head, with its full torque."""
-    return Setpoints(
+    return RequestedSetpoints(
         [Mode.POSITION] * len(robot.joints),
         [float(angle) for angle in angles_rad],
         [joint.torque_limit_nm for joint in robot.joints],

@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ControllerError, raised
 from snakesim_hal.wire.messages import Description, JointDescription, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 NUMBERS = {float, int}  # exactly: a NumPy number or a bool cannot be sent
 MODES = ", ".join(f"Mode.{mode.name}" for mode in Mode)
@@ -63,17 +63,17 @@ def check(action: Action, described: Sequence[JointDescription]) -> None:
         raise ValueError(f"update() returned {_repr(action)}, must return an Action")
     joints = [joint.name for joint in described]
     points, report = action.setpoints, action.report
-    if not isinstance(points, Setpoints):
-        raise ValueError(f"Action.setpoints is {_repr(points)}, must be Setpoints")
+    if not isinstance(points, RequestedSetpoints):
+        raise ValueError(f"Action.setpoints is {_repr(points)}, must be RequestedSetpoints")
     if not isinstance(report, Report):
         raise ValueError(f"Action.report is {_repr(report)}, must be a Report")
     _check_length("mode", points.mode, joints)
     for i, mode in enumerate(points.mode):
         if type(mode) is not Mode:
-            raise ValueError(f"Setpoints.mode[{i}] ({joints[i]}) is {_repr(mode)}, must be one of {MODES}")
+            raise ValueError(f"setpoints.mode[{i}] ({joints[i]}) is {_repr(mode)}, must be one of {MODES}")
         if not described[i].has(mode):
             has = ", ".join(f"Mode.{one.name}" for one in described[i].modes)
-            raise ValueError(f"Setpoints.mode[{i}] is Mode.{mode.name}, which {joints[i]} does not have; it has {has}")
+            raise ValueError(f"setpoints.mode[{i}] is Mode.{mode.name}, which {joints[i]} does not have; it has {has}")
     _check_numbers("target", points.target, joints, least=-MAX_TARGET)
     _check_numbers("torque_limit_nm", points.torque_limit_nm, joints, least=0.0)
     _check_report(report, joints)
@@ -82,10 +82,10 @@ def check(action: Action, described: Sequence[JointDescription]) -> None:
 def _check_length(field: str, values: Any, joints: Sequence[str]) -> None:
     if type(values) is not list:
         hint = "; use .tolist()" if hasattr(values, "tolist") else ""
-        raise ValueError(f"Setpoints.{field} is {_repr(values)}, must be a list{hint}")
+        raise ValueError(f"RequestedSetpoints.{field} is {_repr(values)}, must be a list{hint}")
     if len(values) != len(joints):
         wanted = f"{len(joints)}: one a joint, {joints[0]} to {joints[-1]}"
-        raise ValueError(f"Setpoints.{field} has {len(values)} values, must have {wanted}")
+        raise ValueError(f"RequestedSetpoints.{field} has {len(values)} values, must have {wanted}")
 
 
 def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: float) -> None:
@@ -93,7 +93,7 @@ def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: flo
     for i, value in enumerate(values):
         if type(value) in NUMBERS and least <= value <= MAX_TARGET:  # false for NaN
             continue
-        where = f"Setpoints.{field}[{i}] ({joints[i]}) is {_repr(value)}"
+        where = f"RequestedSetpoints.{field}[{i}] ({joints[i]}) is {_repr(value)}"
         if type(value) not in NUMBERS:
             raise ValueError(f"{where}, must be a plain float: use float(), or .tolist() of an array")
         unit = "N·m" if field == "torque_limit_nm" else "rad, rad/s or N·m"

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.observations import Observer, Part, chosen, parts_of
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import SHIPPED, FileStruct, expanded
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 RUNTIME: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # as this file is loaded: an arming, which makes the policy, cannot wait
@@ -79,7 +79,7 @@ class Policy:
         self._observer = Observer(robot, self._model.parts)
         self._mode = MODES[self._model.action]
         self._robot = robot
-        self._held: Setpoints | None = None  # setpoints while a sensor is silent
+        self._held: RequestedSetpoints | None = None  # setpoints while a sensor is silent
         self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
         self._target: list[float] | None = None
         self._asked = 0  # the tick of the last question
@@ -99,7 +99,7 @@ class Policy:
         self._held = None
         if self._target is None or view.tick - self._asked >= self._model.frame_skip:
             self._target, self._asked = self._model(self._observer.update(view)), view.tick
-        points = Setpoints([self._mode] * len(self._target), list(self._target), list(self._torque_limit_nm))
+        points = RequestedSetpoints([self._mode] * len(self._target), list(self._target), list(self._torque_limit_nm))
         reference = self._target if self._mode is Mode.POSITION else ()
         return Action(points, Report(why="a policy moves the joints", reference_rad=reference))
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from snakesim_hal.backend import Backend, Injectable, Samples, Setpoints
+from snakesim_hal.backend import Backend, Injectable, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.base.step_limit import StepTooLongError, place_of
 from snakesim_hal.model.fault_kinds import Injection
@@ -72,7 +72,7 @@ class GuardedBackend:
         return replace(samples, encoded=encoded)
 
     @_guarded
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """As the backend does."""
         self._inner.enact(setpoints, lifecycle)
 

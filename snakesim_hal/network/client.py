@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from queue import Empty
 from typing import Any, Generic
 
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import mismatch
@@ -32,6 +31,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.outgoing import checked
 from snakesim_hal.wire.own_sample import own_kind_at
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 KEPT_PER_KEY = 32
 NO_TICK = -1  # of messages without a tick, such as an intent: only the newest is kept
@@ -321,7 +321,7 @@ class Commander:
         self._epoch = answer.epoch if answer.ok else 0
         return answer.ok
 
-    def send(self, clock: Clock, joints: JointState, setpoints: Setpoints) -> None:
+    def send(self, clock: Clock, joints: JointState, setpoints: RequestedSetpoints) -> None:
         """Publish setpoints that answer a joint state; they are valid for one lease term after its publishing."""
         self._sequence += 1
         command = JointCommand(
@@ -338,8 +338,8 @@ class Commander:
         self._client.put(keys.JOINT_COMMAND, command)
         self._client.commanded_tick = joints.tick
 
-    def stay(self, joints: JointState) -> Setpoints:
-        """Setpoints that hold every joint at its angle: sent while the robot is not armed."""
+    def stay(self, joints: JointState) -> RequestedSetpoints:
+        """RequestedSetpoints that hold every joint at its angle: sent while the robot is not armed."""
         count = len(self._description.joints)
         limits = [joint.torque_limit_nm for joint in self._description.joints]
-        return Setpoints([Mode.POSITION] * count, list(joints.angle_rad), limits)
+        return RequestedSetpoints([Mode.POSITION] * count, list(joints.angle_rad), limits)

@@ -7,7 +7,6 @@ ms, and an armed robot goes into its stop mode.
 import time
 from collections.abc import Callable
 
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import RefusedError, StalledError
 from snakesim_hal.base.process import tune_garbage_collector
 from snakesim_hal.model.fault_kinds import CONTROL
@@ -15,6 +14,7 @@ from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, Description, JointState, Message, Pose
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SILENCE_S = 2.0
 LEASE_S = 10.0
@@ -36,7 +36,7 @@ class Commanding:
         self._client.description()
         self._ticks = self._client.ticks(SILENCE_S)
         self._commander = Commander(self._client, robot)
-        self._last: Setpoints | None = None
+        self._last: RequestedSetpoints | None = None
         self.clock: Clock | None = None
         self._mine = False
         tune_garbage_collector()  # looking through all objects of a notebook may take longer than a lease
@@ -66,7 +66,7 @@ class Commanding:
         """Whether the lease is ours at this tick."""
         return self._mine
 
-    def send(self, points: Setpoints) -> None:
+    def send(self, points: RequestedSetpoints) -> None:
         """Command these in this tick. Raises RefusedError without the lease."""
         joints = self.read(keys.JOINTS)
         if not isinstance(joints, JointState) or self.clock is None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import Derating
@@ -41,7 +41,7 @@ COMMANDS_KEPT = 1024
 class Decision:
     """The setpoints of one tick."""
 
-    setpoints: Setpoints
+    setpoints: SafeSetpoints
     sequence: int | None  # of the command; None: the host's own stop mode
     limited: dict[int, str]  # joint index -> which limit changed its target
 

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import oldest_state_ns
@@ -274,10 +274,10 @@ def _why(
     return "acceleration" if fast else "torque_rate"
 
 
-def as_setpoints(applied: Applied, isolated: frozenset[int]) -> Setpoints:
+def as_setpoints(applied: Applied, isolated: frozenset[int]) -> SafeSetpoints:
     """For the backend. isolated: indices of isolated joints."""
     modes = [_MODES[code] for code in applied.mode.tolist()]
-    return Setpoints(modes, applied.target.tolist(), applied.torque_limit_nm.tolist(), isolated)
+    return SafeSetpoints(modes, applied.target.tolist(), applied.torque_limit_nm.tolist(), isolated)
 
 
 _MODES = {int(mode): mode for mode in Mode}

@@ -160,7 +160,7 @@ class Servos:
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """Setpoints; torque on and off. An emergency stop is torque off, too: servos know no other."""
+        """SafeSetpoints; torque on and off. An emergency stop is torque off, too: servos know no other."""
         everybody = range(len(self.servos))
         if not may_enable:
             following &= {i for i in everybody if self.servos[i].follows}

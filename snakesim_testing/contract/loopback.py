@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from snakesim_hal.backend import Backend, Samples, Setpoints
+from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
@@ -26,6 +26,7 @@ from snakesim_hal.wire.messages import (
     LifecycleState,
     Mode,
 )
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract.rig import HOLDER, JointTargets
 
 LIMIT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
@@ -86,7 +87,7 @@ class Controller:
             commander = Commander(client, robot)
             client.announce()
             arm_session = armed_at = -1
-            held: Setpoints | None = None
+            held: RequestedSetpoints | None = None
             for clock in client.ticks(silence_s=0.05):
                 if self.stopped.is_set():
                     return
@@ -106,14 +107,14 @@ class Controller:
                     self.last_sent_tick, self.epoch, self.arm_session = clock.tick, clock.lease_epoch, clock.arm_session
                     client.done(clock.tick)
 
-    def _asked(self, clock: Clock, held: Setpoints, ticks: int) -> Setpoints | None:
+    def _asked(self, clock: Clock, held: RequestedSetpoints, ticks: int) -> RequestedSetpoints | None:
         asked = self.plan(ticks) if clock.lifecycle == "armed" else {}
         if asked is None:
             return None
         mode, target = list(held.mode), list(held.target)
         for joint, (wanted_mode, wanted) in asked.items():
             mode[joint], target[joint] = wanted_mode, wanted
-        return Setpoints(mode, target, held.torque_limit_nm)
+        return RequestedSetpoints(mode, target, held.torque_limit_nm)
 
 
 class Hosted:

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.backend import Backend, Samples, Setpoints
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.host.control_cycle import ControlCycle
 from snakesim_hal.safety.authority import Authority
-from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     ClockMode,
     EstopRequest,
@@ -23,9 +23,9 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     LifecycleState,
     Mode,
-    Power,
     request_to_arm,
 )
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract import tolerances as t
 
 JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
@@ -37,12 +37,17 @@ def _no_sleep(_seconds: float) -> None:
     """In lockstep no drive's time is that of a clock."""
 
 
+def unlimited(requested: RequestedSetpoints) -> SafeSetpoints:
+    """Pass setpoints off as limited, for clauses about what a backend does at its joints' ends."""
+    return SafeSetpoints(requested.mode, requested.target, requested.torque_limit_nm)
+
+
 @dataclass
 class Record:
     """Joint states and setpoints over some ticks. All arrays are (ticks, n_joints)."""
 
     samples: list[Samples]
-    setpoints: list[Setpoints]
+    setpoints: list[SafeSetpoints]
     faults: list[Fault]  # reported by the backend in these ticks
 
     @property
@@ -84,11 +89,11 @@ class Rig:
         self.robot = self.backend.describe()
         self.count = len(self.robot.joints)
         self.full_torque_nm = [joint.torque_limit_nm for joint in self.robot.joints]
-        self.authority = Authority(self.robot)
+        self._cycle = ControlCycle(self.backend, Authority(self.robot))
         self._sequence = 0
         self._anchor_ns = time.monotonic_ns()
         self._samples: list[Samples] = []
-        self._setpoints: list[Setpoints] = []
+        self._setpoints: list[SafeSetpoints] = []
         self.first = self._sample()
         # On a bus the first joint states may take a few periods.
         for _ in range(t.ARMING_PERIODS):
@@ -97,6 +102,11 @@ class Rig:
                 break
         self.home_rad = list(self.now.angle_rad)
         self.faults_at_opening = self.faults
+
+    @property
+    def authority(self) -> Authority:
+        """The safety core that drives the robot."""
+        return self._cycle.safety
 
     # --- capabilities --------------------------------------------------------------------------------------
 
@@ -148,18 +158,16 @@ class Rig:
 
     # --- one period ----------------------------------------------------------------------------------------
 
-    def hand(self, points: Setpoints, lifecycle: LifecycleState) -> None:
+    def hand(self, points: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Hand setpoints to the backend without the limiter, and let a period pass."""
         self.backend.enact(points, lifecycle)
         self.let_pass(points)
 
-    def let_pass(self, setpoints: Setpoints | None = None) -> None:
+    def let_pass(self, setpoints: SafeSetpoints | None = None) -> None:
         """Let a period pass and sample, as the host does. Faults go to the authority, as in the host."""
         self._setpoints.append(setpoints or self._setpoints[-1])
-        self.backend.advance()
-        for fault in self.backend.faults():
+        for fault in self._cycle.advance():
             self._found.append((self.tick, fault))
-            self.authority.fault(fault)
         self.tick += 1
         if self.clock_mode == "realtime":
             self._wait_for_deadline()
@@ -169,8 +177,9 @@ class Rig:
         """Periods without a new command: the last one stays active while its lease lasts."""
         began = self.tick
         for _ in range(periods):
-            self.authority.expire(self._now_ns, self.tick)
-            self.hand(self.authority.decide().setpoints, self.authority.state)
+            decision = self._cycle.decide(self._now_ns, self.tick)
+            self._cycle.enact(decision)
+            self.let_pass(decision.setpoints)
         return self.since(began)
 
     def drive(self, asked: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
@@ -181,7 +190,7 @@ class Rig:
             self.idle()
         return self.since(began)
 
-    def offer(self, points: Setpoints) -> Record:
+    def offer(self, points: RequestedSetpoints) -> Record:
         """One command as it is, and the period after it."""
         began = self.tick
         self._offer(points)
@@ -193,12 +202,11 @@ class Rig:
         began = self.tick
         for _ in range(periods):
             self._offer(self.points(dict.fromkeys(asked, (Mode.PASSIVE, 0.0))))
-            self.authority.expire(self._now_ns, self.tick)
-            self.authority.decide()
-            self.hand(self.points(asked, torque_limit_nm), self.authority.state)
+            self._cycle.decide(self._now_ns, self.tick)
+            self.hand(unlimited(self.points(asked, torque_limit_nm)), self.authority.state)
         return self.since(began)
 
-    def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> Setpoints:
+    def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> RequestedSetpoints:
         """Setpoints of all joints; those without a command hold the start pose.
 
         A joint without a velocity mode gets the positions that lead along at that speed, one each time.
@@ -209,7 +217,7 @@ class Rig:
             if wanted_mode is Mode.VELOCITY and not self.has(joint, Mode.VELOCITY):
                 wanted_mode, wanted = Mode.POSITION, self._next_along(joint, wanted)
             mode[joint], target[joint] = wanted_mode, wanted
-        return Setpoints(mode, target, torque_limit_nm or self.full_torque_nm)
+        return RequestedSetpoints(mode, target, torque_limit_nm or self.full_torque_nm)
 
     def freeze_host(self, seconds: float, freeze_driver: Callable[[float, Callable[[float], None]], None]) -> None:
         """Let time pass in which the host does nothing, as when its process is stopped and goes on later."""
@@ -258,13 +266,14 @@ class Rig:
     @contextlib.contextmanager
     def may_lose_a_joint(self) -> Iterator[None]:
         """Context in which one failed joint is isolated, whatever the robot file allows. Begins and ends disarmed."""
-        usual = self.authority
-        self.authority = Authority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
+        usual = self._cycle
+        tolerant = Authority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
+        self._cycle = ControlCycle(self.backend, tolerant)
         self.idle()
         yield
         self.disarm()
         self.idle()
-        self.authority = usual
+        self._cycle = usual
         self.idle()
 
     def lose(self, joint: int) -> None:
@@ -309,7 +318,7 @@ class Rig:
         away = np.abs(np.array(self.now.angle_rad) - self.home_rad)
         return bool(away.max() < t.REACHED_RAD and np.abs(self.now.velocity_rad_s).max() < t.STILL_RAD_S)
 
-    def _offer(self, points: Setpoints) -> None:
+    def _offer(self, points: RequestedSetpoints) -> None:
         """Send a command; a rejection shows in the joint states."""
         if self.authority.state == "disarmed" and not self.authority.lease.live(self._now_ns):
             self.authority.on_lease(LeaseRequest(action="acquire", holder=HOLDER), self._now_ns)
@@ -328,11 +337,8 @@ class Rig:
         self.authority.offer(command, now_ns=self._now_ns, tick=self.tick, age_ns=0)
 
     def _sample(self) -> Samples:
-        samples = self.backend.sample(self.tick, self._now_ns)
-        self.authority.observe(samples.joints, self._now_ns)
-        power = samples.others.get(keys.POWER)
-        if isinstance(power, Power):
-            self.authority.observe_power(power, self._now_ns)
+        samples = self._cycle.sample(self.tick, self._now_ns)
+        self._cycle.observe(samples, self._now_ns)
         self._samples.append(samples)
         return samples
 

@@ -11,7 +11,7 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import JointState, Mode
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import Rig, unlimited
 from snakesim_testing.contract.test_lifecycle import GO
 
 
@@ -20,7 +20,7 @@ def what_is_still_seen(rig: Rig) -> list[JointState]:
     seen: list[JointState] = []
     for tick in range(rig.tick + 1, rig.tick + 1 + t.CLOSING_PERIODS):
         with contextlib.suppress(BackendError):
-            rig.backend.enact(rig.points(GO), "armed")
+            rig.backend.enact(unlimited(rig.points(GO)), "armed")
         with contextlib.suppress(BackendError):
             rig.backend.advance()
         with contextlib.suppress(BackendError):

@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.wire.messages import LifecycleState, Mode
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import JointTargets, Record, Rig
+from snakesim_testing.contract.rig import JointTargets, Record, Rig, unlimited
 
 GO: JointTargets = {0: (Mode.VELOCITY, t.CRUISE_RAD_S)}
 
@@ -40,7 +40,7 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig
     asked = {i: (Mode.POSITION, rig.home_rad[i] + 0.5 * t.STEP_RAD) for i in range(rig.count)}
     before, began = np.array(rig.now.angle_rad), rig.tick
     for _ in range(rig.periods(t.CRUISE_S)):
-        rig.hand(rig.points(asked), state)
+        rig.hand(unlimited(rig.points(asked)), state)
     rig.idle(t.TRANSPORT_PERIODS)  # disarmed: the only state after a stop
     moved = float(np.abs(rig.since(began).angle_rad - before).max())
     if moved >= t.STILL_RAD and bench.clock_mode == "lockstep":

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
@@ -46,7 +46,7 @@ class Liar(Workbench):
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         return Samples(self.reads(super().sample(tick, timestamp_ns).joints))
 
-    def enact(self, setpoints: Setpoints, lifecycle: Any) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: Any) -> None:
         super().enact(self.hears(setpoints), lifecycle)
 
     def describes(self, robot: Description) -> Description:
@@ -55,7 +55,7 @@ class Liar(Workbench):
     def reads(self, joints: JointState) -> JointState:
         return joints
 
-    def hears(self, points: Setpoints) -> Setpoints:
+    def hears(self, points: SafeSetpoints) -> SafeSetpoints:
         return points
 
 
@@ -222,7 +222,7 @@ class SaysTheFurthestForNothing(WithSonar):
 # --- modes and units -------------------------------------------------------------------------------------------
 
 
-def let_go(points: Setpoints) -> Setpoints:
+def let_go(points: SafeSetpoints) -> SafeSetpoints:
     """With all joints passive."""
     return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
@@ -234,7 +234,7 @@ def targets_in_degrees(points):
 
 @hears("position_mode_turns_the_joint_that_is_asked_and_no_other")
 def head_to_tail(points):
-    return Setpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
+    return SafeSetpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
 
 
 @hears("position_mode_turns_the_joint_that_is_asked_and_no_other", "torque_mode_pushes_with_the_torque_that_is_asked")
@@ -257,7 +257,7 @@ def one_mode_for_all(points):
 def holds_what_is_lost(points):
     held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
     target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
-    return Setpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
+    return SafeSetpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
 
 
 @hears("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")

@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_drivers.kit.braking import AT_REST_RAD_S
 from snakesim_drivers.kit.drive_backend import LATCHED
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
 DOCS = Path(__file__).parents[2] / "docs" / "backends.md"
@@ -46,7 +46,7 @@ class DrivesWorkbench(Workbench):
         self.braked_s = 0.0
         self.was: LifecycleState = "disarmed"
 
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         was_latched, self.was = self.was in LATCHED, lifecycle
         if was_latched and lifecycle not in LATCHED:
             self.tripped[:] = self.reported[:] = False
@@ -107,7 +107,7 @@ class BusWorkbench(DrivesWorkbench):
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)
         joints = len(self.angle)
-        self.on_its_way: Setpoints | None = None
+        self.on_its_way: SafeSetpoints | None = None
         self.lifecycle: LifecycleState = "disarmed"
         self.armed_for = 0
         self.samples = 0
@@ -138,7 +138,7 @@ class BusWorkbench(DrivesWorkbench):
             )
         )
 
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Put it on the bus."""
         if not self.open:
             super().enact(setpoints, lifecycle)

@@ -47,7 +47,7 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
 def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
-        "from snakesim_gnc.control.controller import Action, Setpoints\n"
+        "from snakesim_gnc.control.controller import Action, RequestedSetpoints\n"
         "from snakesim_gnc.control.hold import Hold\n"
         "from snakesim_hal.wire.messages import Mode\n\n\n"
         "class Wave(Hold):\n"
@@ -55,12 +55,12 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, cloc
         "        if view.time_s < 0.5:\n"
         "            return super().update(view)\n"
         "        angles = list(view.joints.angle_rad)[:-1]\n"
-        "        return Action(Setpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
+        "        return Action(RequestedSetpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
     flags = ["--controller", "./wave.py:Wave", "--clock-mode", clock_mode, "--duration", "60"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     said = (
-        "controller ./wave.py:Wave (class Wave): Setpoints.mode has 12 values, must have 13: one a joint, "
+        "controller ./wave.py:Wave (class Wave): RequestedSetpoints.mode has 12 values, must have 13: one a joint, "
         "joint_1 to joint_13"
     )
     assert ended.code == 1 and summary.duration_s < 5.0  # not after the time that a stalled service is given

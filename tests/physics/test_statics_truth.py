@@ -15,7 +15,7 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import TripletSolution, bending_torque_nm, solve_triplet
 from snakesim_gnc.control.obstacle_triplet.statics import loads
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.route import Route, lay_chain, sine_points
@@ -129,7 +129,7 @@ def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) ->
         risen = share * min(tick / (RISE_S * 100), 1.0)
         target = angles + risen * ahead_rad
         target[bench.joint] = risen * bench.solved.torque_nm
-        backend.enact(Setpoints(mode, target.tolist(), [torque_nm] * count), "armed")
+        backend.enact(SafeSetpoints(mode, target.tolist(), [torque_nm] * count), "armed")
         backend.advance()
         pushed = {f"cylinder_{k}": 0.0 for k in range(3)}
         for contact in backend.true_state().contacts:

@@ -19,7 +19,7 @@ from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.emulated_body import make_physics_model
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.physics.physics_model import PhysicsModel
 from tests.unit.can_backend.loop import Loop, armed, config
 
@@ -56,7 +56,7 @@ class SharedBus(Loop):
 
     true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])  # at ends of ticks
 
-    def run(self, ticks: int, wish: Callable[[int], Setpoints] | None = None) -> None:
+    def run(self, ticks: int, wish: Callable[[int], SafeSetpoints] | None = None) -> None:
         """So many periods, each as long for the modules as for the driver."""
         for _ in range(ticks):
             self.wire.until_ns = self.wire.now_ns + self.config.period_ns

@@ -35,9 +35,9 @@ from snakesim_gnc.control.obstacle_triplet.telemetry import bending_nm, planned_
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstacle that is near the body
 
@@ -91,7 +91,7 @@ class ObstacleTriplet:
         self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
 
     def update(self, view: View) -> Action:
-        """Setpoints for the next period."""
+        """RequestedSetpoints for the next period."""
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
@@ -115,12 +115,12 @@ class ObstacleTriplet:
         limits_nm = self._body.torque_limit_nm
         if choice is None or turn is None:
             self._asked_n = self._force_n = 0.0
-            return Action(Setpoints(mode, targets, limits_nm), self._report_rest(located))
+            return Action(RequestedSetpoints(mode, targets, limits_nm), self._report_rest(located))
         push = self._push(view, located, choice, turn)
         self._force_n = push.force_n
         mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
         self._watch_progress(view, located, choice, push)
-        return Action(Setpoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
+        return Action(RequestedSetpoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
 
     def _follow(self, view: View, located: Located) -> BodyPose:
         """Reference of the joints in position mode; starts, and continues from another place, without a jump."""

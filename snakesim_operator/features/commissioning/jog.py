@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.base.errors import ConfigError, RefusedError
 from snakesim_hal.base.process import SERVICE_PRIORITY, on_stop_signal, set_realtime_priority, user_name
 from snakesim_hal.base.terminal import say
@@ -31,6 +30,7 @@ from snakesim_hal.wire.messages import (
     Status,
     request_to_arm,
 )
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.features.commissioning.by_hand import chosen, running_joints
 from snakesim_operator.robot_commands.command import ask_meanwhile
@@ -167,7 +167,7 @@ class _Jogging:
             modes[self._joint] = Mode.POSITION
             targets[self._joint] = at_rad if self._jog is None else self._jog.after(period_s, at_rad)
             limits_nm = [self._request.torque * joint.torque_limit_nm for joint in joints]
-            self._commanding.send(Setpoints(modes, targets, limits_nm))
+            self._commanding.send(RequestedSetpoints(modes, targets, limits_nm))
         return clock
 
     def _angle_rad(self) -> float:

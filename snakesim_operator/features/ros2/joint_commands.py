@@ -11,8 +11,8 @@ from typing import Any
 
 from rosbags.serde import SerdeError
 
-from snakesim_hal.backend import Setpoints
 from snakesim_hal.wire.messages import Clock, Description, JointState, Mode
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.features.ros2.message_age import why_too_old
 from snakesim_operator.features.ros2.messages import JOINT_STATE, STORE
 
@@ -70,7 +70,7 @@ class JointTargets:
         self.why = why
         return False
 
-    def setpoints(self, clock: Clock, joints: JointState) -> Setpoints:
+    def setpoints(self, clock: Clock, joints: JointState) -> RequestedSetpoints:
         """For this tick. An arming begins with staying."""
         count = len(self._robot.joints)
         if clock.lifecycle != "armed":
@@ -86,7 +86,7 @@ class JointTargets:
             if stays_rad is None:  # where it is now, not where it sinks to
                 self._stays_rad[i] = stays_rad = joints.angle_rad[i]
             targets[i] = stays_rad
-        return Setpoints(modes, targets, self._limits_nm)
+        return RequestedSetpoints(modes, targets, self._limits_nm)
 
     def _read(self, payload: bytes) -> "_Commanded | str":
         """What a message commands; a text: what is wrong with it."""

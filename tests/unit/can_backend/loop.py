@@ -13,7 +13,7 @@ from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import InProcessEmulators
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
@@ -37,10 +37,10 @@ class Loop:
     tick: int = 0
     samples: list[Samples] = field(default_factory=list[Samples])
     faults: list[Fault] = field(default_factory=list[Fault])
-    wanted: Setpoints | None = None
+    wanted: SafeSetpoints | None = None
     true_speed_rad_s: list[float] = field(default_factory=list[float])  # of the fastest joint, at every tick
 
-    def run(self, ticks: int, wish: Callable[[int], Setpoints] | None = None) -> None:
+    def run(self, ticks: int, wish: Callable[[int], SafeSetpoints] | None = None) -> None:
         """So many periods; a fault takes the robot out of `armed`, as the authority does."""
         for _ in range(ticks):
             samples = self.backend.sample(self.tick, self.tick * self.config.period_ns)
@@ -62,16 +62,16 @@ class Loop:
         self.run(ticks)
         assert self.states() == [ModuleState.ARMED] * len(self.states()), self.faults
 
-    def staying(self, samples: Samples) -> Setpoints:
+    def staying(self, samples: Samples) -> SafeSetpoints:
         """Every joint stays where it is."""
         angles = list(samples.joints.angle_rad)
-        return Setpoints([Mode.POSITION] * len(angles), angles, [4.0] * len(angles))
+        return SafeSetpoints([Mode.POSITION] * len(angles), angles, [4.0] * len(angles))
 
-    def waving(self, tick: int) -> Setpoints:
+    def waving(self, tick: int) -> SafeSetpoints:
         """Every joint swings by 0.3 rad at 1 Hz."""
         swing = 0.3 * np.sin(2 * np.pi * tick / 100)
         count = len(self.samples[-1].joints.angle_rad)
-        return Setpoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
+        return SafeSetpoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
 
     def states(self) -> list[ModuleState]:
         """What the modules last said."""

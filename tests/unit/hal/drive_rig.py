@@ -3,7 +3,7 @@
 from typing import Any
 
 from snakesim_drivers.kit.drive_backend import DriveBackend
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
@@ -32,7 +32,7 @@ class DriveRig:
             count = len(self.joints.angle_rad)
             mode, target = self._setpoint(lifecycle)
             self.backend.enact(
-                Setpoints([mode] * count, [target] * count, [self.limit_nm] * count, self.isolated), lifecycle
+                SafeSetpoints([mode] * count, [target] * count, [self.limit_nm] * count, self.isolated), lifecycle
             )
             self.backend.advance()
             found += self.backend.faults()

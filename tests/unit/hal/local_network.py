@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.faults.allowed import faults_of_host
 from snakesim_hal.host.guarded_backend import GuardedBackend
@@ -34,6 +34,7 @@ from snakesim_hal.wire.messages import (
     SensorDescription,
     Status,
 )
+from snakesim_hal.wire.setpoints import RequestedSetpoints
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import pose
@@ -79,8 +80,8 @@ class LagBackend:
         count = config.robot.chain.modules
         self._period_s = config.period_ns * 1e-9
         self.angles = [0.0] * count
-        self._points = Setpoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
-        self.enacted: list[Setpoints] = []
+        self._points = SafeSetpoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
+        self.enacted: list[SafeSetpoints] = []
         self.advanced = 0
         self.fails_in: str | None = None  # sample, enact, advance or faults
         self.fails_with: Exception = BackendError("diverged")
@@ -113,7 +114,7 @@ class LagBackend:
             return Samples(joints)
         return Samples(joints, {keys.POSE: pose(tick, timestamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
 
-    def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """From now on."""
         self._fail("enact")
         self._points = setpoints
@@ -178,7 +179,7 @@ class Follower:
             if clock.lifecycle == "armed":
                 self.armed_ticks.append(clock.tick)
                 wave = self.amplitude_rad * math.sin(2 * math.pi * clock.timestamp_ns * 1e-9)
-                points = Setpoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
+                points = RequestedSetpoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
             commander.send(clock, joints, points)
         client.done(clock.tick)
 

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 import msgspec
 from mujoco import MjData
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.files import read_part
 from snakesim_hal.model.scenario import RunConfig, check
 from snakesim_hal.wire.messages import Message, Mode
@@ -78,7 +78,7 @@ class Run:
         modes = mode if isinstance(mode, list) else [mode] * self.count
         targets = target if isinstance(target, list) else [float(target)] * self.count
         limits = [self.config.robot.limits.torque_nm if limit is None else limit] * self.count
-        self.sim.enact(Setpoints(modes, targets, limits), "armed")
+        self.sim.enact(SafeSetpoints(modes, targets, limits), "armed")
 
     def sample(self) -> Samples:
         """The samples of the present tick."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.scenario import load
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.wire.messages import Mode
@@ -129,7 +129,7 @@ def test_the_simulator_s_motors_do_the_same():
             gains = (motor.stiffness_nm_per_rad, damping, limits.speed_rad_s)
             motors.drive(i, mode, float(target[i]), limits.torque_nm, *gains)
         for _ in range(4):
-            sim.enact(Setpoints([mode] * count, target.tolist(), [limits.torque_nm] * count), "armed")
+            sim.enact(SafeSetpoints([mode] * count, target.tolist(), [limits.torque_nm] * count), "armed")
             sim.advance()
             for _ in range(round(run.period_ns * 1e-9 / physics_model.step_s)):
                 physics_model.advance(motors.step(physics_model.angle_rad, physics_model.velocity_rad_s))

@@ -14,7 +14,7 @@ from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
 from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.loop import config
@@ -150,7 +150,7 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
     joints = backend.sample(0, 0).joints
     for tick in range(1, 20):
         joints = backend.sample(tick, tick * CONFIG.period_ns).joints
-        backend.enact(Setpoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
+        backend.enact(SafeSetpoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
         backend.advance()
     backend.close()
     read = [parse_registers(frame.data) for frame in sent]

@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
 )
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import LifecycleState, Mode
 from tests.unit.can_backend.frames import read
 
@@ -24,7 +24,7 @@ TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "to
 
 
 def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
-    (frame,) = commands.SetpointWriter(1).frames(Setpoints([mode], [target], [limit_nm]))
+    (frame,) = commands.SetpointWriter(1).frames(SafeSetpoints([mode], [target], [limit_nm]))
     return frame
 
 
@@ -56,7 +56,7 @@ def test_a_passive_joint_gets_no_target(target: float) -> None:
 
 def test_joints_and_set_points_must_be_as_many() -> None:
     with pytest.raises(ValueError):
-        commands.SetpointWriter(3).frames(Setpoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
+        commands.SetpointWriter(3).frames(SafeSetpoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
 
 
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------

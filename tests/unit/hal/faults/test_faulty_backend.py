@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.backend import Backend, Setpoints
+from snakesim_hal.backend import Backend, SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import Injection, parse
@@ -45,7 +45,7 @@ class Bench:
         self.tick = 0
 
     def sample(self) -> JointState:
-        self.backend.enact(Setpoints([Mode.VELOCITY] * 3, [1.0] * 3, [4.0] * 3), "armed")
+        self.backend.enact(SafeSetpoints([Mode.VELOCITY] * 3, [1.0] * 3, [4.0] * 3), "armed")
         self.backend.advance()
         self.tick += 1
         return self.backend.sample(self.tick, self.tick * PERIOD_NS).joints

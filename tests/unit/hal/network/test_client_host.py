@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES, CommandArrival
@@ -35,7 +35,7 @@ from tests.unit.hal.rig import command, description, run_config, state
 pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
-def passive(points: Setpoints) -> bool:
+def passive(points: SafeSetpoints) -> bool:
     return set(points.mode) == {Mode.PASSIVE}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
@@ -20,7 +20,7 @@ ROBOT = description()
 
 
 def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Decision:
-    return Decision(Setpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
+    return Decision(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
 
 
 def digest(*rows: tuple[int, Decision], angle: float = 0.0) -> str:
@@ -169,7 +169,7 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
 def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
     robot = description(chain__modules=100)
     box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
-    reported = Decision(Setpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    reported = Decision(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
     for tick in range(300):
         box.record(tick, tick, row, reported)
     peaks = [0] * 700

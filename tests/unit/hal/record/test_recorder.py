@@ -12,7 +12,7 @@ from threading import Event
 import msgspec
 import pytest
 
-from snakesim_hal.backend import Samples, Setpoints
+from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.programs.host_program import record_of
 from snakesim_hal.run_log import writer as under_test
 from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
@@ -25,7 +25,7 @@ from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.rig import description, run_config, state
 
 ROBOT = description()
-TOLD = Decision(Setpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
+TOLD = Decision(SafeSetpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
 ROW = BlackBox(ROBOT).layout.row_bytes
 
 

@@ -25,7 +25,7 @@ from snakesim_can_backend.protocol.definitions import (
     opcode_of,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
@@ -158,11 +158,11 @@ def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> 
     speeds = []
     for torque_nm in (0.0, 1.0):
         with loop() as run:
-            run.wanted = Setpoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
+            run.wanted = SafeSetpoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
             run.arm()
 
-            def wish(tick: int, torque_nm: float = torque_nm) -> Setpoints:
-                return Setpoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
+            def wish(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
+                return SafeSetpoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
 
             run.run(change_at + 5 - run.tick, wish)
             speeds.append(np.array([samples.joints.velocity_rad_s for samples in run.samples]))

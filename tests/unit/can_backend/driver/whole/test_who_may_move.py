@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.backend import Setpoints
+from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import LifecycleState, Mode
 from tests.unit.can_backend.driver.whole.recorded import (
     ARMED,
@@ -120,7 +120,7 @@ def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
         for _ in range(30):
             tick = run.tick
             before = len(WIRES[0].sent)
-            run.run(1, lambda tick: Setpoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
+            run.run(1, lambda tick: SafeSetpoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
             mine = [f for f in WIRES[0].sent[before:] if is_set_point(f) and node_of(f.id) == 2]
             by_tick[tick] = [read(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)

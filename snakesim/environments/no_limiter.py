@@ -1,0 +1,51 @@
+"""What decides on the setpoints of an environment that has no limits."""
+
+from snakesim_hal.backend import SafeSetpoints
+from snakesim_hal.safety.authority import Decision
+from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Mode, Power
+
+
+class NoLimiter:
+    """A stand-in for the authority of a simulated robot: it passes every target on, and is always armed.
+
+    It is the one place outside of the limiter that declares setpoints safe, so it must never drive a real robot.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self._full_torque_nm = [joint.torque_limit_nm for joint in description.joints]
+        self._modes = [Mode.PASSIVE] * len(description.joints)
+        self._target = [0.0] * len(description.joints)
+        self._failure = ""
+
+    @property
+    def state(self) -> LifecycleState:
+        """`armed`, until the backend fails."""
+        return "fault" if self._failure else "armed"
+
+    @property
+    def why(self) -> str:
+        """Why it is in this state."""
+        return self._failure or "no limiter"
+
+    def command(self, modes: list[Mode], target: list[float]) -> None:
+        """Set the modes and targets of the next period."""
+        self._modes = modes
+        self._target = target
+
+    def observe(self, joints: JointState, now_ns: int) -> None:
+        """Ignore the joint states."""
+
+    def observe_power(self, power: Power, now_ns: int) -> None:
+        """Ignore the power samples."""
+
+    def expire(self, now_ns: int, tick: int) -> None:
+        """Do nothing: there is no lease that could expire."""
+
+    def decide(self, up_to: int | None = None) -> Decision:
+        """Return the targets unchanged."""
+        return Decision(SafeSetpoints(self._modes, self._target, self._full_torque_nm), None, {})
+
+    def fault(self, fault: Fault) -> None:
+        """Remember a fault of the whole robot; a fault of a joint changes nothing."""
+        if fault.reach == "robot":
+            self._failure = fault.cause

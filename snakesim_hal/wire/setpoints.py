@@ -1,0 +1,17 @@
+"""The setpoints that a controller requests."""
+
+from dataclasses import dataclass
+
+from snakesim_hal.wire.messages import Mode
+
+
+@dataclass(frozen=True)
+class RequestedSetpoints:
+    """Setpoints of all joints, tail to head, as a controller or a client requests them, before any limit is applied.
+
+    A backend never receives them. The HAL host's limiter turns them into `snakesim_hal.backend.SafeSetpoints`.
+    """
+
+    mode: list[Mode]
+    target: list[float]  # rad, rad/s or N·m, as the mode says
+    torque_limit_nm: list[float]  # maximum torque of each joint's motor, at least 0

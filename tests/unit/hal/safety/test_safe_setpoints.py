@@ -1,0 +1,25 @@
+"""The type checker proves that a backend gets limited setpoints only if nothing else creates that type."""
+
+import ast
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[4]
+MAY_CREATE = {
+    "snakesim_hal/safety/limiter.py",
+    "snakesim/environments/no_limiter.py",  # simulated robots whose environment was asked for without limits
+    "snakesim_testing/contract/rig.py",  # the bench of the contract suite
+}
+
+
+def files_that_create_safe_setpoints() -> set[str]:
+    """The shipped files with a call of `SafeSetpoints(...)`."""
+    found: set[str] = set()
+    for path in REPOSITORY.glob("snakesim*/**/*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "SafeSetpoints":
+                found.add(str(path.relative_to(REPOSITORY)))
+    return found
+
+
+def test_only_the_limiter_creates_setpoints_for_a_backend() -> None:
+    assert files_that_create_safe_setpoints() <= MAY_CREATE
