@@ -46,7 +46,7 @@ class BodyOnPath:
         self._rows: dict[int, Floats] = {}
         self._chord_ends: dict[float, dict[int, float]] = {length: {} for length in segments_m}
 
-    def at(self, tail_s_m: float) -> BodyPose:
+    def pose_at(self, tail_s_m: float) -> BodyPose:
         """The body with its tail end at an arc length, which may be before the path's start or beyond its end."""
         row, _ = self._between(tail_s_m)
         return BodyPose(
@@ -56,11 +56,11 @@ class BodyOnPath:
             row[self._xy.stop :],
         )
 
-    def find(self, nodes_w: Floats) -> float:
+    def find_tail_s_m(self, nodes_w: Floats) -> float:
         """Arc length of the tail of a body that may be anywhere; nodes_w: (2, n_nodes) as measured."""
-        return self.fit(nodes_w, self.route.project(nodes_w[:, 0]), steps=8)
+        return self.refine_tail_s_m(nodes_w, self.route.project(nodes_w[:, 0]), steps=8)
 
-    def fit(self, nodes_w: Floats, near_s_m: float, *, steps: int = 2) -> float:
+    def refine_tail_s_m(self, nodes_w: Floats, near_s_m: float, *, steps: int = 2) -> float:
         """Arc length at which the body on the path is closest to a measured one (least squares over the nodes)."""
         measured = nodes_w.ravel()
         s = near_s_m
@@ -135,7 +135,7 @@ def chain_nodes(
     return np.array((xs, ys))
 
 
-def heading_of(wxyz: tuple[float, float, float, float]) -> float:
+def compute_heading_rad(wxyz: tuple[float, float, float, float]) -> float:
     """Heading on the ground of a frame's x axis, from its quaternion."""
     w, x, y, z = wxyz
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

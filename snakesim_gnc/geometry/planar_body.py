@@ -8,7 +8,7 @@ from statistics import median
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import BodyPose, chain_nodes, heading_of
+from snakesim_gnc.geometry.body_on_path import BodyPose, chain_nodes, compute_heading_rad
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.route import yaw_segments_m
@@ -52,7 +52,7 @@ class PlanarBody:
             chain_w = nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
             return chain_w[self._node_rows, :2].T
         bending = [angles_rad[i] for i in self.bends]
-        heading = heading_of(world.base_orientation_wxyz)
+        heading = compute_heading_rad(world.base_orientation_wxyz)
         return chain_nodes(world.base_position_w[:2], heading, bending, self.segments_m)
 
     def joints_w(self, body_pose: BodyPose) -> Floats:
@@ -76,12 +76,12 @@ class RecentAngles:
     def __bool__(self) -> bool:
         return bool(self._kept)
 
-    def put(self, timestamp_ns: int, angles_rad: list[float]) -> None:
+    def add(self, timestamp_ns: int, angles_rad: list[float]) -> None:
         """Those of the newest joint state, which may be the one before again."""
         if not self._kept or timestamp_ns > self._kept[-1][0]:
             self._kept.append((timestamp_ns, angles_rad))
 
-    def at(self, timestamp_ns: int) -> list[float]:
+    def nearest_to(self, timestamp_ns: int) -> list[float]:
         """Those measured nearest to an instant."""
         return min(self._kept, key=lambda held: abs(held[0] - timestamp_ns))[1]
 

@@ -68,14 +68,14 @@ class Navigation(Service):
         world, joints = self._client.read(self._world), self._client.read(self._joints)
         desired = self._intents.desired(self._intent.newest(), clock.timestamp_ns)
         if joints is not None:
-            self._recent.put(joints.timestamp_ns, joints.angle_rad)
+            self._recent.add(joints.timestamp_ns, joints.angle_rad)
         if self._along is not None and desired.heading_w_rad is None:
             trajectory = self._along.update(clock.tick, world, desired)
             self._planner.follow(self._along.route, trajectory.push_points)
             return [(keys.TRAJECTORY, self._with_rises(trajectory))]
         if world is None or not self._recent:
             return None
-        nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
+        nodes = self._body.nodes_w(world, self._recent.nearest_to(pose_instant_ns(world)))
         trajectory = self._planner.update(clock.tick, world, nodes.T, desired)
         if not self._planner.ready and clock.clock_mode == "lockstep" and clock.arm_session == 0:
             return None  # time stands until the robot is armed, and nobody arms it before there is a path

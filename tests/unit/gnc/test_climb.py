@@ -54,6 +54,6 @@ def test_who_only_turns_left_and_right_does_not_climb() -> None:
 
 def test_seen_from_above_a_body_on_a_ramp_is_shorter() -> None:
     segments = [0.1, *[0.2] * 8, 0.1]
-    level, climbing = (BodyOnPath(Route(STRAIGHT), segments, rises).at(0.0).nodes_w[0] for rises in ([], [RISE]))
+    level, climbing = (BodyOnPath(Route(STRAIGHT), segments, rises).pose_at(0.0).nodes_w[0] for rises in ([], [RISE]))
     assert np.all(level[:4] == climbing[:4]) and level[-1] == pytest.approx(1.8)
     assert 0.005 < level[-1] - climbing[-1] < 0.05
