@@ -69,7 +69,7 @@ class Localizer:
             self._go(step)
         self.history.add(joints.timestamp_ns, self.base, joints.angle_rad)
 
-    def take_pose(self, pose: Pose) -> None:
+    def add_pose(self, pose: Pose) -> None:
         """A new sample of the pose sensor."""
         self.carried_m = 0.0
         if self.pose_timestamp_ns is not None and pose.timestamp_ns <= self.pose_timestamp_ns:

@@ -57,20 +57,20 @@ class PerceivedWorld:
         self._touched_ns = self._variance_m2 = 0
         self.depth_timestamp_ns: int | None = None  # of the newest image or ranges in the map
 
-    def take_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
+    def add_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
         """The newest joint state moves the body. contacts, imu: the newest, for dead reckoning."""
         if self._joints is not None and joints.timestamp_ns <= self._joints.timestamp_ns:
             return
         self._joints = joints
         self.localizer.move(joints, contacts, imu)
 
-    def take_pose(self, pose: Pose) -> None:
+    def add_pose(self, pose: Pose) -> None:
         """A sample of the pose sensor."""
-        self.localizer.take_pose(pose)
+        self.localizer.add_pose(pose)
         if self.localizer.carried_m:
             self.map.drift(self.localizer.carried_m**2)
 
-    def take_contacts(self, contacts: Contacts) -> None:
+    def add_contacts(self, contacts: Contacts) -> None:
         """Touches, and the body's own way: where it is, nothing else is."""
         self._contacts = contacts
         if contacts.timestamp_ns - self._touched_ns < TOUCH_EVERY_NS and self._touched_ns:
@@ -91,7 +91,7 @@ class PerceivedWorld:
                 touches.append((position[:2], normal[:2] / math.hypot(*normal[:2])))
         self.map.take_touches(touches, contacts.timestamp_ns)
 
-    def take_look(self, look: Look, noise: Noise) -> None:
+    def add_look(self, look: Look, noise: Noise) -> None:
         """An image or a scan, of any camera, lidar or range finder. noise: of its distances."""
         body = self._body_of(look.timestamp_ns, "image" if isinstance(look, DepthImage) else "ranges")
         if body is None or look.link >= len(body.origins_w):
@@ -109,7 +109,7 @@ class PerceivedWorld:
             scan = scan_of_ranges(look, position, rotation, float(plane[0]), noise)
         self._take(scan, body)
 
-    def world(self, tick: int, now_ns: int) -> World | None:
+    def make_world(self, tick: int, now_ns: int) -> World | None:
         """The world now; None before the first joint state. tick, now_ns: of the clock."""
         joints = self._joints
         if joints is None:

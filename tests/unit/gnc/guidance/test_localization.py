@@ -52,10 +52,10 @@ def test_a_pose_that_jumps_is_not_believed_until_it_stays():
     drive = Drive([])
     *_, here = drive.turns(50, images=False)
     for here in drive.turns(10, pose=False, images=False):
-        drive.world.take_pose(drive.pose(here, off_m=0.3))
+        drive.world.add_pose(drive.pose(here, off_m=0.3))
     assert abs(drive.world.localizer.base.planar_w[0] - here.base_w[0]) < 0.03 and drive.world.localizer.refused == 10
     for here in drive.turns(20, pose=False, images=False):
-        drive.world.take_pose(drive.pose(here, off_m=0.3))
+        drive.world.add_pose(drive.pose(here, off_m=0.3))
     assert drive.world.localizer.base.planar_w[0] == pytest.approx(here.base_w[0] + 0.3, abs=0.005)
 
 
@@ -65,7 +65,7 @@ def test_a_late_pose_corrects_what_has_happened_since():
     for here in drive.turns(150, pose=False, images=False):
         late.append(drive.pose(here))
         if len(late) > 10:  # 0.2 s, in which it goes 4 cm
-            drive.world.take_pose(late.pop(0))
+            drive.world.add_pose(late.pop(0))
     assert math.dist(drive.world.localizer.base.planar_w[:2], drive.place(drive.turn - 1).base_w[:2]) < 0.012
 
 
