@@ -14,7 +14,7 @@ MISSED_BINS = 1  # dropped out within a surface
 HOLLOW_M = 0.025  # an obstacle is convex: its points do not lie this far behind the line between its ends
 
 
-def clusters_of(scan: Scan) -> list[Indices]:
+def find_clusters(scan: Scan) -> list[Indices]:
     """Bins of each cluster, in order of azimuth."""
     hits = np.flatnonzero(np.isfinite(scan.range_m))
     if len(hits) == 0:

@@ -18,7 +18,7 @@ def tolerance_m(range_m: Floats) -> Floats:
     return FLAT_M + PER_M * range_m
 
 
-def plane_under(bottoms_w: Floats, at_w: Floats) -> Floats:
+def fit_plane_under(bottoms_w: Floats, at_w: Floats) -> Floats:
     """The plane under the body: (3,) a, b, c of z = a + b x + c y, with x and y from `at_w`.
 
     bottoms_w: (n, 3) lowest points of the links. The slope across a straight body is unknown, and taken as none.
@@ -32,7 +32,7 @@ def plane_under(bottoms_w: Floats, at_w: Floats) -> Floats:
     return np.clip(plane, [-np.inf, -MAX_SLOPE, -MAX_SLOPE], [np.inf, MAX_SLOPE, MAX_SLOPE])
 
 
-def refined(plane: Floats, points: Floats) -> Floats:
+def refine_plane(plane: Floats, points: Floats) -> Floats:
     """The plane fitted to the seen points (n, 3) near it, by iterated reweighting (Tukey); or as it was.
 
     Obstacles are above it, so points above count less than points below.

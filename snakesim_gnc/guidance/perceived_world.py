@@ -11,12 +11,12 @@ import numpy as np
 
 from snakesim_gnc.guidance.body_history import Base, Body
 from snakesim_gnc.guidance.contacts_w import contact_w
-from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, metres_of
-from snakesim_gnc.guidance.ground import plane_under
+from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, decode_depth_m
+from snakesim_gnc.guidance.ground import fit_plane_under
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import Look, Noise, Scan, scan_of_ranges
-from snakesim_gnc.guidance.scan_match import matched
+from snakesim_gnc.guidance.scan import Look, Noise, Scan, make_scan
+from snakesim_gnc.guidance.scan_match import match_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire.messages import (
@@ -89,7 +89,7 @@ class PerceivedWorld:
             if abs(normal[2]) < UPRIGHT:
                 position = body.origins_w[contact.link] + rotation @ np.array(contact.position_l)
                 touches.append((position[:2], normal[:2] / math.hypot(*normal[:2])))
-        self.map.take_touches(touches, contacts.timestamp_ns)
+        self.map.add_touches(touches, contacts.timestamp_ns)
 
     def add_look(self, look: Look, noise: Noise) -> None:
         """An image or a scan, of any camera, lidar or range finder. noise: of its distances."""
@@ -98,15 +98,15 @@ class PerceivedWorld:
             return
         position, rotation = _mount(body, look)
         bottoms_w = np.vstack([body.origins_w, body.head_w]) - [0.0, 0.0, self._radius_m]
-        plane = plane_under(bottoms_w, position[:2])
+        plane = fit_plane_under(bottoms_w, position[:2])
         if isinstance(look, DepthImage):
-            kind = (Intrinsics.of(look), noise)
+            kind = (Intrinsics.from_image(look), noise)
             scanner = self._scanners.get(kind)
             if scanner is None:
                 scanner = self._scanners[kind] = DepthScanner(*kind)
-            scan = scanner.scan(metres_of(look), look.timestamp_ns, position, rotation, plane)
+            scan = scanner.scan(decode_depth_m(look), look.timestamp_ns, position, rotation, plane)
         else:
-            scan = scan_of_ranges(look, position, rotation, float(plane[0]), noise)
+            scan = make_scan(look, position, rotation, float(plane[0]), noise)
         self._take(scan, body)
 
     def make_world(self, tick: int, now_ns: int) -> World | None:
@@ -117,7 +117,7 @@ class PerceivedWorld:
         here = self.localizer
         base = here.base
         body = self._body = here.history.lay(base, np.asarray(joints.angle_rad))
-        self.map.take_body(body.axis_w(), self._radius_m, min(here.position_sd_m, 0.01))
+        self.map.carve_body(body.axis_w(), self._radius_m, min(here.position_sd_m, 0.01))
         self.map.forget(body.axis_w())
         middles = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
         contacts = self._contacts
@@ -171,16 +171,16 @@ class PerceivedWorld:
         self.map.here_m2 = variance
         if not self._trusts_pose(scan.timestamp_ns):
             then = here.history.base_at(scan.timestamp_ns)
-            found = None if then is None else matched(scan, self.map.tracks, then.planar_w)
+            found = None if then is None else match_scan(scan, self.map.tracks, then.planar_w)
             if then is not None and found is not None:
                 here.correct(then, found.planar_w, found.covariance, found.map_m2)
                 scan = scan.moved(then.planar_w, found.planar_w)
         self.depth_timestamp_ns = scan.timestamp_ns
-        self.map.take_scan(scan, min(here.position_sd_m, 0.02))
+        self.map.add_scan(scan, min(here.position_sd_m, 0.02))
         self._variance_m2 = 0.5 * float(np.trace(here.covariance[:2, :2]))
 
     def _name_at(self, position_w: Floats) -> str | None:
-        track = self.map.at(position_w[:2])
+        track = self.map.find_track(position_w[:2])
         return None if track is None else track.name
 
 

@@ -45,7 +45,7 @@ class Scan:
     free_m: Floats  # (n,) up to here nothing stands; 0: unknown
     top_m: Floats  # (n,) highest point seen on the surface, above the ground; NaN: none
 
-    def bins_of(self, points_w: Floats) -> tuple[NDArray[np.intp], Floats]:
+    def find_bins(self, points_w: Floats) -> tuple[NDArray[np.intp], Floats]:
         """Bin and range of points (..., 2); bin -1 is outside the view."""
         offset = points_w - self.origin_w
         azimuth = np.arctan2(offset[..., 1], offset[..., 0]) - self.azimuth_w
@@ -75,7 +75,7 @@ class Scan:
         return replace(self, origin_w=origin, points_w=points, azimuth_w=self.azimuth_w + turn)
 
 
-def scan_of_ranges(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: float, noise: Noise) -> Scan:
+def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: float, noise: Noise) -> Scan:
     """The scan of a range finder or lidar.
 
     position_w: (3,) of the sensor; rotation: (3, 3) world_from_sensor. Beams that end on the ground or above the body's
