@@ -126,4 +126,6 @@ def _is_landmark(track: Track) -> bool:
 
 
 def _is_plausible(correction: Floats) -> bool:
-    return bool(np.hypot(correction[0], correction[1]) <= GATE_M and abs(correction[2]) <= MAX_ROTATION_RAD)
+    is_too_far = np.hypot(correction[0], correction[1]) > GATE_M
+    is_turned_too_far = abs(correction[2]) > MAX_ROTATION_RAD
+    return not (is_too_far or is_turned_too_far)

@@ -81,7 +81,7 @@ def test_the_history_gives_the_body_at_any_stamp_it_has_and_no_other():
     middle = 0.5 * (places[40].head_w + places[41].head_w)
     assert np.abs(half.head_w - middle).max() < 1e-4
     assert history.body_at(59 * STEP_NS + 10 * STEP_NS) is None
-    history.move(np.array(places[50].base_w[:2]), np.array([0.1, 0.0, 0.0]))
+    history.shift(np.array(places[50].base_w[:2]), np.array([0.1, 0.0, 0.0]))
     moved = history.base_at(55 * STEP_NS)
     assert moved is not None and moved.planar_w[0] == pytest.approx(places[55].base_w[0] + 0.1)
 
