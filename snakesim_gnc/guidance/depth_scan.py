@@ -141,7 +141,7 @@ class DepthScanner:
         bin_count = len(free_m)
         bins = pixels.bins
         range_m = self._find_upright_m(pixels, bin_count)
-        spread_m = self._noise.at(np.nan_to_num(range_m))
+        spread_m = self._noise.sd_m(np.nan_to_num(range_m))
         width_m = SPREAD_SD * spread_m + CELL_RATIO * CELL_M
         count = np.zeros(bin_count)
         on_surface = np.zeros(len(bins), dtype=bool)

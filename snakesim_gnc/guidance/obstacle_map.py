@@ -298,7 +298,7 @@ class ObstacleMap:
         return self._start_track("seen")
 
     def _start_felt_track(self, position_w: Floats, normal_w: Floats) -> Track:
-        """Start a track at a touch, with the center where the next touch of the same obstacle will look for it."""
+        """Start a track at a touch, with its center one prior radius behind the point."""
         track = self._start_track("felt")
         track.center_w = position_w - RADIUS_M * normal_w
         track.position_sd_m = RADIUS_SD_M

@@ -111,7 +111,7 @@ class PerceivedWorld:
         bottoms_w = np.vstack([body.origins_w, body.head_w]) - [0.0, 0.0, self._radius_m]
         plane = fit_plane_under(bottoms_w, position_w[:2])
         if isinstance(look, DepthImage):
-            scanner = self._scanner_of(Intrinsics.from_image(look), noise)
+            scanner = self._find_scanner(Intrinsics.from_image(look), noise)
             scan = scanner.scan(decode_depth_m(look), look.timestamp_ns, position_w, rotation, plane)
         else:
             scan = make_scan(look, position_w, rotation, float(plane[0]), noise)
@@ -133,8 +133,8 @@ class PerceivedWorld:
             tick=tick,
             timestamp_ns=joints.timestamp_ns,
             base_position_w=tuple(base.position_w.tolist()),
-            base_orientation_wxyz=quaternion_of(base.rotation),
-            base_confidence=confidence_of(localizer.position_sd_m),
+            base_orientation_wxyz=quaternion_from_rotation(base.rotation),
+            base_confidence=compute_confidence(localizer.position_sd_m),
             contacts=self._transform_contacts(body),
             obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
             pose_timestamp_ns=localizer.pose_timestamp_ns,
@@ -182,7 +182,7 @@ class PerceivedWorld:
             self.refused[f"{sample} without a joint state of its time"] += 1
         return body
 
-    def _scanner_of(self, lens: Intrinsics, noise: Noise) -> DepthScanner:
+    def _find_scanner(self, lens: Intrinsics, noise: Noise) -> DepthScanner:
         """Return the scanner of a camera, which is made once."""
         key = (lens, noise)
         scanner = self._scanners.get(key)
@@ -221,12 +221,12 @@ class PerceivedWorld:
         return 0.5 * float(np.trace(self.localizer.covariance[:2, :2]))
 
 
-def confidence_of(position_sd_m: float) -> float:
+def compute_confidence(position_sd_m: float) -> float:
     """Return the confidence in a position, 0 to 1, by its standard deviation."""
     return 1.0 / (1.0 + (position_sd_m / HALF_CONFIDENCE_SD_M) ** 2)
 
 
-def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
+def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
     """Return the unit quaternion wxyz of a rotation matrix (3, 3).
 
     The rows of a symmetric matrix are 4 q_i q for i = w, x, y, z. The one with the largest diagonal entry is the most

@@ -11,7 +11,7 @@ import numpy as np
 from snakesim_gnc.guidance.anchoring import ESTIMATED, MEASURED, Anchors
 from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
-from snakesim_gnc.guidance.perceived_world import confidence_of, quaternion_of
+from snakesim_gnc.guidance.perceived_world import compute_confidence, quaternion_from_rotation
 from snakesim_hal.wire.messages import Contacts, Description, JointState, Obstacle, Pose, World
 
 MAX_POSITION_SD_M = 1e3  # upper limits of what is reported
@@ -46,7 +46,7 @@ class ReckonedPose:
             tick=joints.tick,
             timestamp_ns=joints.timestamp_ns,
             position_w=tuple(localizer.base.position_w.tolist()),
-            orientation_wxyz=quaternion_of(localizer.base.rotation),
+            orientation_wxyz=quaternion_from_rotation(localizer.base.rotation),
             velocity_w=(0.0, 0.0, 0.0),
             angular_velocity_w=(0.0, 0.0, 0.0),
         )
@@ -56,7 +56,7 @@ class ReckonedPose:
         position_sd_m = min(self._localizer.position_sd_m, MAX_POSITION_SD_M)
         return msgspec.structs.replace(
             world,
-            base_confidence=confidence_of(position_sd_m),
+            base_confidence=compute_confidence(position_sd_m),
             pose_timestamp_ns=None,
             base_position_sd_m=position_sd_m,
             base_yaw_sd_rad=min(self._localizer.yaw_sd_rad, MAX_YAW_SD_RAD),

@@ -27,7 +27,7 @@ class Noise:
     floor_m: float = 0.002
     per_m2: float = 0.003
 
-    def at(self, range_m: Floats) -> Floats:
+    def sd_m(self, range_m: Floats) -> Floats:
         """Return the standard deviations at ranges, in m."""
         return self.floor_m + self.per_m2 * range_m * range_m
 
@@ -121,7 +121,7 @@ def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: 
         step_rad=abs(step_rad),
         range_m=np.where(is_hit, range_m, np.nan),
         points_w=np.where(is_hit[:, None], points_w, np.nan),
-        sd_m=noise.at(np.nan_to_num(range_m)),
+        sd_m=noise.sd_m(np.nan_to_num(range_m)),
         top_m=np.where(is_hit, height_m, np.nan),
         free_m=np.where(np.isnan(range_m), 0.0, np.minimum(range_m, MAX_RANGE_M)),
     )

@@ -103,12 +103,12 @@ class _SurveyedSource:
         self._reckoned = None
         if self._config.dead_reckons(robot):
             self._reckoned = ReckonedPose(robot, _start_pose(self._config), self._known)
-            print_stderr("nobody measures the pose: it is reckoned from the start, by joints, contacts and the map")
+            print_stderr("no pose sensor: the pose is reckoned from the start, by joints, contacts and the map")
         self._estimator = None
         has_contact_sensor = any(sensor.key == keys.CONTACTS for sensor in robot.sensors)
         if not has_contact_sensor and can_estimate_contacts(robot):
             self._estimator = ContactEstimator(robot)
-            print_stderr("no sensor tells contacts: they are estimated from the torques of the joints")
+            print_stderr("no contact sensors: contacts are estimated from the torques of the joints")
 
     def make_world(self, clock: Clock) -> World | None:
         read = self._client.read

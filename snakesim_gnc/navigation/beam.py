@@ -110,7 +110,7 @@ PathSearch = Generator[int, None, SearchedPath | None]  # yields the nodes of ea
 
 @dataclass(frozen=True)
 class _Task:
-    """What one search looks for."""
+    """The goal of one search, and the body from which it starts."""
 
     origin_w: Floats  # (2,) the head of the measured body; moments are about it
     goal_rad: float
@@ -191,7 +191,7 @@ class BeamSearch:
             failed_w: (k, 2) points of paths on which the body got stuck here; the search prefers other ways round.
 
         Returns:
-            A path that may be shorter than asked for; None if there is none.
+            A path, which may have fewer arcs; None if there is none.
         """
         lying_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
         task = _Task(

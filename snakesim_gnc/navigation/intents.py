@@ -56,9 +56,9 @@ class Intents:
         if self._followed is None:
             speed_m_s = 0.0 if self._stop_reason else self._mission_m_s
             return DesiredMotion(speed_m_s, refusal or self._stop_reason, self._heading_w_rad)
-        return self._motion_of(self._followed)
+        return self._motion_from(self._followed)
 
-    def _motion_of(self, intent: Intent) -> DesiredMotion:
+    def _motion_from(self, intent: Intent) -> DesiredMotion:
         if not intent.go:
             return DesiredMotion(0.0, f"{intent.who} wants it to stop", self._heading_w_rad)
         speed_m_s = self._mission_m_s if intent.speed_m_s is None else intent.speed_m_s

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.body_history import Base, BodyHistory
-from snakesim_gnc.guidance.perceived_world import quaternion_of
+from snakesim_gnc.guidance.perceived_world import quaternion_from_rotation
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from tests.unit.gnc.guidance.drive import STEP_NS, Drive, random_field
 from tests.unit.gnc.guidance.rendered import turned
@@ -89,4 +89,4 @@ def test_the_history_gives_the_body_at_any_stamp_it_has_and_no_other():
 def test_quaternions_go_there_and_back():
     for angles in ((0.3, 0.2, -0.1), (3.1, 0.0, 0.0), (-2.0, 1.2, 3.0), (0.0, -1.5, 1.0)):
         rotation = turned(*angles)
-        assert rotation_from_quaternion(quaternion_of(rotation)) == pytest.approx(rotation)
+        assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(rotation)
