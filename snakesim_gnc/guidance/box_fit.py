@@ -175,46 +175,16 @@ def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces,
         faces: (b, 1) each.
         misfit: (b,).
     """
-    _, is_first_axis = _assign_faces(points, faces)
-    is_point = weight > 0
-    low_m: list[Floats] = []  # extent of the points along each axis
-    high_m: list[Floats] = []
-    is_seen: list[Bools] = []  # of each face
-    information: list[Floats] = []  # of each face, in 1 / m²
-    for axis in (0, 1):
-        place_m = points.place_m[axis][:, 0]
-        along_face_m = points.place_m[1 - axis][:, 0]
-        low_m.append(np.where(is_point, place_m, np.inf).min(axis=1))
-        high_m.append(np.where(is_point, place_m, -np.inf).max(axis=1))
-        is_this_axis = (is_first_axis if axis == 0 else ~is_first_axis)[:, 0]
-        for direction in (LOW, HIGH):
-            is_on_face = is_point & is_this_axis & (direction * points.outward[axis][:, 0] > 0)
-            left_m = np.where(is_on_face, along_face_m, np.inf).min(axis=1)
-            right_m = np.where(is_on_face, along_face_m, -np.inf).max(axis=1)
-            is_seen.append(right_m - left_m > MIN_FACE_M)
-            information.append(np.where(is_on_face, weight, 0.0).sum(axis=1))
-
-    longest_m = np.maximum(high_m[0] - low_m[0], high_m[1] - low_m[1])
+    extents = _measure_extents(points, weight, faces)
+    longest_m = np.maximum(extents.high_m[0] - extents.low_m[0], extents.high_m[1] - extents.low_m[1])
     depth_m = np.where(longest_m > WALL_M, WALL_THICKNESS_M, DEPTH_M)
     center_m = np.empty((len(yaw_rad), 2))  # along and across yaw
     half_m = np.empty((len(yaw_rad), 2))
     sd_m = np.empty((len(yaw_rad), 2))
     for axis in (0, 1):
-        low, high = 2 * axis, 2 * axis + 1
-        # If a face of the other axis was seen, this axis ends where the points of that face end.
-        has_ends = is_seen[2 - low] | is_seen[3 - low]
-        guess_m = np.maximum(depth_m, high_m[axis] - low_m[axis])
-        bottom_m = np.where(has_ends | ~is_seen[high], low_m[axis], faces[high][:, 0] - guess_m)
-        bottom_m = np.where(is_seen[low], faces[low][:, 0], bottom_m)
-        top_m = np.where(has_ends | ~is_seen[low], high_m[axis], faces[low][:, 0] + guess_m)
-        top_m = np.where(is_seen[high], faces[high][:, 0], top_m)
-        open_sd_m = np.where(has_ends, END_SD_M, DEPTH_SD_M)
-        bottom_sd_m = np.where(is_seen[low], _sd_m(information[low]), open_sd_m)
-        top_sd_m = np.where(is_seen[high], _sd_m(information[high]), open_sd_m)
+        bottom_m, top_m, sd_m[:, axis] = _close_axis(axis, extents, faces, depth_m)
         center_m[:, axis] = 0.5 * (bottom_m + top_m)
         half_m[:, axis] = np.maximum(0.5 * (top_m - bottom_m), MIN_HALF_M)
-        sd_m[:, axis] = 0.5 * np.hypot(bottom_sd_m, top_sd_m)
-
     cosine = np.cos(yaw_rad)
     sine = np.sin(yaw_rad)
     center_x = cosine * center_m[:, 0] - sine * center_m[:, 1]
@@ -226,8 +196,67 @@ def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces,
         center_sd_m=sd_m,
         half_sd_m=sd_m.copy(),
         misfit=misfit,
-        faces=np.sum(is_seen, axis=0),
+        faces=np.sum(extents.is_seen, axis=0),
     )
+
+
+@dataclass(frozen=True)
+class _Extents:
+    """What was seen of each obstacle, in its heading: lists by axis or by face, of arrays (b,)."""
+
+    low_m: list[Floats]  # by axis: where the points begin
+    high_m: list[Floats]  # by axis: where they end
+    is_seen: list[Bools]  # by face
+    information: list[Floats]  # by face, in 1 / m²
+
+
+def _measure_extents(points: _Points, weight: Floats, faces: Faces) -> _Extents:
+    """Find out which faces were seen, and where the points end along each axis."""
+    extents = _Extents([], [], [], [])
+    _, is_first_axis = _assign_faces(points, faces)
+    is_point = weight > 0
+    for axis in (0, 1):
+        place_m = points.place_m[axis][:, 0]
+        along_face_m = points.place_m[1 - axis][:, 0]
+        extents.low_m.append(np.where(is_point, place_m, np.inf).min(axis=1))
+        extents.high_m.append(np.where(is_point, place_m, -np.inf).max(axis=1))
+        is_this_axis = (is_first_axis if axis == 0 else ~is_first_axis)[:, 0]
+        for direction in (LOW, HIGH):
+            is_on_face = is_point & is_this_axis & (direction * points.outward[axis][:, 0] > 0)
+            left_m = np.where(is_on_face, along_face_m, np.inf).min(axis=1)
+            right_m = np.where(is_on_face, along_face_m, -np.inf).max(axis=1)
+            extents.is_seen.append(right_m - left_m > MIN_FACE_M)
+            extents.information.append(np.where(is_on_face, weight, 0.0).sum(axis=1))
+    return extents
+
+
+def _close_axis(axis: int, extents: _Extents, faces: Faces, depth_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return where the boxes begin and end along an axis, and the standard deviation of half their size, (b,) each.
+
+    An end is the face there if it was seen. If a face of the other axis was seen, it is where the points of that face
+    end. Otherwise it is at a guessed depth behind the opposite face.
+    """
+    low_face = 2 * axis
+    high_face = 2 * axis + 1
+    other_low_face = 2 - low_face
+    has_low = extents.is_seen[low_face]
+    has_high = extents.is_seen[high_face]
+    has_other = extents.is_seen[other_low_face] | extents.is_seen[other_low_face + 1]
+    low_m = extents.low_m[axis]
+    high_m = extents.high_m[axis]
+    guess_m = np.maximum(depth_m, high_m - low_m)
+    low_face_m = faces[low_face][:, 0]
+    high_face_m = faces[high_face][:, 0]
+
+    bottom_m = np.where(has_other | ~has_high, low_m, high_face_m - guess_m)
+    bottom_m = np.where(has_low, low_face_m, bottom_m)
+    top_m = np.where(has_other | ~has_low, high_m, low_face_m + guess_m)
+    top_m = np.where(has_high, high_face_m, top_m)
+
+    open_sd_m = np.where(has_other, END_SD_M, DEPTH_SD_M)
+    bottom_sd_m = np.where(has_low, _sd_m(extents.information[low_face]), open_sd_m)
+    top_sd_m = np.where(has_high, _sd_m(extents.information[high_face]), open_sd_m)
+    return bottom_m, top_m, 0.5 * np.hypot(bottom_sd_m, top_sd_m)
 
 
 def _sd_m(information: Floats) -> Floats:
