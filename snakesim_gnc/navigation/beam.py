@@ -31,19 +31,20 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import sample_back_from_end, wrenches
 from snakesim_gnc.navigation.margin import compute_margins_n
-from snakesim_gnc.navigation.obstacle_grid import CELL_ERROR_M, NO_OBSTACLE, ObstacleGrid
+from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
+from snakesim_gnc.navigation.search_arcs import STEP_M, ArcTable, SearchArcs
 from snakesim_gnc.navigation.search_nodes import (
     NodeLayer,
     count_earlier_in_cell,
     make_start_nodes,
     number_cells,
 )
+from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.base.arrays import Floats
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
-STEP_M = 0.05  # length of an arc
 MAX_HEADING_ERROR_RAD = 1.75  # a path heads no farther away from the goal
 
 # Of the nodes in one narrow cell only the cheapest is kept: they are the same for the robot.
@@ -61,39 +62,6 @@ FAILED_PATH_M = 0.025  # a path farther than this from a failed one is another p
 # Where the search of a whole body begins: around the tail, and around its heading.
 TAIL_OFFSETS_M = (-0.03, 0.0, 0.03)  # to the left
 TAIL_TURNS_RAD = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
-
-
-@dataclass(frozen=True)
-class SearchParameters:
-    """The robot and the costs of the search. Costs and rewards are meters of path for each meter of path."""
-
-    # The robot.
-    body_length_m: float
-    radius_m: float
-    segment_m: float  # length of a link: straight links cut the corners of the path by segment_m² |curvature| / 8
-    # The space that is searched.
-    curvatures_per_m: tuple[float, ...] = (-5.5, -3.7, -1.8, 0.0, 1.8, 3.7, 5.5)
-    clearance_m: float = 0.004
-    contact_distance_m: float = 0.02  # a smaller gap counts as a contact: `path_fit` will close it
-    kept_nodes: int = 900
-    kept_per_wide_cell: int = 16
-    # The propulsion margin.
-    peg_friction: float = 0.0  # Coulomb coefficient mu of the obstacles
-    unused_tail_m: float = 0.2  # contacts this near to the tail end do not count
-    unused_head_m: float = 0.1  # likewise to the head end
-    wanted_margin_n: float = 40.0  # F_wanted
-    # Costs of every path.
-    push_reward: float = 2.4
-    brake_cost: float = 1.0
-    weak_margin_cost: float = 6.0
-    curvature_change_cost_m: float = 0.02
-    progress_reward: float = 1.2
-    # Costs of a path on which the whole body is laid again.
-    push_reward_of_body: float = 4.0  # instead of `push_reward`, up to where the head will lie
-    weak_margin_cost_near: float = 15.0  # instead of `weak_margin_cost`, over the first `near_m` ahead of the head
-    near_m: float = 0.3
-    failed_path_cost: float = 1.0
-    sideways_cost: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -122,38 +90,14 @@ class _Task:
     failed_w: Floats | None = None  # (k, 2) points of paths on which the body got stuck here
 
 
-@dataclass(frozen=True)
-class _Arcs:
-    """All children of a layer before they are thinned out: one row for each parent, one column for each curvature."""
-
-    # Middles of the arcs.
-    middle_x_m: Floats  # (n, c)
-    middle_y_m: Floats
-    middle_heading_rad: Floats
-    # Ends of the arcs.
-    x_m: Floats
-    y_m: Floats
-    heading_rad: Floats
-
-
 class BeamSearch:
     """Searches paths from a body's head, or for the whole body, towards a direction."""
 
     def __init__(self, obstacles: ObstacleGrid, parameters: SearchParameters) -> None:
         self._obstacles = obstacles
         self._parameters = parameters
-        self._curvatures_per_m = np.array(parameters.curvatures_per_m)  # (c,)
+        self._arc_table = ArcTable(parameters)
         self._body_arcs = round(parameters.body_length_m / STEP_M)
-
-        # (2, c): the end and the middle of a child's arc, ahead and to the left of its parent. The chord of an arc
-        # of length s and curvature k has the length s sinc(k s / 2) and the direction k s / 2.
-        half_turn_rad = 0.5 * self._curvatures_per_m * STEP_M
-        chord_m = STEP_M * np.sinc(half_turn_rad / np.pi)
-        self._end_m = np.stack([chord_m * np.cos(half_turn_rad), chord_m * np.sin(half_turn_rad)])
-        middle_chord_m = 0.5 * STEP_M * np.sinc(0.5 * half_turn_rad / np.pi)
-        self._middle_m = np.stack(
-            [middle_chord_m * np.cos(0.5 * half_turn_rad), middle_chord_m * np.sin(0.5 * half_turn_rad)]
-        )
 
     def search_ahead(self, body_w: Floats, goal_rad: float, steps: int) -> PathSearch:
         """Search the best path ahead of the head.
@@ -232,7 +176,7 @@ class BeamSearch:
     def _expand(self, layers: Sequence[NodeLayer], task: _Task) -> NodeLayer | None:
         """Return the best children of the newest layer, or None if none is free."""
         parents = layers[-1]
-        arcs = self._steer(parents)
+        arcs = self._arc_table.steer(parents)
         sideways_m = _distance_from_lying(arcs, parents.s_m, task)
         is_allowed = self._find_allowed(arcs, sideways_m, task)
         if not is_allowed.any():
@@ -243,56 +187,22 @@ class BeamSearch:
         self._add_contact_terms(nodes, layers, arcs, candidates, task)
         return self._thin_out(nodes)
 
-    def _steer(self, parents: NodeLayer) -> _Arcs:
-        """Return the arcs with every curvature from every parent."""
-        cosine = np.cos(parents.heading_rad)[:, None]
-        sine = np.sin(parents.heading_rad)[:, None]
-        x_m = parents.x_m[:, None]
-        y_m = parents.y_m[:, None]
-        heading_rad = parents.heading_rad[:, None] + self._curvatures_per_m * STEP_M
-        return _Arcs(
-            middle_x_m=x_m + cosine * self._middle_m[0] - sine * self._middle_m[1],
-            middle_y_m=y_m + sine * self._middle_m[0] + cosine * self._middle_m[1],
-            middle_heading_rad=heading_rad - 0.5 * self._curvatures_per_m * STEP_M,
-            x_m=x_m + cosine * self._end_m[0] - sine * self._end_m[1],
-            y_m=y_m + sine * self._end_m[0] + cosine * self._end_m[1],
-            heading_rad=heading_rad,
-        )
-
-    def _find_allowed(self, arcs: _Arcs, sideways_m: Floats | None, task: _Task) -> Bools:
+    def _find_allowed(self, arcs: SearchArcs, sideways_m: Floats | None, task: _Task) -> Bools:
         """Return which arcs clear all obstacles and lead about the right way, (n, c)."""
-        is_allowed = self._clears_obstacles(arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad)
-        is_allowed &= self._clears_obstacles(arcs.x_m, arcs.y_m, arcs.heading_rad)
+        is_allowed = self._arc_table.clears_obstacles(
+            self._obstacles, arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad
+        )
+        is_allowed &= self._arc_table.clears_obstacles(self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad)
         heading_error_rad = np.abs(np.remainder(arcs.heading_rad - task.goal_rad + np.pi, 2 * np.pi) - np.pi)
         is_allowed &= heading_error_rad < MAX_HEADING_ERROR_RAD
         if sideways_m is not None:
             is_allowed &= sideways_m < task.max_sideways_m
         return is_allowed
 
-    def _clears_obstacles(self, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Bools:
-        """Return whether the body clears all obstacles at poses on the arcs. All arrays: (n, c).
-
-        Straight links cut the corners of the path, so the inner side of an arc needs more room. Most poses are decided
-        by the approximate distance; the exact one, with its normal, is computed for the others.
-        """
-        corner_cut_m = self._parameters.segment_m**2 * np.abs(self._curvatures_per_m) / 8  # (c,)
-        needed_m = self._parameters.radius_m + self._parameters.clearance_m
-        approximate_m = self._obstacles.approximate_distance_m(x_m, y_m)
-        is_clear = approximate_m >= needed_m + corner_cut_m + CELL_ERROR_M
-        unsure = np.nonzero(~is_clear & (approximate_m >= needed_m - CELL_ERROR_M))
-        nearest = self._obstacles.find_nearest(x_m[unsure], y_m[unsure])
-        heading = heading_rad[unsure]
-        curvature_index = unsure[1]
-        normal_to_left = np.cos(heading) * nearest.normal_w[:, 1] - np.sin(heading) * nearest.normal_w[:, 0]
-        is_inner_side = normal_to_left * np.sign(self._curvatures_per_m[curvature_index]) < 0
-        cut_m = np.where(is_inner_side, corner_cut_m[curvature_index], 0.0)
-        is_clear[unsure] = nearest.distance_m >= needed_m + cut_m
-        return is_clear
-
-    def _path_cost_m(self, parents: NodeLayer, arcs: _Arcs, sideways_m: Floats | None, task: _Task) -> Floats:
+    def _path_cost_m(self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None, task: _Task) -> Floats:
         """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts, (n, c)."""
         parameters = self._parameters
-        curvature_change = np.abs(self._curvatures_per_m - parents.curvature_per_m[:, None])
+        curvature_change = np.abs(self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None])
         step_x = arcs.x_m - parents.x_m[:, None]
         step_y = arcs.y_m - parents.y_m[:, None]
         progress_m = step_x * task.goal_w[0] + step_y * task.goal_w[1]
@@ -312,7 +222,7 @@ class BeamSearch:
             cost_m = cost_m + STEP_M * parameters.failed_path_cost * closeness
         return cost_m + STEP_M * parameters.sideways_cost * (sideways_m / task.max_sideways_m) ** 2
 
-    def _pick_candidates(self, arcs: _Arcs, is_allowed: Bools, cost_m: Floats) -> Ints:
+    def _pick_candidates(self, arcs: SearchArcs, is_allowed: Bools, cost_m: Floats) -> Ints:
         """Return the indices into the raveled arcs of the cheapest allowed one in each cell, the cheapest first."""
         allowed = np.flatnonzero(is_allowed.ravel())
         cheapest_first = allowed[np.argsort(cost_m.ravel()[allowed], kind="stable")]
@@ -327,22 +237,22 @@ class BeamSearch:
         first_of_cell = np.sort(first_of_cell)
         return cheapest_first[first_of_cell[: CANDIDATES_PER_KEPT_NODE * self._parameters.kept_nodes]]
 
-    def _make_nodes(self, parents: NodeLayer, arcs: _Arcs, cost_m: Floats, candidates: Ints) -> NodeLayer:
+    def _make_nodes(self, parents: NodeLayer, arcs: SearchArcs, cost_m: Floats, candidates: Ints) -> NodeLayer:
         """Return nodes at the ends of some arcs, with the contacts and the drag of their parents."""
-        curvature_count = len(self._curvatures_per_m)
+        curvature_count = len(self._arc_table.curvatures_per_m)
         parent_rows = candidates // curvature_count
         nodes = parents.select_rows(parent_rows)
         nodes.parent = parent_rows
         nodes.x_m = arcs.x_m.ravel()[candidates]
         nodes.y_m = arcs.y_m.ravel()[candidates]
         nodes.heading_rad = arcs.heading_rad.ravel()[candidates]
-        nodes.curvature_per_m = self._curvatures_per_m[candidates % curvature_count]
+        nodes.curvature_per_m = self._arc_table.curvatures_per_m[candidates % curvature_count]
         nodes.cost_m = cost_m.ravel()[candidates]
         nodes.s_m = parents.s_m + STEP_M
         return nodes
 
     def _add_contact_terms(
-        self, nodes: NodeLayer, layers: Sequence[NodeLayer], arcs: _Arcs, candidates: Ints, task: _Task
+        self, nodes: NodeLayer, layers: Sequence[NodeLayer], arcs: SearchArcs, candidates: Ints, task: _Task
     ) -> None:
         """Add the contacts and the drag of the newest arc to nodes, and what they cost. layers: without the nodes."""
         parameters = self._parameters
@@ -447,7 +357,7 @@ def _start_at_tail(lying_w: Floats) -> NodeLayer:
     return make_start_nodes(points_w, np.tile(heading_rad + TAIL_TURNS_RAD, len(TAIL_OFFSETS_M)))
 
 
-def _distance_from_lying(arcs: _Arcs, parent_s_m: float, task: _Task) -> Floats | None:
+def _distance_from_lying(arcs: SearchArcs, parent_s_m: float, task: _Task) -> Floats | None:
     """Return how far the ends of the arcs are from where the body lies at the same arc length, (n, c).
 
     None if the body is not laid again, or if the arcs are ahead of its head.

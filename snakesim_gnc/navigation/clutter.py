@@ -18,7 +18,6 @@ from collections.abc import Generator, Sequence
 import numpy as np
 
 from snakesim_gnc.geometry.planar import space_evenly
-from snakesim_gnc.navigation.beam import STEP_M, SearchParameters
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.plan import (
@@ -40,6 +39,8 @@ from snakesim_gnc.navigation.plan import (
     make_plan,
 )
 from snakesim_gnc.navigation.planning_goal import PlanningGoal
+from snakesim_gnc.navigation.search_arcs import STEP_M
+from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route

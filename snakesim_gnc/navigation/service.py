@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 
 from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
-from snakesim_gnc.navigation.beam import SearchParameters
 from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion, Intents
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_gnc.navigation.platform_rises import PlatformRises
+from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, start_of, surveyed
 from snakesim_hal.model.scenario import Service as Schedule
