@@ -168,7 +168,7 @@ class ObstacleAided:
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
         ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
-        at = located.on_path.at
+        at = located.on_path.pose_at
         here = self._body.all_angles(at(located.tail_s_m))
         turns_per_m = (self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here) / SLOPE_M
         torques = scale * self._push_nm(view, located, turns_per_m)
@@ -280,7 +280,7 @@ class ObstacleAided:
             return
         config = self._set
         outlines, friction = Outlines.of(located.world.obstacles), located.trajectory.peg_friction
-        at, then_s_m = located.on_path.at, located.tail_s_m + ACTS_AFTER_S * located.speed_m_s
+        at, then_s_m = located.on_path.pose_at, located.tail_s_m + ACTS_AFTER_S * located.speed_m_s
         nodes_w = located.nodes_w + at(then_s_m).nodes_w - at(located.measured_s_m).nodes_w
         touches = find_touches(nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction)
         names = [located.world.obstacles[k].name for k in touches.obstacle.tolist()]

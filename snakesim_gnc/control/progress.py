@@ -56,7 +56,7 @@ class Progress:
 
     def update(self, view: View) -> Located | str:
         """Position of the body at this tick, or why it is unknown."""
-        self._angles.put(view.joints.timestamp_ns, view.joints.angle_rad)
+        self._angles.add(view.joints.timestamp_ns, view.joints.angle_rad)
         world, trajectory = view.world, view.trajectory
         if world is None or trajectory is None:
             self._measured_ns = None
@@ -69,12 +69,12 @@ class Progress:
         assert body is not None
         pose_ns, before_ns = pose_instant_ns(world), self._measured_ns
         if before_ns is None or pose_ns > before_ns:
-            self._nodes = self._planar.nodes_w(world, self._angles.at(pose_ns))
+            self._nodes = self._planar.nodes_w(world, self._angles.nearest_to(pose_ns))
             self._measured_ns = pose_ns
         if new_path:
-            self._s_m = body.find(self._nodes)  # the body is as fast as before
+            self._s_m = body.find_tail_s_m(self._nodes)  # the body is as fast as before
         elif before_ns is None:
-            self._s_m, self._speed_m_s = body.fit(self._nodes, self._s_m, steps=AGAIN_STEPS), 0.0
+            self._s_m, self._speed_m_s = body.refine_tail_s_m(self._nodes, self._s_m, steps=AGAIN_STEPS), 0.0
         elif pose_ns > before_ns:
             self._filter(body, max(_seconds(pose_ns - before_ns, view), view.period_s))
         assert self._measured_ns is not None
@@ -86,7 +86,7 @@ class Progress:
     def _filter(self, body: BodyOnPath, passed_s: float) -> None:
         """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""
         expected = self._s_m + self._speed_m_s * passed_s
-        off = body.fit(self._nodes, expected, steps=1) - expected
+        off = body.refine_tail_s_m(self._nodes, expected, steps=1) - expected
         keep = float(np.exp(-passed_s / self._speed_filter_s)) if self._speed_filter_s > 0 else 0.0
         self._s_m = expected + (1 - keep * keep) * off
         self._speed_m_s += (1 - keep) ** 2 * off / passed_s

@@ -8,86 +8,103 @@ from statistics import median
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import BodyPose, chain_nodes, heading_of
+from snakesim_gnc.geometry.body_on_path import BodyPose, chain_nodes, compute_heading_rad
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import nodes_w
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
 
-TICKS_KEPT = 128
+TICKS_KEPT = 128  # of joint angles: more than the latency of any pose
 
 
 class PlanarBody:
-    """Lengths, limits and indices. Nodes are the tail end, the joints that bend, and the head end."""
+    """Lengths, limits and indices of a robot. Nodes are the tail end, the joints that bend, and the head end."""
 
     def __init__(self, robot: Description) -> None:
         axes = [joint.axis for joint in robot.joints]
         lengths = [link.length_m for link in robot.links]
+        self._robot = robot
+
+        # All joints and links.
         self.names = [joint.name for joint in robot.joints]
         self.torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
         self.radius_m = max(link.radius_m for link in robot.links)
         self.weight_n = GRAVITY_M_S2 * math.fsum(link.mass_kg for link in robot.links)
+        self.joint_s_m = np.cumsum(lengths)[:-1]  # (n_joints,) along the body
+        self._joint_s_list: list[float] = self.joint_s_m.tolist()
+
+        # The joints that bend the body in the plane, and the segments between them.
         self.bends = [i for i, axis in enumerate(axes) if axis == "yaw"]
+        self._all_bend = len(self.bends) == len(axes)
         self.segments_m = yaw_segments_m(axes, lengths)
+        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighboring joints that bend
         self.node_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]
         self.length_m = self.node_s_m[-1]
-        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighboring joints that bend
-        self.joint_s_m = np.cumsum(lengths)[:-1]
-        self._joint_s: list[float] = self.joint_s_m.tolist()
-        self._all_bend = len(self.bends) == len(axes)
-        self._robot, self._node_rows = robot, [0, *(i + 1 for i in self.bends), len(lengths)]
+        self._node_rows = [0, *(i + 1 for i in self.bends), len(lengths)]  # of the nodes, among all joints and ends
 
     def all_angles(self, body_pose: BodyPose) -> Floats:
-        """Angles of all joints, (n_joints,): those that bend as on the path, the others straight."""
+        """Return the angles of all joints, (n_joints,): those that bend as on the path, the others straight."""
         if self._all_bend:
             return body_pose.angles_rad
-        angles = np.zeros(len(self.names))
-        angles[self.bends] = body_pose.angles_rad
-        return angles
+        angles_rad = np.zeros(len(self.names))
+        angles_rad[self.bends] = body_pose.angles_rad
+        return angles_rad
 
     def nodes_w(self, world: World, angles_rad: Sequence[float]) -> Floats:
-        """Nodes (2, n_nodes) of the measured body; angles_rad: of all joints, at the instant of the world's pose."""
-        if not self._all_bend:  # a link that is turned up is shorter, seen from above
+        """Return the nodes (2, n_nodes) of the measured body.
+
+        Args:
+            world: the pose of the base.
+            angles_rad: of all joints, at the instant of that pose.
+        """
+        if not self._all_bend:
+            # A link that is pitched up is shorter, as seen from above.
             chain_w = nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
             return chain_w[self._node_rows, :2].T
-        bending = [angles_rad[i] for i in self.bends]
-        heading = heading_of(world.base_orientation_wxyz)
-        return chain_nodes(world.base_position_w[:2], heading, bending, self.segments_m)
+        bend_angles_rad = [angles_rad[i] for i in self.bends]
+        heading_rad = compute_heading_rad(world.base_orientation_wxyz)
+        return chain_nodes(world.base_position_w[:2], heading_rad, bend_angles_rad, self.segments_m)
 
     def joints_w(self, body_pose: BodyPose) -> Floats:
-        """Places of all joints on the path, (n_joints, 2)."""
-        x, y = body_pose.nodes_w
+        """Return the places of all joints on the path, (n_joints, 2)."""
         if self._all_bend:
             return body_pose.nodes_w[:, 1:-1].T
-        return np.column_stack([np.interp(self.joint_s_m, self.node_s_m, values) for values in (x, y)])
+        node_x, node_y = body_pose.nodes_w
+        x = np.interp(self.joint_s_m, self.node_s_m, node_x)
+        y = np.interp(self.joint_s_m, self.node_s_m, node_y)
+        return np.column_stack([x, y])
 
     def link_at(self, body_s_m: float) -> int:
-        """Index of the link at an arc length along the body."""
-        return bisect_right(self._joint_s, body_s_m)
+        """Return the index of the link at an arc length along the body."""
+        return bisect_right(self._joint_s_list, body_s_m)
 
 
 class RecentAngles:
-    """Joint angles of the last ticks, for a pose that is some ticks old."""
+    """Stores the joint angles of the last ticks, for a pose that is some ticks old."""
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
+        self._entries: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
 
     def __bool__(self) -> bool:
-        return bool(self._kept)
+        return bool(self._entries)
 
-    def put(self, timestamp_ns: int, angles_rad: list[float]) -> None:
-        """Those of the newest joint state, which may be the one before again."""
-        if not self._kept or timestamp_ns > self._kept[-1][0]:
-            self._kept.append((timestamp_ns, angles_rad))
+    def add(self, timestamp_ns: int, angles_rad: list[float]) -> None:
+        """Store the angles of the newest joint state. A state that is not newer than the last one is ignored."""
+        if not self._entries or timestamp_ns > self._entries[-1][0]:
+            self._entries.append((timestamp_ns, angles_rad))
 
-    def at(self, timestamp_ns: int) -> list[float]:
-        """Those measured nearest to an instant."""
-        return min(self._kept, key=lambda held: abs(held[0] - timestamp_ns))[1]
+    def nearest_to(self, timestamp_ns: int) -> list[float]:
+        """Return the angles that were measured nearest to an instant."""
+        _, angles_rad = min(self._entries, key=lambda entry: abs(entry[0] - timestamp_ns))
+        return angles_rad
 
 
 def pose_instant_ns(world: World) -> int:
-    """When the body was at the world's base pose: that of the sensor, or dead-reckoned up to the world's own stamp."""
+    """Return when the body was at the world's base pose.
+
+    A measured pose has the timestamp of the sensor. A dead-reckoned pose has that of the world model itself.
+    """
     if world.pose_timestamp_ns is None or world.base_position_sd_m is not None:
         return world.timestamp_ns
     return world.pose_timestamp_ns

@@ -1,13 +1,13 @@
-"""Dead reckoning held by known obstacles: what the body touches is at its skin, and nothing is in it. Pure.
+"""Corrects dead reckoning by known obstacles: contacts are at the body's skin, and no obstacle is in the body. Pure.
 
-For each obstacle near the body, the gap between its outline and the body's skin, as the reckoned pose has it, is
-measured as zero
+For each obstacle near the body, the gap between its outline and the skin, with the estimated pose, counts as a
+measurement of zero
 
-    where a contact on that side of the body, near that place, is felt
-    where it would be negative: the body would lie in the obstacle
+    if a contact near that place pushes the body away from the obstacle
+    if the gap is negative, because the body would lie in the obstacle
 
-Three contacts whose normals do not meet in a point hold the body as firmly as a pose sensor; fewer leave it free along
-what they do not touch.
+Three contacts whose normals do not meet in a point fix the pose as firmly as a pose sensor. Fewer contacts leave it
+free along directions in which they do not push.
 """
 
 import math
@@ -16,71 +16,94 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import Body
+from snakesim_gnc.guidance.body_history import BodyFrames
 from snakesim_gnc.guidance.localization import Localizer
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Contact, Description, Obstacle
 
-MIN_FORCE_N = 1.0  # weaker pushes may be anything
-NEAR_LINKS = 1.5  # along the body, in lengths of a link: how far an estimated contact may be off
-FARTHEST_M = 0.06  # a contact that is felt is not of an obstacle further away than this
-DEEPEST_M = 0.04  # deeper than this the body lies on another side of it, and nothing can be told
-POINTS = 12  # on the axis of each link
+MIN_FORCE_N = 1.0  # a weaker push may be noise
+MAX_ALONG_LINKS = 1.5  # along the body, in link lengths: how far an estimated contact may be from its place
+MAX_GAP_M = 0.06  # a contact does not belong to an obstacle farther away than this
+MAX_DEPTH_M = 0.04  # deeper than this, the body may lie on either side of the obstacle
+POINTS_PER_LINK = 12  # on the axis of each link, at which gaps are computed
 
 
-class Trust(NamedTuple):
-    """Standard deviations of a gap that is measured as zero, at each turn."""
+class GapTrust(NamedTuple):
+    """Standard deviations of a gap that is measured as zero, in each update."""
 
-    touch_m: float
-    sunk_m: float
+    contact_m: float  # where a contact pushes
+    sunk_m: float  # where the body would lie in an obstacle
 
 
-# Sensors tell contacts at every turn, with the same error each time. Estimated ones come seldom, and while the body
-# waits for one, its own steps along the path, which it takes on trust, would lead it away. Tuned on `triplet`.
-MEASURED, ESTIMATED = Trust(0.03, 0.02), Trust(0.003, 0.002)
+# Sensors report contacts in every update, with the same error each time. Estimated contacts are rare. Between them the
+# body's steps along the path, which dead reckoning takes on trust, would lead it away. Tuned on `triplet`.
+MEASURED = GapTrust(0.03, 0.02)
+ESTIMATED = GapTrust(0.003, 0.002)
 
 
 class Anchors:
-    """The known obstacles, and one robot's body."""
+    """The known obstacles, which correct the pose of one robot."""
 
     def __init__(self, robot: Description, known: Sequence[Obstacle]) -> None:
         self._outlines = Outlines.of(known)
-        self._lengths = np.array([link.length_m for link in robot.links])
-        self._radii = np.array([link.radius_m for link in robot.links])
-        self._share = (np.arange(POINTS) + 0.5) / POINTS
+        self._lengths_m = np.array([link.length_m for link in robot.links])
+        self._radii_m = np.array([link.radius_m for link in robot.links])
+        self._ratios = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK  # of each link's length
 
-    def hold(self, localizer: Localizer, angles_rad: Floats, felt: Sequence[Contact], trust: Trust) -> None:
-        """Correct the localizer's base, at the joint angles of its last move. felt: contacts of that time."""
+    def hold(self, localizer: Localizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust) -> None:
+        """Correct the localizer's base.
+
+        Args:
+            localizer: it is changed.
+            angles_rad: (joints,) at the localizer's last move.
+            contacts: at that time.
+            trust: standard deviations of the gaps.
+        """
         if not len(self._outlines):
             return
-        body = localizer.history.lay(localizer.base, angles_rad)
-        steps = (self._lengths[:, None] * body.rotations[:, :2, 0])[:, None]
-        axis = (body.origins_w[:, None, :2] + self._share[:, None] * steps).reshape(-1, 2)
-        gaps = self._outlines.distance_m(axis) - np.repeat(self._radii, POINTS)[:, None]
-        nearest = gaps.argmin(axis=0)
-        near = np.flatnonzero((gaps.min(axis=0) < FARTHEST_M) & (gaps.min(axis=0) > -DEEPEST_M))
-        _, normals = self._outlines.towards(axis[nearest[near]], near)
-        rows: list[Floats] = []
-        found: list[tuple[float, float]] = []
-        for obstacle, normal in zip(near.tolist(), normals, strict=True):
-            at = int(nearest[obstacle])
-            gap_m = float(gaps[at, obstacle])
-            if gap_m >= 0.0 and self._measured_force_n(body, felt, at, normal) <= MIN_FORCE_N:
-                continue
-            found.append((gap_m, trust.sunk_m if gap_m < 0.0 else trust.touch_m))
-            x, y = axis[at] - localizer.base.planar_w[:2]
-            rows.append(np.array([normal[0], normal[1], normal[1] * x - normal[0] * y]))
-        if rows:
-            gaps_m, sds_m = np.array(found).T
-            localizer.correct_along(np.array(rows), -gaps_m, sds_m)
+        body = localizer.history.compute_frames(localizer.base, angles_rad)
+        axis_w = self._sample_axis_w(body)
+        gaps_m = self._outlines.distance_m(axis_w) - np.repeat(self._radii_m, POINTS_PER_LINK)[:, None]
+        nearest_point = gaps_m.argmin(axis=0)  # of each obstacle
+        smallest_gap_m = gaps_m.min(axis=0)
+        near = np.flatnonzero((smallest_gap_m < MAX_GAP_M) & (smallest_gap_m > -MAX_DEPTH_M))
+        _, normals_w = self._outlines.towards(axis_w[nearest_point[near]], near)
 
-    def _measured_force_n(self, body: Body, felt: Sequence[Contact], at: int, normal_w: Floats) -> float:
-        """Forces near a point of the axis that push the way that an obstacle there would."""
-        place = (at + 0.5) / POINTS
-        return math.fsum(
-            math.hypot(*one.force_l)
-            for one in felt
-            if abs(one.link + one.position_l[0] / self._lengths[one.link] - place) < NEAR_LINKS
-            and float((body.rotations[one.link] @ np.array(one.normal_l))[:2] @ normal_w) > 0.0
-        )
+        rows: list[Floats] = []
+        measured_gaps_m: list[float] = []
+        sds_m: list[float] = []
+        for obstacle, normal_w in zip(near.tolist(), normals_w, strict=True):
+            point = int(nearest_point[obstacle])
+            gap_m = float(gaps_m[point, obstacle])
+            is_sunk = gap_m < 0.0
+            if not is_sunk and self._pushing_force_n(body, contacts, point, normal_w) <= MIN_FORCE_N:
+                continue
+            measured_gaps_m.append(gap_m)
+            sds_m.append(trust.sunk_m if is_sunk else trust.contact_m)
+            x, y = axis_w[point] - localizer.base.planar_w[:2]
+            # How the gap changes with x, y and heading of the base.
+            rows.append(np.array([normal_w[0], normal_w[1], normal_w[1] * x - normal_w[0] * y]))
+        if rows:
+            localizer.correct_along(np.array(rows), -np.array(measured_gaps_m), np.array(sds_m))
+
+    def _sample_axis_w(self, body: BodyFrames) -> Floats:
+        """Return POINTS_PER_LINK points on the axis of each link, (points, 2), tail to head."""
+        links = self._lengths_m[:, None] * body.rotations[:, :2, 0]
+        points_w = body.origins_w[:, None, :2] + self._ratios[:, None] * links[:, None]
+        return points_w.reshape(-1, 2)
+
+    def _pushing_force_n(self, body: BodyFrames, contacts: Sequence[Contact], point: int, normal_w: Floats) -> float:
+        """Return the sum of the contact forces near a point of the axis that push as an obstacle there would.
+
+        normal_w: (2,) from the obstacle to the body.
+        """
+        place_links = (point + 0.5) / POINTS_PER_LINK  # along the body, in link lengths
+        forces_n: list[float] = []
+        for contact in contacts:
+            contact_links = contact.link + contact.position_l[0] / self._lengths_m[contact.link]
+            contact_normal_w = (body.rotations[contact.link] @ np.array(contact.normal_l))[:2]
+            is_near = abs(contact_links - place_links) < MAX_ALONG_LINKS
+            if is_near and float(contact_normal_w @ normal_w) > 0.0:
+                forces_n.append(math.hypot(*contact.force_l))
+        return math.fsum(forces_n)

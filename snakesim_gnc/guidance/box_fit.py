@@ -1,8 +1,11 @@
-"""Boxes through the visible parts of surfaces, with covariance; many obstacles at once. Pure.
+"""Fits boxes to the visible parts of surfaces, with standard deviations; many obstacles at once. Pure.
 
-For each of a set of headings every point belongs to one of two faces, those that look towards who saw it; the heading
-with the least misfit wins (L-shape fitting by closeness, Zhang et al. 2017). Faces that nobody saw are open: the depth
-behind a seen face is a guess with a wide covariance, never less than what was seen.
+For each of a set of headings every point belongs to one of the two faces that look towards the sensor. The heading with
+the smallest misfit wins (L-shape fitting by closeness, Zhang et al. 2017). A face that was not seen is open: the depth
+behind a seen face is a guess with a large standard deviation, never less than what was seen.
+
+In shapes, b is the number of obstacles, p the number of points of each, and h the number of headings. A heading has two
+axes, 0 along it and 1 across it, and each axis has two faces, low and high: face 2 * axis + (0 low, 1 high).
 """
 
 import math
@@ -11,130 +14,250 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.circle_fit import OUTLIER_SD, softened
+from snakesim_gnc.guidance.circle_fit import OUTLIER_SD, soften_weights
 from snakesim_hal.base.arrays import Floats
 
-DEPTH_M, DEPTH_SD_M = 0.10, 0.04  # of a box of which one face was seen
-WALL_M = 0.45  # a longer face is a wall,
-THICKNESS_M = 0.05  # which is this thick unless its other side was seen
-FAR_M = 1e3
-MIN_FACE_M = 0.012  # along it
-END_SD_M = 0.008  # of a face's end that no other face fixes
+Bools = NDArray[np.bool_]
+
+# Faces that were not seen.
+DEPTH_M = 0.10  # of a box of which one face was seen
+DEPTH_SD_M = 0.04
+WALL_M = 0.45  # a longer face is a wall
+WALL_THICKNESS_M = 0.05
+END_SD_M = 0.008  # of the end of a seen face, where no other face was seen
+MIN_FACE_M = 0.012  # a shorter run of points is only the corner of another face
+MIN_HALF_M = 0.005
+
+# The fit.
 COARSE_RAD = np.arange(0.0, 90.0, 5.0) * math.pi / 180
 FINE_RAD = np.array([-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]) * math.pi / 180
+REWEIGHTINGS = 3
+MIN_OUTWARD = 0.05  # part of a point's outward direction along an axis: with more, it may be the extreme of a face
+FAR_M = 1e3  # place of a face to which no point belongs
+
+LOW = -1.0  # outward directions of the two faces of an axis
+HIGH = 1.0
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """One a row."""
+    """Boxes in the world, one a row."""
 
     center_w: Floats  # (b, 2)
     yaw_rad: Floats  # (b,)
-    half_m: Floats  # (b, 2) along and across yaw
+    half_m: Floats  # (b, 2) half size along and across yaw
     center_sd_m: Floats  # (b, 2) along and across yaw
     half_sd_m: Floats  # (b, 2)
-    misfit: Floats  # (b,)
-    faces: NDArray[np.int_]  # (b,) how many were seen
+    misfit: Floats  # (b,) sum of squared, weighted, limited distances
+    faces: NDArray[np.int_]  # (b,) number of faces that were seen
 
 
-Faces = list[Floats]  # places of the four faces in a heading's axes: along it low and high, across it low and high
+@dataclass(frozen=True)
+class _Points:
+    """Points in the axes of headings: each field has one array (b, h, p) for each of the two axes."""
+
+    place_m: tuple[Floats, Floats]
+    outward: tuple[Floats, Floats]
+
+    @classmethod
+    def in_headings(cls, points: Floats, outward: Floats, yaw: Floats) -> "_Points":
+        """Return points and outward directions, (b, p, 2) in the world, in the axes of headings (b, h)."""
+        return cls(_rotate(points, yaw), _rotate(outward, yaw))
+
+
+Faces = list[Floats]  # places of the four faces along their axes
 
 
 def fit_boxes(points: Floats, weight: Floats, outward: Floats) -> Boxes:
-    """points (b, p, 2), weight (b, p), outward (b, p, 2), as of `batched`."""
-    weight = softened(weight)
-    count = len(points)
-    yaw, misfit = np.broadcast_to(COARSE_RAD, (count, len(COARSE_RAD))), np.empty(0)
-    for around in (FINE_RAD, None):
-        _, misfit = _faces(points, weight, outward, yaw)
-        best = misfit.argmin(axis=1)
-        yaw = yaw[np.arange(count), best] + (0.0 if around is not None else _between(misfit, best))
-        yaw = yaw[:, None] + (0.0 if around is None else around)
-    faces, misfit = _faces(points, weight, outward, yaw)
-    return _closed(points, weight, outward, yaw[:, 0], [place[:, 0] for place in faces], misfit[:, 0])
+    """Fit a box to the points of each obstacle.
+
+    The heading is searched in three rounds: coarse, fine, and by a parabola through the fine ones.
+
+    Args:
+        points: (b, p, 2) in the world.
+        weight: (b, p) information in 1 / m²; 0 for padding.
+        outward: (b, p, 2) unit vectors from the surface towards the sensor.
+    """
+    weight = soften_weights(weight)
+    rows = np.arange(len(points))
+    coarse_rad = np.broadcast_to(COARSE_RAD, (len(points), len(COARSE_RAD)))
+    _, misfit = _fit_faces(_Points.in_headings(points, outward, coarse_rad), weight)
+    best = misfit.argmin(axis=1)
+
+    fine_rad = coarse_rad[rows, best][:, None] + FINE_RAD
+    _, misfit = _fit_faces(_Points.in_headings(points, outward, fine_rad), weight)
+    best = misfit.argmin(axis=1)
+
+    yaw_rad = fine_rad[rows, best] + _interpolate_minimum_rad(misfit, best)
+    turned = _Points.in_headings(points, outward, yaw_rad[:, None])
+    faces, misfit = _fit_faces(turned, weight)
+    return _close_boxes(turned, weight, yaw_rad, faces, misfit[:, 0])
 
 
-def _turned(vectors: Floats, yaw: Floats) -> tuple[Floats, Floats]:
-    """Vectors (b, p, 2) in the axes of each heading (b, h): two of (b, h, p)."""
-    c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
-    x, y = vectors[:, None, :, 0], vectors[:, None, :, 1]
-    return c * x + s * y, c * y - s * x
+def _rotate(vectors: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+    """Return vectors (b, p, 2) in the axes of headings (b, h), as components along and across: (b, h, p) each."""
+    cosine = np.cos(yaw)[..., None]
+    sine = np.sin(yaw)[..., None]
+    x = vectors[:, None, :, 0]
+    y = vectors[:, None, :, 1]
+    return cosine * x + sine * y, cosine * y - sine * x
 
 
-def _off(local: tuple[Floats, Floats], away: tuple[Floats, Floats], faces: Faces) -> tuple[Floats, NDArray[np.bool_]]:
-    """Distance of each point from its face, and whether that is one of the first pair."""
-    along, across = (
-        at - np.where(towards > 0, faces[2 * k + 1][..., None], faces[2 * k][..., None])
-        for k, (at, towards) in enumerate(zip(local, away, strict=True))
-    )
-    first = np.abs(along) <= np.abs(across)
-    return np.where(first, along, across), first
+def _fit_faces(points: _Points, weight: Floats) -> tuple[Faces, Floats]:
+    """Return the places of the faces, and the misfit of each heading, each (b, h).
+
+    Each face is the weighted mean of its points, with Huber weights. A face without points is far away.
+    """
+    weight = weight[:, None]
+    faces = _extreme_faces(points, weight)
+    for _ in range(REWEIGHTINGS):
+        error_m, is_first_axis = _assign_faces(points, faces)
+        huber = np.minimum(1.0, OUTLIER_SD / np.maximum(np.abs(error_m) * np.sqrt(weight), 1e-9))
+        trusted = weight * huber
+        for axis in (0, 1):
+            is_this_axis = is_first_axis if axis == 0 else ~is_first_axis
+            for face, direction in ((2 * axis, LOW), (2 * axis + 1, HIGH)):
+                face_weight = trusted * (is_this_axis & (direction * points.outward[axis] > 0))
+                total = face_weight.sum(axis=2)
+                mean_m = (face_weight * points.place_m[axis]).sum(axis=2) / np.maximum(total, 1e-12)
+                faces[face] = np.where(total > 0, mean_m, faces[face])
+    error_m, _ = _assign_faces(points, faces)
+    misfit = np.minimum(weight * error_m * error_m, OUTLIER_SD**2).sum(axis=2)
+    return faces, misfit
 
 
-def _faces(points: Floats, weight: Floats, outward: Floats, yaw: Floats) -> tuple[Faces, Floats]:
-    """Places of the faces for headings (b, h), and the misfit, each (b, h). A face that nobody saw is far away."""
-    local, away = _turned(points, yaw), _turned(outward, yaw)
-    w = weight[:, None]
+def _extreme_faces(points: _Points, weight: Floats) -> Faces:
+    """Return first places of the faces: the outermost point that looks their way. weight: (b, 1, p)."""
     faces: Faces = []
-    for at, towards in zip(local, away, strict=True):
-        for sign in (-1.0, 1.0):  # at first the extreme of what looks this way
-            extreme = np.where((w > 0) & (sign * towards > 0.05), sign * at, -FAR_M).max(axis=2)
-            faces.append(sign * np.where(extreme > -FAR_M, extreme, FAR_M))
-    for _ in range(3):
-        error, first = _off(local, away, faces)
-        trusted = w * np.minimum(1.0, OUTLIER_SD / np.maximum(np.abs(error) * np.sqrt(w), 1e-9))
-        for k, (at, towards) in enumerate(zip(local, away, strict=True)):
-            for j, sign in enumerate((-1.0, 1.0)):
-                mine = trusted * ((first if k == 0 else ~first) & (sign * towards > 0))
-                total = mine.sum(axis=2)
-                mean = (mine * at).sum(axis=2) / np.maximum(total, 1e-12)
-                faces[2 * k + j] = np.where(total > 0, mean, faces[2 * k + j])
-    error, _ = _off(local, away, faces)
-    return faces, np.minimum(w * error * error, OUTLIER_SD**2).sum(axis=2)
+    for axis in (0, 1):
+        for direction in (LOW, HIGH):
+            looks_this_way = (weight > 0) & (direction * points.outward[axis] > MIN_OUTWARD)
+            extreme_m = np.where(looks_this_way, direction * points.place_m[axis], -FAR_M).max(axis=2)
+            faces.append(direction * np.where(extreme_m > -FAR_M, extreme_m, FAR_M))
+    return faces
 
 
-def _between(misfit: Floats, best: NDArray[np.intp]) -> Floats:
-    """Offset of the minimum of the parabola through the best heading and its neighbors, (b,)."""
-    rows, at = np.arange(len(best)), np.clip(best, 1, misfit.shape[1] - 2)
-    left, middle, right = misfit[rows, at - 1], misfit[rows, at], misfit[rows, at + 1]
-    bend = left - 2 * middle + right
-    offset = np.where(bend > 1e-9, 0.5 * (left - right) / np.maximum(bend, 1e-9), 0.0)
-    step = FINE_RAD[1] - FINE_RAD[0]
-    return np.where(at == best, np.clip(offset, -0.5, 0.5) * step, 0.0)
+def _assign_faces(points: _Points, faces: Faces) -> tuple[Floats, Bools]:
+    """Assign each point to the nearer of the two faces that look its way.
+
+    Returns:
+        Distance of each point from its face in m, and whether that face is one of axis 0: (b, h, p) each.
+    """
+    distances: list[Floats] = []
+    for axis in (0, 1):
+        low_m = faces[2 * axis][..., None]
+        high_m = faces[2 * axis + 1][..., None]
+        distances.append(points.place_m[axis] - np.where(points.outward[axis] > 0, high_m, low_m))
+    is_first_axis = np.abs(distances[0]) <= np.abs(distances[1])
+    return np.where(is_first_axis, distances[0], distances[1]), is_first_axis
 
 
-def _closed(points: Floats, weight: Floats, outward: Floats, yaw: Floats, faces: Faces, misfit: Floats) -> Boxes:
-    """Boxes from the faces seen, closed where none was. yaw, faces, misfit: (b,) of each obstacle's own heading."""
-    local, away = _turned(points, yaw[:, None]), _turned(outward, yaw[:, None])
-    _, first = _off(local, away, [place[:, None] for place in faces])
-    low, high, seen, information = [], [], [], []
-    for k in (0, 1):
-        at, along = local[k][:, 0], local[1 - k][:, 0]
-        low.append(np.where(weight > 0, at, np.inf).min(axis=1))
-        high.append(np.where(weight > 0, at, -np.inf).max(axis=1))
-        for sign in (-1.0, 1.0):
-            mine = (weight > 0) & (first if k == 0 else ~first)[:, 0] & (sign * away[k][:, 0] > 0)
-            left, right = np.where(mine, along, np.inf).min(axis=1), np.where(mine, along, -np.inf).max(axis=1)
-            seen.append(right - left > MIN_FACE_M)  # not just the corner of another
-            information.append(np.where(mine, weight, 0.0).sum(axis=1))
-    longest = np.maximum(high[0] - low[0], high[1] - low[1])
-    depth = np.where(longest > WALL_M, THICKNESS_M, DEPTH_M)
-    center, half = np.empty((len(yaw), 2)), np.empty((len(yaw), 2))
-    center_sd, half_sd = np.empty_like(center), np.empty_like(half)
-    for k in (0, 1):
-        has_low, has_high = seen[2 * k], seen[2 * k + 1]
-        ends = seen[2 - 2 * k] | seen[3 - 2 * k]  # a face of the other pair was seen: this pair is where its points end
-        guess = np.maximum(depth, high[k] - low[k])
-        bottom = np.where(ends | ~has_high, low[k], faces[2 * k + 1] - guess)
-        top = np.where(ends | ~has_low, high[k], faces[2 * k] + guess)
-        bottom = np.where(has_low, faces[2 * k], bottom)
-        top = np.where(has_high, faces[2 * k + 1], top)
-        open_sd = np.where(ends, END_SD_M, DEPTH_SD_M)
-        sd_low, sd_high = (
-            np.where(seen[2 * k + j], 1.0 / np.sqrt(np.maximum(information[2 * k + j], 1.0)), open_sd) for j in (0, 1)
-        )
-        center[:, k], half[:, k] = 0.5 * (bottom + top), np.maximum(0.5 * (top - bottom), 0.005)
-        center_sd[:, k] = half_sd[:, k] = 0.5 * np.hypot(sd_low, sd_high)
-    c, s = np.cos(yaw), np.sin(yaw)
-    middle = np.stack([c * center[:, 0] - s * center[:, 1], s * center[:, 0] + c * center[:, 1]], axis=1)
-    return Boxes(middle, yaw, half, center_sd, half_sd, misfit, np.sum(seen, axis=0))
+def _interpolate_minimum_rad(misfit: Floats, best: NDArray[np.intp]) -> Floats:
+    """Return the offset, (b,), of the minimum of the parabola through the best fine heading and its neighbors."""
+    rows = np.arange(len(best))
+    center = np.clip(best, 1, misfit.shape[1] - 2)
+    left = misfit[rows, center - 1]
+    middle = misfit[rows, center]
+    right = misfit[rows, center + 1]
+    curvature = left - 2 * middle + right
+    offset = np.where(curvature > 1e-9, 0.5 * (left - right) / np.maximum(curvature, 1e-9), 0.0)
+    step_rad = FINE_RAD[1] - FINE_RAD[0]
+    return np.where(center == best, np.clip(offset, -0.5, 0.5) * step_rad, 0.0)
+
+
+def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces, misfit: Floats) -> Boxes:
+    """Return boxes from the faces that were seen, closed where none was seen.
+
+    Args:
+        points: in the heading of each obstacle, h = 1.
+        weight: (b, p).
+        yaw_rad: (b,).
+        faces: (b, 1) each.
+        misfit: (b,).
+    """
+    extents = _measure_extents(points, weight, faces)
+    longest_m = np.maximum(extents.high_m[0] - extents.low_m[0], extents.high_m[1] - extents.low_m[1])
+    depth_m = np.where(longest_m > WALL_M, WALL_THICKNESS_M, DEPTH_M)
+    center_m = np.empty((len(yaw_rad), 2))  # along and across yaw
+    half_m = np.empty((len(yaw_rad), 2))
+    sd_m = np.empty((len(yaw_rad), 2))
+    for axis in (0, 1):
+        bottom_m, top_m, sd_m[:, axis] = _close_axis(axis, extents, faces, depth_m)
+        center_m[:, axis] = 0.5 * (bottom_m + top_m)
+        half_m[:, axis] = np.maximum(0.5 * (top_m - bottom_m), MIN_HALF_M)
+    cosine = np.cos(yaw_rad)
+    sine = np.sin(yaw_rad)
+    center_x = cosine * center_m[:, 0] - sine * center_m[:, 1]
+    center_y = sine * center_m[:, 0] + cosine * center_m[:, 1]
+    return Boxes(
+        center_w=np.stack([center_x, center_y], axis=1),
+        yaw_rad=yaw_rad,
+        half_m=half_m,
+        center_sd_m=sd_m,
+        half_sd_m=sd_m.copy(),
+        misfit=misfit,
+        faces=np.sum(extents.is_seen, axis=0),
+    )
+
+
+@dataclass(frozen=True)
+class _Extents:
+    """What was seen of each obstacle, in its heading: lists by axis or by face, of arrays (b,)."""
+
+    low_m: list[Floats]  # by axis: where the points begin
+    high_m: list[Floats]  # by axis: where they end
+    is_seen: list[Bools]  # by face
+    information: list[Floats]  # by face, in 1 / m²
+
+
+def _measure_extents(points: _Points, weight: Floats, faces: Faces) -> _Extents:
+    """Find out which faces were seen, and where the points end along each axis."""
+    extents = _Extents([], [], [], [])
+    _, is_first_axis = _assign_faces(points, faces)
+    is_point = weight > 0
+    for axis in (0, 1):
+        place_m = points.place_m[axis][:, 0]
+        along_face_m = points.place_m[1 - axis][:, 0]
+        extents.low_m.append(np.where(is_point, place_m, np.inf).min(axis=1))
+        extents.high_m.append(np.where(is_point, place_m, -np.inf).max(axis=1))
+        is_this_axis = (is_first_axis if axis == 0 else ~is_first_axis)[:, 0]
+        for direction in (LOW, HIGH):
+            is_on_face = is_point & is_this_axis & (direction * points.outward[axis][:, 0] > 0)
+            left_m = np.where(is_on_face, along_face_m, np.inf).min(axis=1)
+            right_m = np.where(is_on_face, along_face_m, -np.inf).max(axis=1)
+            extents.is_seen.append(right_m - left_m > MIN_FACE_M)
+            extents.information.append(np.where(is_on_face, weight, 0.0).sum(axis=1))
+    return extents
+
+
+def _close_axis(axis: int, extents: _Extents, faces: Faces, depth_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return where the boxes begin and end along an axis, and the standard deviation of half their size, (b,) each.
+
+    An end is the face there if it was seen. If a face of the other axis was seen, it is where the points of that face
+    end. Otherwise it is at a guessed depth behind the opposite face.
+    """
+    low_face = 2 * axis
+    high_face = 2 * axis + 1
+    other_low_face = 2 - low_face
+    has_low = extents.is_seen[low_face]
+    has_high = extents.is_seen[high_face]
+    has_other = extents.is_seen[other_low_face] | extents.is_seen[other_low_face + 1]
+    low_m = extents.low_m[axis]
+    high_m = extents.high_m[axis]
+    guess_m = np.maximum(depth_m, high_m - low_m)
+    low_face_m = faces[low_face][:, 0]
+    high_face_m = faces[high_face][:, 0]
+
+    bottom_m = np.where(has_other | ~has_high, low_m, high_face_m - guess_m)
+    bottom_m = np.where(has_low, low_face_m, bottom_m)
+    top_m = np.where(has_other | ~has_low, high_m, low_face_m + guess_m)
+    top_m = np.where(has_high, high_face_m, top_m)
+
+    open_sd_m = np.where(has_other, END_SD_M, DEPTH_SD_M)
+    bottom_sd_m = np.where(has_low, _sd_m(extents.information[low_face]), open_sd_m)
+    top_sd_m = np.where(has_high, _sd_m(extents.information[high_face]), open_sd_m)
+    return bottom_m, top_m, 0.5 * np.hypot(bottom_sd_m, top_sd_m)
+
+
+def _sd_m(information: Floats) -> Floats:
+    return 1.0 / np.sqrt(np.maximum(information, 1.0))

@@ -1,7 +1,9 @@
-"""Circles through the visible parts of surfaces, with covariance; many obstacles at once. Pure.
+"""Fits circles to the visible parts of surfaces, with covariance; many obstacles at once. Pure.
 
 Gauss-Newton on the distances of points from the circle, with a prior on the radius. The visible arc of a cylinder fixes
-center and radius; a short arc leaves both uncertain along the line of sight, and the covariance says so.
+center and radius. A short arc leaves both uncertain along the line of sight; the covariance shows that.
+
+In shapes, b is the number of obstacles and p the number of points of each.
 """
 
 from dataclasses import dataclass
@@ -10,16 +12,20 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 
-RADIUS_M, RADIUS_SD_M = 0.05, 0.03  # prior: what stands around, before it was looked at
-SMALLEST_M, LARGEST_M = 0.01, 0.5
-STEPS = 5
-OUTLIER_SD = 3.0
+RADIUS_M = 0.05  # prior of an obstacle before it was seen
+RADIUS_SD_M = 0.03
+MIN_RADIUS_M = 0.01
+MAX_RADIUS_M = 0.5
+CENTER_INFORMATION = 1.0  # 1 / m², a prior so weak that it only keeps the equations regular
+ITERATIONS = 5
+MAX_STEP_M = 0.04
+OUTLIER_SD = 3.0  # standard deviations from which on a point counts less
 MODEL_SD_M = 0.0015  # of real surfaces from a circle or box, and of points that are means over a cell
 
 
 @dataclass(frozen=True)
 class Circles:
-    """One a row."""
+    """Circles in the world, one a row."""
 
     center_w: Floats  # (b, 2)
     radius_m: Floats  # (b,)
@@ -28,43 +34,74 @@ class Circles:
 
 
 def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: Floats, began_w: Floats) -> Circles:
-    """points (b, p, 2), weight (b, p), outward (b, p, 2), normal_weight (b, p), as of `batched`.
+    """Fit a circle with center c and radius r to the points q of each obstacle.
 
-    began_w: (b, 2) centers of earlier fits; NaN: none.
+    Minimizes the sum of w (|q - c| - r)² with Huber weights, of (r - r_0)² / sd_0², and of v (a . (q - c))²: the
+    measured normal of a touch, to which a is perpendicular, leads through the center.
+
+    Args:
+        points: (b, p, 2) q, in the world.
+        weight: (b, p) w, information in 1 / m²; 0 for padding.
+        outward: (b, p, 2) unit vectors from the surface towards the sensor, or normals.
+        normal_weight: (b, p) v, information of `outward` as a normal; 0 for points that were only seen.
+        began_w: (b, 2) centers of earlier fits; NaN without one.
     """
-    weight = softened(weight)
-    share = weight / weight.sum(axis=1, keepdims=True)
-    center = np.where(np.isnan(began_w), np.einsum("bp,bpk->bk", share, points - RADIUS_M * outward), began_w)
-    radius = np.einsum(
-        "bp,bp->b", share, np.hypot(points[..., 0] - center[:, None, 0], points[..., 1] - center[:, None, 1])
-    )
+    weight = soften_weights(weight)
+    center, radius = _first_guess(points, weight, outward, began_w)
     information = np.zeros((len(points), 3, 3))
-    for _ in range(STEPS):
+    for _ in range(ITERATIONS):
         offset = points - center[:, None]
-        distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)
-        error = distance - radius[:, None]
-        trusted = weight * np.minimum(1.0, OUTLIER_SD / np.maximum(np.abs(error) * np.sqrt(weight), 1e-9))
-        rows = np.stack([-offset[..., 0] / distance, -offset[..., 1] / distance, -np.ones_like(distance)], axis=-1)
-        information = np.einsum("bp,bpi,bpj->bij", trusted, rows, rows)
-        gradient = np.einsum("bp,bpi->bi", trusted * error, rows)
-        across = np.stack([outward[..., 1], -outward[..., 0], np.zeros_like(distance)], axis=-1)  # of a felt normal
-        missed = np.einsum("bpk,bpk->bp", across[..., :2], -offset)
-        information += np.einsum("bp,bpi,bpj->bij", normal_weight, across, across)
-        gradient += np.einsum("bp,bpi->bi", normal_weight * missed, across)
-        information[:, 2, 2] += RADIUS_SD_M**-2
-        gradient[:, 2] += (radius - RADIUS_M) * RADIUS_SD_M**-2
-        information[:, [0, 1], [0, 1]] += 1.0
+        information, gradient = _linearize(offset, radius, weight, outward, normal_weight)
         step = -np.linalg.solve(information, gradient[..., None])[..., 0]
-        step *= np.minimum(1.0, 0.04 / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]
+        step *= np.minimum(1.0, MAX_STEP_M / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]
         center = center + step[:, :2]
-        radius = np.clip(radius + step[:, 2], SMALLEST_M, LARGEST_M)
+        radius = np.clip(radius + step[:, 2], MIN_RADIUS_M, MAX_RADIUS_M)
     offset = points - center[:, None]
-    error = np.hypot(offset[..., 0], offset[..., 1]) - radius[:, None]
-    misfit = np.minimum(weight * error * error, OUTLIER_SD**2).sum(axis=1)
-    surplus = np.maximum(misfit / np.maximum((weight > 0).sum(axis=1) - 3, 1), 1.0)
-    return Circles(center, radius, np.linalg.inv(information) * surplus[:, None, None], misfit)
+    error_m = np.hypot(offset[..., 0], offset[..., 1]) - radius[:, None]
+    misfit = np.minimum(weight * error_m * error_m, OUTLIER_SD**2).sum(axis=1)
+    surplus_points = np.maximum((weight > 0).sum(axis=1) - 3, 1)
+    # If the points scatter more than their weights say, the result is less certain by that.
+    excess = np.maximum(misfit / surplus_points, 1.0)
+    return Circles(center, radius, np.linalg.inv(information) * excess[:, None, None], misfit)
 
 
-def softened(weight: Floats) -> Floats:
-    """Weights (b, p) with the deviation of real surfaces from any model added; 0 stays 0."""
+def soften_weights(weight: Floats) -> Floats:
+    """Return weights (b, p) with the deviation of real surfaces from any model added; 0 stays 0."""
     return weight / (1.0 + weight * MODEL_SD_M**2)
+
+
+def _first_guess(points: Floats, weight: Floats, outward: Floats, began_w: Floats) -> tuple[Floats, Floats]:
+    """Return centers (b, 2), from the earlier fit or one prior radius behind the surface, and mean radii (b,)."""
+    ratio = weight / weight.sum(axis=1, keepdims=True)
+    behind_surface = np.einsum("bp,bpk->bk", ratio, points - RADIUS_M * outward)
+    center = np.where(np.isnan(began_w), behind_surface, began_w)
+    distance_m = np.hypot(points[..., 0] - center[:, None, 0], points[..., 1] - center[:, None, 1])
+    return center, np.einsum("bp,bp->b", ratio, distance_m)
+
+
+def _linearize(
+    offset: Floats, radius: Floats, weight: Floats, outward: Floats, normal_weight: Floats
+) -> tuple[Floats, Floats]:
+    """Return information matrices (b, 3, 3) and gradients (b, 3) for steps of x, y and radius.
+
+    offset: (b, p, 2) points from the center; radius: (b,).
+    """
+    distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)
+    error = distance - radius[:, None]
+    huber = np.minimum(1.0, OUTLIER_SD / np.maximum(np.abs(error) * np.sqrt(weight), 1e-9))
+    trusted = weight * huber
+    rows = np.stack([-offset[..., 0] / distance, -offset[..., 1] / distance, -np.ones_like(distance)], axis=-1)
+    information = np.einsum("bp,bpi,bpj->bij", trusted, rows, rows)
+    gradient = np.einsum("bp,bpi->bi", trusted * error, rows)
+
+    # Measured normals lead through the center.
+    across = np.stack([outward[..., 1], -outward[..., 0], np.zeros_like(distance)], axis=-1)
+    miss = np.einsum("bpk,bpk->bp", across[..., :2], -offset)
+    information += np.einsum("bp,bpi,bpj->bij", normal_weight, across, across)
+    gradient += np.einsum("bp,bpi->bi", normal_weight * miss, across)
+
+    # Priors.
+    information[:, 2, 2] += RADIUS_SD_M**-2
+    gradient[:, 2] += (radius - RADIUS_M) * RADIUS_SD_M**-2
+    information[:, [0, 1], [0, 1]] += CENTER_INFORMATION
+    return information, gradient

@@ -1,4 +1,4 @@
-"""Clusters: runs of a scan's points that belong to one surface, cut at jumps and at concave corners. Pure."""
+"""Finds clusters: runs of a scan's points that belong to one surface, cut at jumps and at concave corners. Pure."""
 
 import math
 
@@ -6,45 +6,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.scan import Scan
+from snakesim_hal.base.arrays import Floats
 
 Indices = NDArray[np.intp]
-GRAZING_RAD = 0.26  # a surface seen flatter than this falls apart (adaptive breakpoint detector, Borges 2004)
+
+# Jumps: the adaptive breakpoint detector, Borges 2004.
+GRAZING_RAD = 0.26  # a surface seen under a smaller angle falls apart
 MIN_JUMP_M = 0.02
-MISSED_BINS = 1  # dropped out within a surface
-HOLLOW_M = 0.025  # an obstacle is convex: its points do not lie this far behind the line between its ends
+MAX_MISSED_BINS = 1  # that dropped out within a surface
+NOISE_SD = 3.0  # standard deviations that are added to a limit
+
+# Concave corners.
+HOLLOW_M = 0.025  # an obstacle is convex: its points are not this far behind the line between its ends
+MIN_RUN_POINTS = 5  # a shorter run is not cut
+MIN_CHORD_M = 1e-6
 
 
-def clusters_of(scan: Scan) -> list[Indices]:
-    """Bins of each cluster, in order of azimuth."""
+def find_clusters(scan: Scan) -> list[Indices]:
+    """Return the bins of each cluster, in order of azimuth."""
     hits = np.flatnonzero(np.isfinite(scan.range_m))
     if len(hits) == 0:
         return []
-    points, ranges = scan.points_w[hits], scan.range_m[hits]
-    gaps = np.hypot(*np.diff(points, axis=0).T)
-    bins = np.diff(hits)
-    allowed = bins * np.minimum(ranges[:-1], ranges[1:]) * scan.step_rad / math.sin(GRAZING_RAD)
-    noise = 3 * np.maximum(scan.sd_m[hits[1:]], scan.sd_m[hits[:-1]])
-    jumps = (bins > MISSED_BINS + 1) | (gaps > np.maximum(allowed, MIN_JUMP_M) + noise)
-    found: list[Indices] = []
-    for run in np.split(hits, np.flatnonzero(jumps) + 1):
-        found += _convex_parts(run, scan)
-    return found
+    points_w = scan.points_w[hits]
+    ranges_m = scan.range_m[hits]
+    steps = np.diff(points_w, axis=0)
+    gaps_m = np.hypot(steps[:, 0], steps[:, 1])
+    bin_steps = np.diff(hits)
+    nearer_m = np.minimum(ranges_m[:-1], ranges_m[1:])
+    allowed_m = bin_steps * nearer_m * scan.step_rad / math.sin(GRAZING_RAD)
+    noise_m = NOISE_SD * np.maximum(scan.sd_m[hits[1:]], scan.sd_m[hits[:-1]])
+    is_jump = (bin_steps > MAX_MISSED_BINS + 1) | (gaps_m > np.maximum(allowed_m, MIN_JUMP_M) + noise_m)
+    clusters: list[Indices] = []
+    for run in np.split(hits, np.flatnonzero(is_jump) + 1):
+        clusters += _split_at_corners(run, scan)
+    return clusters
 
 
-def _convex_parts(run: Indices, scan: Scan) -> list[Indices]:
-    """The run, cut where it is hollow as seen from the sensor."""
-    if len(run) < 5:
+def _split_at_corners(run: Indices, scan: Scan) -> list[Indices]:
+    """Return the parts of a run of bins, cut where it is hollow as seen from the sensor."""
+    if len(run) < MIN_RUN_POINTS:
         return [run]
-    points = scan.points_w[run]
-    chord = points[-1] - points[0]
-    length = math.hypot(*chord)
-    if length < 1e-6:
+    behind_m = _distance_behind_chord_m(scan.points_w[run], scan.origin_w)
+    if behind_m is None:
         return [run]
-    away = np.array([chord[1], -chord[0]]) / length
-    if away @ (points[0] - scan.origin_w) < 0:
+    deepest = int(np.argmax(behind_m))
+    is_convex = behind_m[deepest] < HOLLOW_M + NOISE_SD * scan.sd_m[run[deepest]]
+    is_inside = 1 < deepest < len(run) - 2
+    if is_convex or not is_inside:
+        return [run]
+    return _split_at_corners(run[: deepest + 1], scan) + _split_at_corners(run[deepest + 1 :], scan)
+
+
+def _distance_behind_chord_m(points_w: Floats, origin_w: Floats) -> Floats | None:
+    """Return how far points (n, 2) are behind the line from the first to the last, as seen from an origin (2,).
+
+    None if the first and the last point coincide.
+    """
+    chord = points_w[-1] - points_w[0]
+    length_m = math.hypot(*chord)
+    if length_m < MIN_CHORD_M:
+        return None
+    away = np.array([chord[1], -chord[0]]) / length_m
+    if away @ (points_w[0] - origin_w) < 0:
         away = -away
-    behind = (points - points[0]) @ away
-    deepest = int(np.argmax(behind))
-    if behind[deepest] < HOLLOW_M + 3 * scan.sd_m[run[deepest]] or not 1 < deepest < len(run) - 2:
-        return [run]
-    return _convex_parts(run[: deepest + 1], scan) + _convex_parts(run[deepest + 1 :], scan)
+    return (points_w - points_w[0]) @ away

@@ -1,7 +1,7 @@
-"""A depth image becomes a scan: points, minus the ground, then the nearest upright surface in each azimuth. Pure.
+"""Turns a depth image into a scan: the nearest upright surface in each azimuth. Pure.
 
-Upright is what spans height within little range: a hill does not, a cylinder does. So a slope that the ground's plane
-misses is not taken for an obstacle.
+The points of the image are split into ground, obstacles and the rest. A surface is upright if it spans height within
+little range: a cylinder does, a hill does not. So a slope that the ground's plane misses is not taken for an obstacle.
 """
 
 import math
@@ -10,18 +10,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.ground import NEAR_M, refined, tolerance_m
+from snakesim_gnc.guidance.ground import NEAR_M, refine_plane, tolerance_m
 from snakesim_gnc.guidance.scan import BAND_M, MAX_RANGE_M, Noise, Scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage
 
 Singles = NDArray[np.float32]
-CELL_M = 0.02  # of range near the camera; a surface is sought cell by cell,
-STRETCH_M = 1.0  # and cells grow beyond this, as noise does
-RISE_M = 0.02  # least height that an upright surface spans within a cell
-MIN_PIXELS = 2  # in a cell
-NEAR_LIMIT_M = 0.03
-PLANE_EVERY = 7  # one pixel of these is used for the ground's plane
+
+# Cells of range, in which a surface is sought.
+CELL_M = 0.02  # near the camera
+STRETCH_M = 1.0  # beyond this range cells grow, as noise does
+MIN_RISE_M = 0.02  # height that an upright surface spans within a cell
+MIN_PIXELS = 2  # of an upright surface in a cell
+
+# The range of a surface.
+RANGE_ITERATIONS = 2  # the mean of the pixels around the first cell, and of those around that mean
+SPREAD_SD = 2.5  # standard deviations of range within which pixels belong to the surface
+CELL_RATIO = 0.6  # of a cell, in addition
+SURFACE_SD_M = 0.001  # of a surface's range, however many pixels it is the mean of
+
+MIN_RANGE_M = 0.03
+HEAD_ROOM_M = 0.02  # above the ground's offset from the camera, that the band of heights includes at least
+PLANE_EVERY = 7  # one pixel in so many is used for the ground's plane
 
 
 @dataclass(frozen=True)
@@ -36,110 +46,142 @@ class Intrinsics:
     cy_px: float
 
     @staticmethod
-    def of(image: DepthImage) -> "Intrinsics":
-        """Of the image's camera."""
+    def from_image(image: DepthImage) -> "Intrinsics":
+        """Return the intrinsics of the image's camera."""
         return Intrinsics(image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px)
 
     def rays(self) -> Singles:
-        """(height * width, 3), row by row from the top."""
+        """Return the direction of each pixel, (height * width, 3), row by row from the top."""
         v, u = np.mgrid[: self.height, : self.width]
-        left, up = -(u - self.cx_px) / self.fx_px, -(v - self.cy_px) / self.fy_px
+        left = -(u - self.cx_px) / self.fx_px
+        up = -(v - self.cy_px) / self.fy_px
         return np.stack([np.ones_like(left), left, up], axis=-1).reshape(-1, 3).astype(np.float32)
 
 
-def metres_of(image: DepthImage) -> Singles:
-    """Distance along the camera's x axis, (height * width,); 0: nothing seen, or beyond the camera's range."""
+def decode_depth_m(image: DepthImage) -> Singles:
+    """Return distances along the camera's x axis, (height * width,); 0: nothing seen, or out of the camera's range."""
     counts = np.frombuffer(image.depth, dtype="<u2").astype(np.float32)
-    depth = counts * np.float32(image.scale_m)
-    depth[(depth < image.range_min_m) | (depth > image.range_max_m)] = 0.0
-    return depth
+    depth_m = counts * np.float32(image.scale_m)
+    depth_m[(depth_m < image.range_min_m) | (depth_m > image.range_max_m)] = 0.0
+    return depth_m
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels that may show an obstacle; m is their number."""
+
+    bins: NDArray[np.int32]  # (m,) of azimuth
+    points: Singles  # (m, 3) from the camera, in the world's axes
+    ranges_m: Singles  # (m,) from the camera, on the ground
+    heights_m: Singles  # (m,) above the ground
 
 
 class DepthScanner:
-    """Scans of one camera."""
+    """Makes scans from the images of one camera."""
 
     def __init__(self, lens: Intrinsics, noise: Noise) -> None:
         self.lens = lens
         self._rays = lens.rays()
         self._noise = noise
         self._step_rad = 1.0 / lens.fx_px
+        self._cells = math.ceil(STRETCH_M * math.asinh(MAX_RANGE_M / STRETCH_M) / CELL_M) + 1
 
     def scan(self, depth_m: Singles, timestamp_ns: int, position_w: Floats, rotation: Floats, plane: Floats) -> Scan:
-        """depth_m: (height * width,). position_w, rotation: world_from_camera. plane: of the ground, first guess.
+        """Return the scan of an image.
 
-        The plane is z = a + b x + c y in the world, with x and y from the camera.
+        Args:
+            depth_m: (height * width,) distances along the camera's x axis; 0 where nothing was seen.
+            timestamp_ns: of the image.
+            position_w: (3,) of the camera.
+            rotation: (3, 3) world_from_camera.
+            plane: (3,) first guess of the ground: z = a + b x + c y in the world, with x and y from the camera.
         """
         seen = np.flatnonzero(depth_m)
         rays = self._rays[seen] @ rotation.T.astype(np.float32)
         points = rays * depth_m[seen, None]  # from the camera, in the world's axes
         points[:, 2] += position_w[2]
-        ranges = np.hypot(points[:, 0], points[:, 1])
-        near = np.flatnonzero(ranges < NEAR_M)[::PLANE_EVERY]
-        a, b, c = refined(plane, points[near].astype(np.float64)).astype(np.float32)
-        heights = points[:, 2] - (a + b * points[:, 0] + c * points[:, 1])
-        yaw, fov = self._view(rotation)
-        turned = np.arctan2(rays[:, 1], rays[:, 0]) - np.float32(yaw - fov / 2)
-        bins = (np.mod(turned, np.float32(2 * math.pi)) / np.float32(self._step_rad)).astype(np.int32)
-        count = math.ceil(fov / self._step_rad)
-        kept = (ranges > NEAR_LIMIT_M) & (ranges < MAX_RANGE_M) & (bins < count)
-        limit = tolerance_m(ranges)
-        floor = kept & (np.abs(heights) <= limit)
-        band = np.flatnonzero(kept & (heights > np.maximum(limit, BAND_M[0])) & (heights < max(BAND_M[1], a + 0.02)))
-        free = np.zeros(count)
-        np.maximum.at(free, bins[floor], ranges[floor])
-        return self._nearest(
-            timestamp_ns, position_w[:2], yaw - fov / 2, free, bins[band], points[band], ranges[band], heights[band]
-        )
+        ranges_m = np.hypot(points[:, 0], points[:, 1])
+        near = np.flatnonzero(ranges_m < NEAR_M)[::PLANE_EVERY]
+        a, b, c = refine_plane(plane, points[near].astype(np.float64)).astype(np.float32)
+        heights_m = points[:, 2] - (a + b * points[:, 0] + c * points[:, 1])
+
+        # Bins of azimuth, counter-clockwise from the right edge of the view.
+        heading_rad, fov_rad = self._view(rotation)
+        first_rad = heading_rad - fov_rad / 2
+        from_first_rad = np.arctan2(rays[:, 1], rays[:, 0]) - np.float32(first_rad)
+        bins = (np.mod(from_first_rad, np.float32(2 * math.pi)) / np.float32(self._step_rad)).astype(np.int32)
+        bin_count = math.ceil(fov_rad / self._step_rad)
+
+        is_valid = (ranges_m > MIN_RANGE_M) & (ranges_m < MAX_RANGE_M) & (bins < bin_count)
+        ground_m = tolerance_m(ranges_m)
+        is_ground = is_valid & (np.abs(heights_m) <= ground_m)
+        lowest_m = np.maximum(ground_m, BAND_M[0])
+        highest_m = max(BAND_M[1], a + HEAD_ROOM_M)
+        in_band = np.flatnonzero(is_valid & (heights_m > lowest_m) & (heights_m < highest_m))
+        free_m = np.zeros(bin_count)
+        np.maximum.at(free_m, bins[is_ground], ranges_m[is_ground])
+        pixels = _Pixels(bins[in_band], points[in_band], ranges_m[in_band], heights_m[in_band])
+        return self._make_scan(timestamp_ns, position_w[:2], first_rad, free_m, pixels)
 
     def _view(self, rotation: Floats) -> tuple[float, float]:
-        """Azimuth of the middle of the view, and its width."""
+        """Return the azimuth of the middle of the view, and its width, in rad."""
         corners = self._rays[[0, self.lens.width - 1, -self.lens.width, -1]] @ rotation.T
-        ahead = math.atan2(rotation[1, 0], rotation[0, 0])
-        off = np.arctan2(corners[:, 1], corners[:, 0]) - ahead
-        widest = float(np.abs((off + math.pi) % (2 * math.pi) - math.pi).max())
-        return ahead, min(2 * widest + 2 * self._step_rad, 2 * math.pi)
+        heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
+        off_rad = np.arctan2(corners[:, 1], corners[:, 0]) - heading_rad
+        half_rad = float(np.abs((off_rad + math.pi) % (2 * math.pi) - math.pi).max())
+        return heading_rad, min(2 * half_rad + 2 * self._step_rad, 2 * math.pi)
 
-    def _nearest(
-        self,
-        timestamp_ns: int,
-        origin_w: Floats,
-        first_w: float,
-        free: Floats,
-        bins: NDArray[np.int32],
-        points: Singles,
-        ranges: Singles,
-        heights: Singles,
+    def _make_scan(
+        self, timestamp_ns: int, origin_w: Floats, first_rad: float, free_m: Floats, pixels: _Pixels
     ) -> Scan:
-        """The nearest upright surface in each bin."""
-        count, cells = len(free), math.ceil(STRETCH_M * math.asinh(MAX_RANGE_M / STRETCH_M) / CELL_M) + 1
-        cell = bins * cells + (np.arcsinh(ranges / STRETCH_M) * (STRETCH_M / CELL_M)).astype(np.int32)
-        pixels = np.bincount(cell, minlength=count * cells)
-        low = np.full(count * cells, np.inf, dtype=np.float32)
-        high = np.full(count * cells, -np.inf, dtype=np.float32)
-        np.minimum.at(low, cell, heights)
-        np.maximum.at(high, cell, heights)
-        upright = ((pixels >= MIN_PIXELS) & (high - low >= RISE_M)).reshape(count, cells)
-        has = upright.any(axis=1)
-        at = STRETCH_M * np.sinh((upright.argmax(axis=1) + 0.5) * (CELL_M / STRETCH_M))
-        at = np.where(has, at, np.nan)
-        spread = self._noise.at(np.nan_to_num(at))
-        n, ours = np.zeros(count), np.zeros(len(bins), dtype=bool)
-        for _ in range(2):  # the mean of the pixels around the first find, and of those around that mean
+        """Return the scan of the nearest upright surface in each bin, the mean of its pixels.
+
+        free_m: (n,) range up to which each bin shows ground.
+        """
+        bin_count = len(free_m)
+        bins = pixels.bins
+        range_m = self._find_upright_m(pixels, bin_count)
+        spread_m = self._noise.sd_m(np.nan_to_num(range_m))
+        width_m = SPREAD_SD * spread_m + CELL_RATIO * CELL_M
+        count = np.zeros(bin_count)
+        on_surface = np.zeros(len(bins), dtype=bool)
+        for _ in range(RANGE_ITERATIONS):
             with np.errstate(invalid="ignore"):
-                ours = np.abs(ranges - at[bins]) < (2.5 * spread + 0.6 * CELL_M)[bins]
-            n = np.bincount(bins[ours], minlength=count).astype(np.float64)
-            at = np.bincount(bins[ours], ranges[ours], count) / np.where(n > 0, n, np.nan)
-        xy = np.stack([np.bincount(bins[ours], points[ours, k], count) for k in (0, 1)], axis=1)
-        top = np.full(count, -np.inf)
-        np.maximum.at(top, bins[ours], heights[ours])
+                on_surface = np.abs(pixels.ranges_m - range_m[bins]) < width_m[bins]
+            count = np.bincount(bins[on_surface], minlength=bin_count).astype(np.float64)
+            total_m = np.bincount(bins[on_surface], pixels.ranges_m[on_surface], bin_count)
+            range_m = total_m / np.where(count > 0, count, np.nan)
+
+        has_surface = count > 0
+        x = np.bincount(bins[on_surface], pixels.points[on_surface, 0], bin_count)
+        y = np.bincount(bins[on_surface], pixels.points[on_surface, 1], bin_count)
+        mean_xy = np.stack([x, y], axis=1) / np.where(has_surface, count, np.nan)[:, None]
+        top_m = np.full(bin_count, -np.inf)
+        np.maximum.at(top_m, bins[on_surface], pixels.heights_m[on_surface])
         return Scan(
             timestamp_ns=timestamp_ns,
             origin_w=origin_w,
-            azimuth_w=first_w,
+            azimuth_w=first_rad,
             step_rad=self._step_rad,
-            range_m=at,
-            points_w=origin_w + xy / np.where(n > 0, n, np.nan)[:, None],
-            sd_m=np.hypot(spread / np.sqrt(np.maximum(n, 1.0)), 0.001),
-            free_m=np.where(n > 0, np.nan_to_num(at), free),
-            top_m=np.where(n > 0, top, np.nan),
+            range_m=range_m,
+            points_w=origin_w + mean_xy,
+            sd_m=np.hypot(spread_m / np.sqrt(np.maximum(count, 1.0)), SURFACE_SD_M),
+            free_m=np.where(has_surface, np.nan_to_num(range_m), free_m),
+            top_m=np.where(has_surface, top_m, np.nan),
         )
+
+    def _find_upright_m(self, pixels: _Pixels, bin_count: int) -> Floats:
+        """Return the range of the nearest cell with an upright surface in each bin, (n,); NaN if there is none."""
+        cell_of_bin = (np.arcsinh(pixels.ranges_m / STRETCH_M) * (STRETCH_M / CELL_M)).astype(np.int32)
+        cell = pixels.bins * self._cells + cell_of_bin
+        cell_count = bin_count * self._cells
+        pixel_count = np.bincount(cell, minlength=cell_count)
+        low_m = np.full(cell_count, np.inf, dtype=np.float32)
+        high_m = np.full(cell_count, -np.inf, dtype=np.float32)
+        np.minimum.at(low_m, cell, pixels.heights_m)
+        np.maximum.at(high_m, cell, pixels.heights_m)
+        is_upright = (pixel_count >= MIN_PIXELS) & (high_m - low_m >= MIN_RISE_M)
+        is_upright = is_upright.reshape(bin_count, self._cells)
+        nearest = is_upright.argmax(axis=1)
+        range_m = STRETCH_M * np.sinh((nearest + 0.5) * (CELL_M / STRETCH_M))
+        return np.where(is_upright.any(axis=1), range_m, np.nan)

@@ -1,11 +1,11 @@
-"""Contacts of a robot without contact sensors: the estimate from joint torques, told as such a sensor would."""
+"""Contacts of a robot without contact sensors: estimated from joint torques, in the form that sensors publish."""
 
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
+from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.model.kinematics import tangents
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState, Pose, World
 
@@ -13,52 +13,73 @@ NO_IMU = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceler
 
 
 class EstimatedContacts(NamedTuple):
-    """Of one joint state."""
+    """The contacts at one joint state."""
 
     contacts: Contacts
     confidence: list[float]  # of each contact, 0 to 1
 
 
 class ContactEstimator:
-    """Of one robot."""
+    """Estimates the contacts of one robot, all of whose joints measure torque.
+
+    A joint without a torque measurement would hide all contacts ahead of it: see `can_estimate_contacts`.
+    """
 
     def __init__(self, robot: Description) -> None:
         self._robot = robot
 
-    @classmethod
-    def of(cls, robot: Description) -> "ContactEstimator | None":
-        """None for a robot with a joint that does not measure its torque: that hides all that is ahead of it."""
-        return cls(robot) if all("torque" in joint.measures for joint in robot.joints) else None
-
     def contacts(self, joints: JointState, imu: Imu | None, pose: Pose | None) -> EstimatedContacts | None:
-        """None while a joint's numbers are outdated. imu: counts if it is of the same instant as the joints."""
+        """Return the contacts at a joint state, or None while a joint's values are outdated.
+
+        Args:
+            joints: with torques.
+            imu: used only if it has the same timestamp as the joints.
+            pose: velocity of the base; None if it is unknown.
+        """
         if not all(joints.valid):
             return None
-        fresh = imu if imu is not None and imu.timestamp_ns == joints.timestamp_ns else NO_IMU
-        felt = estimate(self._robot, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, fresh, pose)
-        contacts = [self._contact(one) for one in felt]
+        imu_of_joints = NO_IMU
+        if imu is not None and imu.timestamp_ns == joints.timestamp_ns:
+            imu_of_joints = imu
+        pushes = estimate_pushes(
+            self._robot,
+            joints.angle_rad,
+            joints.velocity_rad_s,
+            joints.torque_nm,
+            imu_of_joints,
+            pose,
+        )
+        contacts = [self._make_contact(push) for push in pushes]
         message = Contacts(tick=joints.tick, timestamp_ns=joints.timestamp_ns, contacts=contacts)
-        return EstimatedContacts(message, [one.confidence for one in felt])
+        return EstimatedContacts(message, [push.confidence for push in pushes])
 
-    def _contact(self, felt: FeltContact) -> Contact:
-        """At the skin of its link, where the push comes from."""
-        normal = np.array(felt.normal_l)
-        position = np.array([felt.along_m, 0.0, 0.0]) - self._robot.links[felt.link].radius_m * normal
-        along, across = tangents(felt.normal_l)
+    def _make_contact(self, push: EstimatedPush) -> Contact:
+        """Return the contact at the skin of the link, on the side of the obstacle."""
+        normal_l = np.array(push.normal_l)
+        position_l = np.array([push.along_m, 0.0, 0.0]) - self._robot.links[push.link].radius_m * normal_l
+        tangent_1_l, tangent_2_l = tangents(push.normal_l)
         return Contact(
-            link=felt.link,
+            link=push.link,
             obstacle=None,
-            position_l=tuple(position.tolist()),
-            normal_l=felt.normal_l,
-            tangent_1_l=along,
-            tangent_2_l=across,
-            force_l=tuple((felt.force_n * normal).tolist()),
+            position_l=tuple(position_l.tolist()),
+            normal_l=push.normal_l,
+            tangent_1_l=tangent_1_l,
+            tangent_2_l=tangent_2_l,
+            force_l=tuple((push.force_n * normal_l).tolist()),
             torque_l=(0.0, 0.0, 0.0),
         )
 
 
-def with_estimated(world: World, estimated: EstimatedContacts) -> World:
-    """The world made with estimated contacts, which says so. On a known map a push where no obstacle is, is noise."""
+def can_estimate_contacts(robot: Description) -> bool:
+    """Return whether all joints of the robot measure their torque."""
+    return all("torque" in joint.measures for joint in robot.joints)
+
+
+def mark_estimated(world: World, estimated: EstimatedContacts) -> World:
+    """Return a world made with estimated contacts, marked as such, with the confidence of each contact.
+
+    A push where the known map has no obstacle is noise, and left out.
+    """
     contacts = [
         msgspec.structs.replace(contact, confidence=confidence)
         for contact, confidence in zip(world.contacts, estimated.confidence, strict=True)

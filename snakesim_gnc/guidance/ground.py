@@ -1,51 +1,74 @@
-"""The ground as a plane, from the body that lies on it and from what a camera sees of it. Pure.
+"""Fits the ground as a plane, from the body that lies on it and from what a camera sees of it. Pure.
 
-On hills the plane is that of the ground near the head; what is off it by less than `tolerance_m` is still ground.
+On hills the plane is that of the ground near the head. What is off it by less than `tolerance_m` is still ground. A
+plane is an array (3,) of a, b, c in z = a + b x + c y.
 """
 
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 
-FLAT_M, PER_M = 0.015, 0.02  # deviation of ground from its plane: near the robot, and more for each metre of distance
-NEAR_M = 1.5  # the plane is fitted to what is nearer
-MIN_POINTS = 30
+# Deviation of the ground from its plane.
+FLAT_M = 0.015  # near the robot
+FLAT_PER_M = 0.02  # in addition, for each meter of distance
+
+NEAR_M = 1.5  # the plane is fitted to nearer points
 MAX_SLOPE = 0.3
+
+# The plane under the body.
+NEAR_WEIGHT_M = 0.1  # a point counts 1 / (its distance + this): the ground near the camera matters
+LEVEL_PRIOR = np.diag([0.0, 0.02, 0.02])  # pulls slopes that the body does not show to zero
+
+# The plane that a camera sees.
+MIN_POINTS = 30
+WIDTHS_M = (0.04, 0.025)  # of the Tukey weights in each iteration
+ABOVE_RATIO = 0.5  # of the width, for points above the plane: obstacles are above it
+SEEN_PRIOR = np.diag([1.0, 0.3, 0.3])  # weight of the first guess
 
 
 def tolerance_m(range_m: Floats) -> Floats:
-    """How far above or below the plane a point of the ground may be, at a distance."""
-    return FLAT_M + PER_M * range_m
+    """Return how far above or below the plane a point of the ground may be, at a distance."""
+    return FLAT_M + FLAT_PER_M * range_m
 
 
-def plane_under(bottoms_w: Floats, at_w: Floats) -> Floats:
-    """The plane under the body: (3,) a, b, c of z = a + b x + c y, with x and y from `at_w`.
+def fit_plane_under(bottoms_w: Floats, at_w: Floats) -> Floats:
+    """Fit the plane under the body, by weighted least squares.
 
-    bottoms_w: (n, 3) lowest points of the links. The slope across a straight body is unknown, and taken as none.
+    The slope across a straight body is unknown, and assumed to be zero.
+
+    Args:
+        bottoms_w: (n, 3) lowest points of the links.
+        at_w: (2,) origin of the plane's x and y.
     """
     x, y = (bottoms_w[:, :2] - at_w[:2]).T
     rows = np.stack([np.ones_like(x), x, y], axis=1)
-    weights = 1.0 / (0.1 + np.hypot(x, y))  # the ground near the camera counts
-    level = np.diag([0.0, 0.02, 0.02])  # pulls slopes that the body does not show to zero
-    normal = rows.T @ (rows * weights[:, None]) + level
-    plane = np.linalg.solve(normal, rows.T @ (bottoms_w[:, 2] * weights))
+    weights = 1.0 / (NEAR_WEIGHT_M + np.hypot(x, y))
+    normal_matrix = rows.T @ (rows * weights[:, None]) + LEVEL_PRIOR
+    plane = np.linalg.solve(normal_matrix, rows.T @ (bottoms_w[:, 2] * weights))
     return np.clip(plane, [-np.inf, -MAX_SLOPE, -MAX_SLOPE], [np.inf, MAX_SLOPE, MAX_SLOPE])
 
 
-def refined(plane: Floats, points: Floats) -> Floats:
-    """The plane fitted to the seen points (n, 3) near it, by iterated reweighting (Tukey); or as it was.
+def refine_plane(plane: Floats, points: Floats) -> Floats:
+    """Fit the plane to seen points near it, by iterated reweighting (Tukey).
 
-    Obstacles are above it, so points above count less than points below.
+    Args:
+        plane: (3,) first guess.
+        points: (n, 3).
+
+    Returns:
+        The fitted plane, or the first guess if too few points are near it or the fit is too steep.
     """
     x, y, z = points.T
     rows = np.stack([np.ones_like(x), x, y], axis=1)
-    first = plane
-    for width in (0.04, 0.025):
-        off = z - rows @ plane
-        weights = np.clip(1.0 - np.square(off / np.where(off > 0, 0.5 * width, width)), 0.0, None) ** 2
+    first_guess = plane
+    for width_m in WIDTHS_M:
+        above_m = z - rows @ plane
+        limit_m = np.where(above_m > 0, ABOVE_RATIO * width_m, width_m)
+        weights = np.clip(1.0 - np.square(above_m / limit_m), 0.0, None) ** 2
         if np.count_nonzero(weights) < MIN_POINTS:
-            return first
-        prior = np.diag([1.0, 0.3, 0.3])
-        right = rows.T @ (z * weights) + prior @ first
-        plane = np.linalg.solve(rows.T @ (rows * weights[:, None]) + prior, right)
-    return plane if np.abs(plane[1:]).max() < MAX_SLOPE else first
+            return first_guess
+        right_side = rows.T @ (z * weights) + SEEN_PRIOR @ first_guess
+        plane = np.linalg.solve(rows.T @ (rows * weights[:, None]) + SEEN_PRIOR, right_side)
+    if np.abs(plane[1:]).max() < MAX_SLOPE:
+        return plane
+    return first_guess

@@ -1,7 +1,8 @@
-"""The map: obstacles from scans, touches and the body's own way, associated, fused, merged and forgotten. Pure.
+"""The map: obstacles from scans, touches and the body's own path. Pure.
 
-Each measured point goes to the obstacle on whose outline it lies; what lies on none begins a new one. What is looked
-through, or what the body lies in, loses its surface there, and an obstacle without a surface is dropped.
+Each measured point goes to the obstacle on whose outline it lies; points that lie on none begin a new obstacle. Where a
+scan sees through an obstacle, or the body lies in it, the obstacle loses that part of its surface. An obstacle without
+a surface is dropped.
 """
 
 import math
@@ -13,220 +14,350 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.circle_fit import RADIUS_M, RADIUS_SD_M
-from snakesim_gnc.guidance.clusters import clusters_of
+from snakesim_gnc.guidance.clusters import find_clusters
 from snakesim_gnc.guidance.scan import MAX_RANGE_M, Scan
 from snakesim_gnc.guidance.surfaces import MAX_DOUBTS
-from snakesim_gnc.guidance.tracks import BELIEVED, GONE, HIT, MISS, TOUCH, Track, fit, outlines_of, position_sd_m
+from snakesim_gnc.guidance.tracks import (
+    DROP_LOG_ODDS,
+    HIT_LOG_ODDS,
+    MISS_LOG_ODDS,
+    REPORT_LOG_ODDS,
+    TOUCH_LOG_ODDS,
+    Track,
+    fit_shapes,
+    list_position_sd_m,
+    make_outlines,
+)
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
 Indices = NDArray[np.intp]
-GATE_M = 0.02  # from an outline, beside what its sd and the point's allow
-WIDEST_GATE_M = 0.08
-MIN_POINTS = 2  # of a cluster that begins an obstacle
-APART_M = 0.03  # from the outline of a well known circle: what is further off is something else
-LOOKED_PAST_M = 0.03  # further than a cell: it was looked through
-TOUCH_SD_M, NORMAL_SD_RAD = 0.003, 0.2
-SUNK_M = 0.008  # deeper than this in the body nothing can be
+Claim = tuple[Track, Indices]  # a track, and the bins of a scan that belong to it
+
+# Which obstacle a point belongs to.
+GATE_M = 0.02  # distance from an outline, in addition to what the standard deviations allow
+MAX_GATE_M = 0.08
+MAX_GATE_SD_M = 0.02  # of an obstacle's position: with more it is not preferred to others
+MIN_CLUSTER_POINTS = 2  # of a cluster that begins an obstacle
+MIN_OWNER_RATIO = 0.2  # of a cluster's points, or
+MIN_OWNER_POINTS = 4  # so many, that an obstacle must have to own a part of it
+APART_M = 0.03  # from the outline of a well-known circle: a point farther away belongs to another obstacle
+WELL_KNOWN_SD_M = 0.01
+WELL_KNOWN_CELLS = 6
+
+# Merging two obstacles into one.
+MERGE_OVERLAP_M = 0.01  # a point that is nearer to the other's outline than this, or inside, overlaps
+MERGE_RATIO = 0.4  # of the points of one obstacle that overlap with the other
+
+# Evidence against an obstacle.
+SEEN_PAST_M = 0.03  # a ray that ends farther behind a point than this has seen through it
+MAX_TRACK_SD_M = 0.05  # of an obstacle's position that a ray must pass, in addition
+SEEN_THROUGH_RATIO = 0.5  # of the visible surface
+SUNK_M = 0.008  # an obstacle deeper in the body than this is not there
+# Part of the surface to the left of the body: between these, the body goes right through the obstacle.
+OTHER_SIDE_RATIO = 0.2
+ONE_SIDE_RATIO = 0.8
+
+# Measurements by the body.
+TOUCH_SD_M = 0.003
+NORMAL_SD_RAD = 0.2
 SKIN_SD_M = 0.004
+
+# Memory.
 MAX_TRACKS = 1024
-KEPT_M = 4.0  # from the body; what is further away is forgotten
+KEPT_M = 4.0  # from the body; obstacles farther away are forgotten
+SCAN_MARGIN_M = 1.0  # beyond the range of a scan: obstacles whose center is within it may be seen
 
 
 class ObstacleMap:
-    """What is known about obstacles."""
+    """The obstacles that are known so far."""
 
     def __init__(self) -> None:
         self.tracks: list[Track] = []
         self.here_m2 = 0.0  # variance of the robot's position now
-        self._count = 0
+        self._track_count = 0  # of all that there ever were
         self._drift_m2 = 0.0
 
     def drift(self, variance_m2: float) -> None:
-        """The robot's position has become less certain by this variance, and with it all that was mapped before."""
+        """Record that the robot's position has become less certain, relative to all that was mapped before."""
         self._drift_m2 += variance_m2
 
     def obstacles(self, now_ns: int, ground_z_m: float) -> list[Obstacle]:
-        """The obstacles with enough evidence."""
-        return [t.obstacle(now_ns, ground_z_m) for t in self.tracks if t.believed(now_ns) > BELIEVED]
+        """Return the obstacles with enough evidence."""
+        return [
+            track.to_obstacle(now_ns, ground_z_m) for track in self.tracks if track.belief_at(now_ns) > REPORT_LOG_ODDS
+        ]
 
-    def take_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
-        """Take in a look. sd_m: of the sensor's position against the map."""
-        near = [t for t in self.tracks if math.hypot(*(t.center_w - scan.origin_w)) < MAX_RANGE_M + 1.0]
-        outlines = outlines_of(near)
-        shares: dict[int, tuple[Track, list[Indices]]] = {}
-        together: list[tuple[Track, Track]] = []
-        for cluster in clusters_of(scan):
-            owners = self._owners(cluster, scan, near, outlines, sd_m)
-            for track, points in owners:
-                shares.setdefault(track.number, (track, []))[1].append(points)
-            together += [(a, b) for (a, _), (b, _) in pairwise(owners) if a is not b]
-        self._doubt(near, scan, set(shares))
-        for track, parts in shares.values():
-            bins = np.concatenate(parts)
-            self._refresh(track)
-            towards = scan.origin_w - scan.points_w[bins]
-            towards = towards / np.maximum(scan.range_m[bins], 1e-6)[:, None]
-            track.surface.add(scan.points_w[bins], scan.sd_m[bins], towards)
-            track.believe(HIT)
-            track.last_seen_ns = scan.timestamp_ns
-            track.top_m = max(track.top_m, float(np.nanmax(scan.top_m[bins])))
-        seen = [track for track, _ in shares.values()]
-        fit(seen)
-        self._merge(seen, together)
-        self._drop()
+    def add_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
+        """Add the points of a scan. sd_m: standard deviation of the sensor's position relative to the map."""
+        near = [track for track in self.tracks if _is_in_range(track, scan)]
+        outlines = make_outlines(near)
+        parts_of: dict[int, list[Indices]] = {}  # bins of each track, by its number
+        seen: dict[int, Track] = {}
+        adjacent: list[tuple[Track, Track]] = []  # tracks side by side in one cluster
+        for cluster in find_clusters(scan):
+            claims = self._divide_cluster(cluster, scan, near, outlines, sd_m)
+            for track, bins in claims:
+                seen.setdefault(track.number, track)
+                parts_of.setdefault(track.number, []).append(bins)
+            adjacent += [(a, b) for (a, _), (b, _) in pairwise(claims) if a is not b]
+        self._doubt_what_is_seen_through(near, scan, set(seen))
+        for track in seen.values():
+            self._add_points(track, scan, np.concatenate(parts_of[track.number]))
+        fit_shapes(list(seen.values()))
+        self._merge_duplicates(list(seen.values()), adjacent)
+        self._drop_disproved()
 
-    def take_touches(self, touches: Sequence[tuple[Floats, Floats]], timestamp_ns: int) -> None:
-        """Take in contacts: a point (2,) of a surface, and its normal (2,) into the body, of each."""
-        felt: dict[int, Track] = {}
+    def add_touches(self, touches: Sequence[tuple[Floats, Floats]], timestamp_ns: int) -> None:
+        """Add contacts, each a point (2,) of a surface and the normal (2,) there into the body, in the world."""
+        touched: dict[int, Track] = {}
         for position_w, normal_w in touches:
-            track = self.at(position_w) or self._new(position_w, normal_w)
-            self._refresh(track)
-            weight = 1.0 / (NORMAL_SD_RAD * track.radius_m) ** 2 if track.shape == "cylinder" else 0.0
-            track.surface.add(position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([weight]))
-            track.felt, track.last_seen_ns = True, max(track.last_seen_ns, timestamp_ns)
-            track.believe(TOUCH)
-            felt[track.number] = track
-        fit(list(felt.values()))
+            track = self.find_track(position_w)
+            if track is None:
+                track = self._start_felt_track(position_w, normal_w)
+            self._update_drift(track)
+            # The normal of a cylinder leads through its center; that of a box says little about its place.
+            is_round = track.shape == "cylinder"
+            normal_weight = 1.0 / (NORMAL_SD_RAD * track.radius_m) ** 2 if is_round else 0.0
+            track.surface.add(position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([normal_weight]))
+            track.felt = True
+            track.last_seen_ns = max(track.last_seen_ns, timestamp_ns)
+            track.add_evidence(TOUCH_LOG_ODDS)
+            touched[track.number] = track
+        fit_shapes(list(touched.values()))
 
-    def at(self, position_w: Floats) -> Track | None:
-        """The obstacle whose outline is at a point (2,), within its uncertainty."""
+    def find_track(self, position_w: Floats) -> Track | None:
+        """Return the obstacle whose outline is at a point (2,), within its uncertainty, or None."""
         if not self.tracks:
             return None
-        off, sd = np.abs(outlines_of(self.tracks).distance_m(position_w)), position_sd_m(self.tracks)
-        best = int(np.argmin(off - np.minimum(sd, 0.02)))
-        return self.tracks[best] if off[best] < min(GATE_M + 2 * sd[best], WIDEST_GATE_M) else None
+        distance_m = np.abs(make_outlines(self.tracks).distance_m(position_w))
+        sd_m = list_position_sd_m(self.tracks)
+        best = int(np.argmin(distance_m - np.minimum(sd_m, MAX_GATE_SD_M)))
+        if distance_m[best] < min(GATE_M + 2 * sd_m[best], MAX_GATE_M):
+            return self.tracks[best]
+        return None
 
-    def take_body(self, axis_w: Floats, radius_m: float, sd_m: float = 0.0) -> None:
-        """Carve by the body: where it is nothing else can be. axis_w: (n, 2) points along it, closer than a radius."""
-        near = [t for t in self.tracks if len(t.surface)]
+    def carve_body(self, axis_w: Floats, radius_m: float, sd_m: float = 0.0) -> None:
+        """Remove surfaces where the body is, because nothing else can be there.
+
+        Args:
+            axis_w: (n, 2) points along the body, closer together than its radius.
+            radius_m: of the body.
+            sd_m: standard deviation of the body's position relative to the map.
+        """
+        near = [track for track in self.tracks if len(track.surface)]
         if not near:
             return
-        outlines = outlines_of(near)
-        gaps = outlines.distance_m(axis_w)  # (n, tracks)
-        allowed = radius_m - SUNK_M - 2 * sd_m
-        across = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # to the left of the body
-        across = across / np.maximum(np.hypot(*across.T), 1e-9)[:, None]
+        gaps_m = make_outlines(near).distance_m(axis_w)  # (n, tracks)
+        allowed_m = radius_m - SUNK_M - 2 * sd_m
+        left = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # (n, 2)
+        left = left / np.maximum(np.hypot(left[:, 0], left[:, 1]), 1e-9)[:, None]
         changed: list[Track] = []
-        for k in np.flatnonzero(gaps.min(axis=0) < allowed):
-            track, cells = near[k], len(near[k].surface)
-            offset = track.surface.points_w[:, None] - axis_w
-            apart = np.hypot(offset[..., 0], offset[..., 1])
-            nearest = apart.argmin(axis=1)
-            left = (offset[np.arange(cells), nearest] * across[nearest]).sum(axis=1) > 0
-            track.surface.keep(apart.min(axis=1) > allowed)
-            if len(track.surface) < cells or 0.2 < np.mean(left) < 0.8:  # it goes right through
-                track.believe(MISS)
-            else:
-                sunk = np.flatnonzero(gaps[:, k] < allowed)
-                towards = across[sunk] if left[0] else -across[sunk]  # to its surface, which is at the body's skin
-                track.surface.add(axis_w[sunk] + radius_m * towards, np.full(len(sunk), SKIN_SD_M), -towards)
-            changed.append(track)
-        self._drop()
-        fit([track for track in changed if len(track.surface)])
+        for index in np.flatnonzero(gaps_m.min(axis=0) < allowed_m):
+            is_sunk = gaps_m[:, index] < allowed_m
+            _carve_track(near[index], axis_w, left, is_sunk, radius_m, allowed_m)
+            changed.append(near[index])
+        self._drop_disproved()
+        fit_shapes([track for track in changed if len(track.surface)])
 
     def forget(self, axis_w: Floats) -> None:
-        """Forget what is far from the body, and the least believed when there is too much."""
-        kept = [t for t in self.tracks if np.hypot(*(axis_w - t.center_w).T).min() < KEPT_M + _length_m(t)]
-        kept.sort(key=lambda t: -t.log_odds)
-        self.tracks = sorted(kept[:MAX_TRACKS], key=lambda t: t.number)
+        """Forget obstacles far from the body's axis (n, 2), and the least believed ones if there are too many."""
+        kept = [track for track in self.tracks if _distance_m(track, axis_w) < KEPT_M + _size_m(track)]
+        kept.sort(key=lambda track: -track.log_odds)
+        self.tracks = sorted(kept[:MAX_TRACKS], key=lambda track: track.number)
 
-    def _owners(
+    def _divide_cluster(
         self, cluster: Indices, scan: Scan, near: Sequence[Track], outlines: Outlines, sd_m: float
-    ) -> list[tuple[Track, Indices]]:
-        """Which track gets which bins of a cluster, in order of azimuth; new tracks are made as needed."""
-        points = scan.points_w[cluster]
-        if not near:
-            return [(self._new(), cluster)] if len(cluster) >= min(MIN_POINTS, len(scan.range_m)) else []
-        off = np.abs(outlines.distance_m(points))
-        limiter = np.minimum(GATE_M + 2 * position_sd_m(near) + sd_m, WIDEST_GATE_M) + 2 * scan.sd_m[cluster][:, None]
-        nearest = off.argmin(axis=1)
-        fits = off[np.arange(len(cluster)), nearest] < limiter[np.arange(len(cluster)), nearest]
-        counts = Counter(nearest[fits].tolist())
-        owners = [k for k, n in counts.items() if n >= 0.2 * len(cluster) or n >= 4]
-        if not owners:
-            return [(self._new(), cluster)] if len(cluster) >= min(MIN_POINTS, len(scan.range_m)) else []
-        best = np.array(owners)[off[:, owners].argmin(axis=1)]
-        others = np.zeros(len(cluster), dtype=bool)
-        for k in owners:
-            track = near[k]
-            if track.shape == "cylinder" and track.position_sd_m < 0.01 and len(track.surface) > 6:
-                others |= (best == k) & (off[:, k] > limiter[:, k] + APART_M)
-        found = [(near[k], cluster[(best == k) & ~others]) for k in owners]
-        if np.count_nonzero(others) > MIN_POINTS:
-            found.append((self._new(), cluster[others]))
-        found = [(track, bins) for track, bins in found if len(bins)]
-        return sorted(found, key=lambda each: int(each[1][0]))
+    ) -> list[Claim]:
+        """Divide the bins of a cluster among tracks, in order of azimuth. New tracks are made as needed.
 
-    def _doubt(self, near: Sequence[Track], scan: Scan, hit: set[int]) -> None:
-        """Lower the belief in what was looked through."""
-        clear = scan.clear_m()
+        outlines: of the tracks that are near.
+        """
+        if not near:
+            return self._claim_for_new_track(cluster, scan)
+        distance_m = np.abs(outlines.distance_m(scan.points_w[cluster]))  # (points, tracks)
+        track_gate_m = np.minimum(GATE_M + 2 * list_position_sd_m(near) + sd_m, MAX_GATE_M)
+        gate_m = track_gate_m + 2 * scan.sd_m[cluster][:, None]  # (points, tracks)
+        rows = np.arange(len(cluster))
+        nearest = distance_m.argmin(axis=1)
+        is_within_gate = distance_m[rows, nearest] < gate_m[rows, nearest]
+        counts = Counter(nearest[is_within_gate].tolist())
+        owners = [
+            index
+            for index, count in counts.items()
+            if count >= MIN_OWNER_RATIO * len(cluster) or count >= MIN_OWNER_POINTS
+        ]
+        if not owners:
+            return self._claim_for_new_track(cluster, scan)
+
+        # Every point goes to the nearest owner, except for points well off a circle whose shape is sure.
+        owner = np.array(owners)[distance_m[:, owners].argmin(axis=1)]
+        is_apart = np.zeros(len(cluster), dtype=bool)
+        for index in owners:
+            if _is_well_known_circle(near[index]):
+                is_apart |= (owner == index) & (distance_m[:, index] > gate_m[:, index] + APART_M)
+        claims = [(near[index], cluster[(owner == index) & ~is_apart]) for index in owners]
+        if np.count_nonzero(is_apart) > MIN_CLUSTER_POINTS:
+            claims.append((self._start_seen_track(), cluster[is_apart]))
+        claims = [(track, bins) for track, bins in claims if len(bins)]
+        return sorted(claims, key=lambda claim: int(claim[1][0]))
+
+    def _claim_for_new_track(self, cluster: Indices, scan: Scan) -> list[Claim]:
+        """Return a new track for a whole cluster, or nothing for one that is too small. A lone beam is large enough."""
+        if len(cluster) < min(MIN_CLUSTER_POINTS, len(scan.range_m)):
+            return []
+        return [(self._start_seen_track(), cluster)]
+
+    def _add_points(self, track: Track, scan: Scan, bins: Indices) -> None:
+        """Add bins of a scan to a track."""
+        self._update_drift(track)
+        towards_sensor = scan.origin_w - scan.points_w[bins]
+        towards_sensor = towards_sensor / np.maximum(scan.range_m[bins], 1e-6)[:, None]
+        track.surface.add(scan.points_w[bins], scan.sd_m[bins], towards_sensor)
+        track.add_evidence(HIT_LOG_ODDS)
+        track.last_seen_ns = scan.timestamp_ns
+        track.top_m = max(track.top_m, float(np.nanmax(scan.top_m[bins])))
+
+    def _doubt_what_is_seen_through(self, near: Sequence[Track], scan: Scan, hit: set[int]) -> None:
+        """Lower the belief in surfaces that the scan sees through. hit: numbers of the tracks that it has seen."""
+        clear_m = scan.clear_m()
         for track in near:
             surface = track.surface
-            bins, ranges = scan.bins_of(surface.points_w)
-            inside = bins >= 0
-            limit = ranges + LOOKED_PAST_M + 3 * scan.sd_m[bins] + min(track.position_sd_m, 0.05)
-            through = inside & (clear[bins] > limit)
-            surface.doubts = np.where(through, surface.doubts + 1, surface.doubts)
+            bins, ranges_m = scan.find_bins(surface.points_w)
+            is_in_view = bins >= 0
+            margin_m = min(track.position_sd_m, MAX_TRACK_SD_M)
+            limit_m = ranges_m + SEEN_PAST_M + 3 * scan.sd_m[bins] + margin_m
+            is_seen_through = is_in_view & (clear_m[bins] > limit_m)
+            surface.doubts = np.where(is_seen_through, surface.doubts + 1, surface.doubts)
             surface.keep(surface.doubts < MAX_DOUBTS)
-            if track.number not in hit and np.count_nonzero(through) > 0.5 * max(np.count_nonzero(inside), 1):
-                track.believe(MISS)
+            visible = max(np.count_nonzero(is_in_view), 1)
+            if track.number not in hit and np.count_nonzero(is_seen_through) > SEEN_THROUGH_RATIO * visible:
+                track.add_evidence(MISS_LOG_ODDS)
 
-    def _merge(self, seen: Sequence[Track], together: Sequence[tuple[Track, Track]]) -> None:
-        """Merge duplicates: of two that overlap, or that one shape explains as well as two."""
-        pairs = [(a, b, False) for a, b in together]
-        if seen:
-            outlines = outlines_of(self.tracks)
-            for a in seen:
-                apart = np.hypot(*(outlines.center_w - a.center_w).T) - outlines.reach_m
-                for k in np.flatnonzero(apart < max(a.radius_m, float(a.half_m.max())) + GATE_M):
-                    b = self.tracks[k]
-                    if b is not a:
-                        inside = outlines_of([b]).distance_m(a.surface.points_w)[:, 0] < 0.01
-                        if np.count_nonzero(inside) > 0.4 * len(inside):
-                            pairs.append((a, b, True))
+    def _merge_duplicates(self, seen: Sequence[Track], adjacent: Sequence[tuple[Track, Track]]) -> None:
+        """Merge tracks that overlap, and adjacent tracks that one shape explains as well as two."""
+        candidates = [(a, b, False) for a, b in adjacent]
+        candidates += [(a, b, True) for a, b in self._find_overlaps(seen)]
         gone: set[int] = set()
-        for a, b, surely in pairs:
-            if a.number in gone or b.number in gone or a is b:
+        for a, b, overlaps in candidates:
+            if a is b or a.number in gone or b.number in gone:
                 continue
             old, new = (a, b) if a.number < b.number else (b, a)
-            both = Track(old.number, old.name)
-            self._refresh(old)
-            self._refresh(new)
-            both.surface.take(old.surface)
-            both.surface.take(new.surface)
-            if not len(both.surface):
-                continue
-            fit([both])
-            if not surely and both.cost > old.cost + new.cost:
-                continue
-            old.surface, old.cost = both.surface, math.inf
-            old.felt, old.top_m = old.felt or new.felt, max(old.top_m, new.top_m)
-            old.log_odds = max(old.log_odds, new.log_odds)
-            old.last_seen_ns = max(old.last_seen_ns, new.last_seen_ns)
-            fit([old])
-            gone.add(new.number)
-        self.tracks = [t for t in self.tracks if t.number not in gone]
+            if self._try_merge(old, new, overlaps=overlaps):
+                gone.add(new.number)
+        self.tracks = [track for track in self.tracks if track.number not in gone]
 
-    def _refresh(self, track: Track) -> None:
-        """Account for the drift since the track was last touched or seen."""
+    def _find_overlaps(self, seen: Sequence[Track]) -> list[tuple[Track, Track]]:
+        """Return pairs of a seen track and another one that covers a good part of its surface."""
+        if not seen:
+            return []
+        outlines = make_outlines(self.tracks)
+        pairs: list[tuple[Track, Track]] = []
+        for track in seen:
+            offset = outlines.center_w - track.center_w
+            apart_m = np.hypot(offset[:, 0], offset[:, 1]) - outlines.reach_m
+            size_m = max(track.radius_m, float(track.half_m.max()))
+            for index in np.flatnonzero(apart_m < size_m + GATE_M):
+                other = self.tracks[index]
+                if other is track:
+                    continue
+                is_covered = make_outlines([other]).distance_m(track.surface.points_w)[:, 0] < MERGE_OVERLAP_M
+                if np.count_nonzero(is_covered) > MERGE_RATIO * len(is_covered):
+                    pairs.append((track, other))
+        return pairs
+
+    def _try_merge(self, old: Track, new: Track, *, overlaps: bool) -> bool:
+        """Merge a newer track into an older one, unless two shapes explain them better. Returns whether it did."""
+        both = Track(old.number, old.name)
+        self._update_drift(old)
+        self._update_drift(new)
+        both.surface.add_surface(old.surface)
+        both.surface.add_surface(new.surface)
+        if not len(both.surface):
+            return False
+        fit_shapes([both])
+        if not overlaps and both.cost > old.cost + new.cost:
+            return False
+        old.surface = both.surface
+        old.cost = math.inf
+        old.felt = old.felt or new.felt
+        old.top_m = max(old.top_m, new.top_m)
+        old.log_odds = max(old.log_odds, new.log_odds)
+        old.last_seen_ns = max(old.last_seen_ns, new.last_seen_ns)
+        fit_shapes([old])
+        return True
+
+    def _update_drift(self, track: Track) -> None:
+        """Add the robot's drift since a track was last seen or touched to the uncertainty of its surface."""
         if self._drift_m2 > track.drift_m2 and len(track.surface):
             track.surface.drift(self._drift_m2 - track.drift_m2)
         track.drift_m2 = self._drift_m2
 
-    def _new(self, position_w: Floats | None = None, normal_w: Floats | None = None) -> Track:
-        self._count += 1
-        name = f"{'seen' if position_w is None else 'felt'}_{self._count}"
-        track = Track(self._count, name, born_m2=self.here_m2, drift_m2=self._drift_m2)
-        if position_w is not None and normal_w is not None:  # where the next touch of the same looks for it
-            track.center_w, track.position_sd_m = position_w - RADIUS_M * normal_w, RADIUS_SD_M
+    def _start_seen_track(self) -> Track:
+        return self._start_track("seen")
+
+    def _start_felt_track(self, position_w: Floats, normal_w: Floats) -> Track:
+        """Start a track at a touch, with its center one prior radius behind the point."""
+        track = self._start_track("felt")
+        track.center_w = position_w - RADIUS_M * normal_w
+        track.position_sd_m = RADIUS_SD_M
+        return track
+
+    def _start_track(self, sense: str) -> Track:
+        self._track_count += 1
+        name = f"{sense}_{self._track_count}"
+        track = Track(self._track_count, name, born_m2=self.here_m2, drift_m2=self._drift_m2)
         self.tracks.append(track)
         return track
 
-    def _drop(self) -> None:
-        self.tracks = [t for t in self.tracks if t.log_odds > GONE and len(t.surface)]
+    def _drop_disproved(self) -> None:
+        self.tracks = [track for track in self.tracks if track.log_odds > DROP_LOG_ODDS and len(track.surface)]
 
 
-def _length_m(track: Track) -> float:
+def _carve_track(
+    track: Track, axis_w: Floats, left: Floats, is_sunk: NDArray[np.bool_], radius_m: float, allowed_m: float
+) -> None:
+    """Remove the part of a track's surface that is in the body, or move the surface to the body's skin.
+
+    Args:
+        track: the track, which is changed.
+        axis_w: (n, 2) points along the body.
+        left: (n, 2) unit vectors to the left of the body.
+        is_sunk: (n,) where the track's outline is too deep in the body.
+        radius_m: of the body.
+        allowed_m: distance from the axis at which a surface may be.
+    """
+    surface = track.surface
+    cells = len(surface)
+    offset = surface.points_w[:, None] - axis_w
+    distance_m = np.hypot(offset[..., 0], offset[..., 1])  # (cells, n)
+    nearest = distance_m.argmin(axis=1)
+    is_left = (offset[np.arange(cells), nearest] * left[nearest]).sum(axis=1) > 0
+    surface.keep(distance_m.min(axis=1) > allowed_m)
+    goes_through = OTHER_SIDE_RATIO < np.mean(is_left) < ONE_SIDE_RATIO
+    if len(surface) < cells or goes_through:
+        track.add_evidence(MISS_LOG_ODDS)
+        return
+    sunk = np.flatnonzero(is_sunk)
+    towards_surface = left[sunk] if is_left[0] else -left[sunk]
+    skin_w = axis_w[sunk] + radius_m * towards_surface
+    surface.add(skin_w, np.full(len(sunk), SKIN_SD_M), -towards_surface)
+
+
+def _is_in_range(track: Track, scan: Scan) -> bool:
+    return math.hypot(*(track.center_w - scan.origin_w)) < MAX_RANGE_M + SCAN_MARGIN_M
+
+
+def _is_well_known_circle(track: Track) -> bool:
+    return track.shape == "cylinder" and track.position_sd_m < WELL_KNOWN_SD_M and len(track.surface) > WELL_KNOWN_CELLS
+
+
+def _distance_m(track: Track, axis_w: Floats) -> float:
+    """Return the distance from a track's center to the body's axis (n, 2)."""
+    offset = axis_w - track.center_w
+    return float(np.hypot(offset[:, 0], offset[:, 1]).min())
+
+
+def _size_m(track: Track) -> float:
     return track.radius_m if track.shape == "cylinder" else float(track.half_m.max())

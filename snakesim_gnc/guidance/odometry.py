@@ -1,17 +1,20 @@
-"""Dead reckoning: how the base moved between two joint states, from joints, contacts and gyros. Pure.
+"""Dead reckoning: estimates how the base moved between two joint states, from joints, contacts and gyroscopes. Pure.
 
-The joints give the change of shape; three unknowns are left, the base's step on the ground. What is known of it:
+The joints give the change of shape. Three unknowns are left: the step of the base on the ground, (forward, left, turn)
+in its level frame before the step. What is known of it:
 
-gyros      the turn of each link, less the joints' part of it
-contacts   a body that slides along an obstacle does not move along the normal (sd 5 mm/s)
-links      they slide along themselves rather than sideways, the less so the faster the joints turn
-all        without joint speed a snake does not move
+gyroscopes  the turn of each link, less the joints' part of it
+contacts    a body that slides along an obstacle does not move along the normal
+links       they slide along themselves rather than sideways, the less so the faster the joints turn
+stillness   without joint speed a snake does not move
 
-Weighted least squares gives the step and its covariance. Slip is not white: its errors last for seconds.
+Each of these is a row a of a linear equation a . step = value, with a standard deviation. Weighted least squares gives
+the step and its covariance. Slip is not white noise: its errors last for seconds.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,107 +22,146 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState
 
-ALONG_NORMAL_M_S = 0.005
-SIDEWAYS_M_S = 0.02  # at rest,
-SIDEWAYS_PER_RAD_S = 0.02  # and for each rad/s of the joints
-ANY_M_S, ANY_PER_RAD_S = 0.005, 1.0
-GYRO_RAD_S = 0.01
-TURN_RAD_S = 1.0  # without a gyro
-LASTING_S = 2.0
-LONGEST_S = 0.2  # between two joint states; a step over a longer gap is only uncertain
+# Standard deviations of speeds.
+ALONG_NORMAL_SD_M_S = 0.005  # of a body along the normal of a contact
+SIDEWAYS_SD_M_S = 0.02  # of a link at rest
+SIDEWAYS_SD_M_PER_RAD = 0.02  # in addition, for each rad/s of the joints
+STEP_SD_M_S = 0.005  # of the base at rest
+STEP_SD_M_PER_RAD = 1.0  # in addition, for each rad/s of the joints
+GYRO_SD_RAD_S = 0.01
+TURN_SD_RAD_S = 1.0  # without a gyroscope
+
+SLIP_S = 2.0  # time for which an error lasts
+MAX_STEP_S = 0.2  # between two joint states; a step over a longer gap is only uncertain
+GAP_SD = (0.3, 0.3, 1.0)  # standard deviations of such a step, in m/s and rad/s
+MIN_HORIZONTAL = 0.5  # part of a normal in the plane of the ground: with less, the body lies on the obstacle
 
 
 @dataclass(frozen=True)
-class Step:
-    """Of the base, in its level frame before the step: forward, left, turn."""
+class OdometryStep:
+    """A step of the base, in its level frame before the step."""
 
-    by: Floats  # (3,)
-    covariance: Floats  # (3, 3) to add to that of the pose
+    motion: Floats  # (3,) forward, left, turn
+    covariance: Floats  # (3, 3), to be added to that of the pose
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """The links at one time, in the level frame of the base; n is their number."""
+
+    timestamp_ns: int
+    origins: Floats  # (n, 3)
+    rotations: Floats  # (n, 3, 3)
+
+
+class _Equations(NamedTuple):
+    """Equations `rows @ step = values`."""
+
+    rows: Floats  # (m, 3)
+    values: Floats  # (m,)
+    sds: Floats  # (m,) standard deviations
 
 
 class Odometry:
-    """Steps from joint state to joint state."""
+    """Computes steps from joint state to joint state."""
 
     def __init__(self, robot: Description) -> None:
         self._axes = [joint.axis for joint in robot.joints]
         self._lengths = [link.length_m for link in robot.links]
         self._half_m = 0.5 * np.array(self._lengths)
-        self._before: tuple[int, Floats, Floats] | None = None  # stamp, origins, rotations in the level base frame
+        self._before: _Shape | None = None
 
-    def step(self, joints: JointState, tilt: Floats, contacts: Contacts | None, imu: Imu | None) -> Step | None:
-        """The step since the last call; None for the first, and when no time has passed.
+    def step(self, joints: JointState, tilt: Floats, contacts: Contacts | None, imu: Imu | None) -> OdometryStep | None:
+        """Return the step since the last call; None for the first call, and if no time has passed.
 
-        tilt: (3, 3) level_from_base. contacts, imu: only when they are fresh.
+        Args:
+            joints: the joint state after the step.
+            tilt: (3, 3) level_from_base.
+            contacts: only if they are recent.
+            imu: only if it is recent.
         """
         origins, rotations = link_frames(np.zeros(3), tilt, joints.angle_rad, self._axes, self._lengths)
-        before, self._before = self._before, (joints.timestamp_ns, origins, rotations)
-        if before is None or joints.timestamp_ns <= before[0]:
-            self._before = before or self._before
+        now = _Shape(joints.timestamp_ns, origins, rotations)
+        before = self._before
+        if before is None:
+            self._before = now
             return None
-        period_s = (joints.timestamp_ns - before[0]) * 1e-9
-        if period_s > LONGEST_S:
-            return Step(np.zeros(3), np.diag([0.3 * period_s, 0.3 * period_s, period_s]) ** 2)
-        turning = float(np.sqrt(np.mean(np.square(joints.velocity_rad_s))))
-        rows, values, spreads = self._sliding(
-            before[1] + self._half_m[:, None] * before[2][:, :, 0], origins, rotations
-        )
-        spreads = spreads * (SIDEWAYS_M_S + SIDEWAYS_PER_RAD_S * turning)
+        if now.timestamp_ns <= before.timestamp_ns:
+            return None
+        self._before = now
+        period_s = (now.timestamp_ns - before.timestamp_ns) * 1e-9
+        if period_s > MAX_STEP_S:
+            return OdometryStep(np.zeros(3), np.diag([sd * period_s for sd in GAP_SD]) ** 2)
+
+        joint_rad_s = float(np.sqrt(np.mean(np.square(joints.velocity_rad_s))))
+        equations = self._sliding_equations(before, now, joint_rad_s)
         if contacts is not None:
-            add = self._touching(before, origins, rotations, contacts.contacts)
-            rows, values, spreads = (np.concatenate(both) for both in zip((rows, values, spreads), add, strict=True))
-        spreads = spreads * period_s
-        rows = np.vstack([rows, np.eye(3)])
-        turn_rad, turn_sd = self._turn(before[2], rotations, imu, period_s)
-        still = (ANY_M_S + ANY_PER_RAD_S * turning) * period_s
-        values = np.concatenate([values, [0.0, 0.0, turn_rad]])
-        spreads = np.concatenate([spreads, [still, still, turn_sd]])
-        information = rows.T @ (rows / np.square(spreads)[:, None])
-        known = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        by: Floats = known @ (rows.T @ (values / np.square(spreads)))
-        covariance: Floats = known * (LASTING_S / period_s)
-        if imu is not None:  # whose noise is white
-            covariance[2, :] = covariance[:, 2] = [0.0, 0.0, turn_sd**2]
-        return Step(by, covariance)
+            at_contacts = _contact_equations(before, now, contacts.contacts)
+            equations = _Equations(*(np.concatenate(both) for both in zip(equations, at_contacts, strict=True)))
+        turn_rad, turn_sd_rad = _measure_turn(before, now, imu, period_s)
+        still_sd_m = (STEP_SD_M_S + STEP_SD_M_PER_RAD * joint_rad_s) * period_s
+        rows = np.vstack([equations.rows, np.eye(3)])
+        values = np.concatenate([equations.values, [0.0, 0.0, turn_rad]])
+        sds = np.concatenate([equations.sds * period_s, [still_sd_m, still_sd_m, turn_sd_rad]])
 
-    def _sliding(self, were: Floats, origins: Floats, rotations: Floats) -> tuple[Floats, ...]:
-        """No link's middle moves sideways: rows (n, 3), values (n,), and shares of a speed's sd (n,)."""
-        middles = origins + self._half_m[:, None] * rotations[:, :, 0]
-        sideways = rotations[:, :2, 1]
-        sideways = sideways / np.maximum(np.hypot(*sideways.T), 1e-6)[:, None]
-        moved = (middles - were)[:, :2]  # by the joints alone
-        return _rows(sideways, middles[:, :2]), -np.einsum("ij,ij->i", sideways, moved), np.ones(len(moved))
+        information = rows.T @ (rows / np.square(sds)[:, None])
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        motion: Floats = covariance @ (rows.T @ (values / np.square(sds)))
+        lasting: Floats = covariance * (SLIP_S / period_s)
+        if imu is not None:
+            # The noise of gyroscopes is white, so the error of the turn does not last.
+            lasting[2, :] = lasting[:, 2] = [0.0, 0.0, turn_sd_rad**2]
+        return OdometryStep(motion, lasting)
 
-    def _touching(
-        self, before: tuple[int, Floats, Floats], origins: Floats, rotations: Floats, contacts: Sequence[Contact]
-    ) -> tuple[Floats, ...]:
-        rows, values = [np.empty((0, 3))], []
-        for contact in contacts:
-            k = contact.link
-            point, normal = np.array(contact.position_l), np.array(contact.normal_l)
-            flat = (rotations[k] @ normal)[:2]
-            length = float(np.hypot(*flat))
-            if length < 0.5:
-                continue  # lies on it
-            flat = flat / length
-            now = (origins[k] + rotations[k] @ point)[:2]
-            then = (before[1][k] + before[2][k] @ point)[:2]
-            rows.append(_rows(flat[None], now[None]))
-            values.append(-float(flat @ (now - then)))
-        return np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_M_S)
-
-    def _turn(self, was: Floats, rotations: Floats, imu: Imu | None, period_s: float) -> tuple[float, float]:
-        """Turn of the base by the gyros, and its sd."""
-        if imu is None or not imu.link:
-            return 0.0, TURN_RAD_S * period_s
-        turns: list[float] = []
-        for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True):
-            relative = rotations[link] @ was[link].T
-            own = float(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
-            turns.append(float((rotations[link] @ np.array(rate))[2]) * period_s - own)
-        return float(np.mean(turns)), GYRO_RAD_S * period_s
+    def _sliding_equations(self, before: _Shape, now: _Shape, joint_rad_s: float) -> _Equations:
+        """Return equations that no link's middle moves sideways; the standard deviations are speeds."""
+        middles_before = before.origins + self._half_m[:, None] * before.rotations[:, :, 0]
+        middles = now.origins + self._half_m[:, None] * now.rotations[:, :, 0]
+        moved = (middles - middles_before)[:, :2]  # by the joints alone
+        left = now.rotations[:, :2, 1]
+        left = left / np.maximum(np.hypot(left[:, 0], left[:, 1]), 1e-6)[:, None]
+        sd_m_s = SIDEWAYS_SD_M_S + SIDEWAYS_SD_M_PER_RAD * joint_rad_s
+        return _Equations(
+            rows=_step_rows(left, middles[:, :2]),
+            values=-np.einsum("ij,ij->i", left, moved),
+            sds=np.ones(len(moved)) * sd_m_s,
+        )
 
 
-def _rows(direction: Floats, points: Floats) -> Floats:
-    """How a step (x, y, turn) moves points (n, 2) along directions (n, 2)."""
+def _contact_equations(before: _Shape, now: _Shape, contacts: Sequence[Contact]) -> _Equations:
+    """Return equations that no contact moves along its normal; the standard deviations are speeds."""
+    rows = [np.empty((0, 3))]
+    values: list[float] = []
+    for contact in contacts:
+        link = contact.link
+        position_l = np.array(contact.position_l)
+        normal = (now.rotations[link] @ np.array(contact.normal_l))[:2]
+        length = float(np.hypot(normal[0], normal[1]))
+        if length < MIN_HORIZONTAL:
+            continue
+        normal = normal / length
+        position = (now.origins[link] + now.rotations[link] @ position_l)[:2]
+        position_before = (before.origins[link] + before.rotations[link] @ position_l)[:2]
+        rows.append(_step_rows(normal[None], position[None]))
+        values.append(-float(normal @ (position - position_before)))
+    return _Equations(np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_SD_M_S))
+
+
+def _measure_turn(before: _Shape, now: _Shape, imu: Imu | None, period_s: float) -> tuple[float, float]:
+    """Return the turn of the base by the gyroscopes, and its standard deviation, in rad."""
+    if imu is None or not imu.link:
+        return 0.0, TURN_SD_RAD_S * period_s
+    turns_rad: list[float] = []
+    for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True):
+        rotation = now.rotations[link]
+        relative = rotation @ before.rotations[link].T
+        by_joints_rad = float(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
+        turn_rad = float((rotation @ np.array(rate))[2]) * period_s
+        turns_rad.append(turn_rad - by_joints_rad)
+    return float(np.mean(turns_rad)), GYRO_SD_RAD_S * period_s
+
+
+def _step_rows(direction: Floats, points: Floats) -> Floats:
+    """Return rows (n, 3): how a step (forward, left, turn) moves points (n, 2) along directions (n, 2)."""
     turning = direction[:, 1] * points[:, 0] - direction[:, 0] * points[:, 1]
     return np.column_stack([direction, turning])

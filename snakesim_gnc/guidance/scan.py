@@ -1,6 +1,7 @@
-"""A scan: what a ranging sensor saw of upright surfaces, from above, by azimuth. All ranging sensors become one.
+"""A scan: what a ranging sensor saw of upright surfaces, from above, by azimuth.
 
-A depth image becomes a scan in `depth_scan.py`; the beams of a range finder or a lidar do here.
+The measurements of all ranging sensors become scans: a depth image in `depth_scan.py`, the beams of a range finder or a
+lidar here.
 """
 
 import math
@@ -13,93 +14,114 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Ranges
 
 BAND_M = (0.02, 0.12)  # height above the ground of what a snake's body can touch
-MAX_RANGE_M = 4.0  # farther surfaces are too coarse to be worth mapping
+MAX_RANGE_M = 4.0  # farther surfaces are too coarse to be mapped
+UNKNOWN_STEP_RAD = 1e-3  # of a range finder with one beam
 
-
-Look = DepthImage | Ranges  # what the map is made of
+Look = DepthImage | Ranges  # the messages that the map is made of
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviation of one range: `floor_m` + `per_m2` x range², as of stereo and structured light."""
+    """Standard deviation of a range: `floor_m` + `per_m2` range², as of stereo and structured light."""
 
     floor_m: float = 0.002
     per_m2: float = 0.003
 
-    def at(self, range_m: Floats) -> Floats:
-        """At a range, in m."""
+    def sd_m(self, range_m: Floats) -> Floats:
+        """Return the standard deviations at ranges, in m."""
         return self.floor_m + self.per_m2 * range_m * range_m
 
 
 @dataclass(frozen=True)
 class Scan:
-    """One look, in `len(range_m)` bins of equal width in azimuth, counter-clockwise from `azimuth_w`."""
+    """One measurement in n bins of equal width in azimuth, counter-clockwise from `azimuth_w`."""
 
     timestamp_ns: int
-    origin_w: Floats  # (2,) of the sensor, on the ground
-    azimuth_w: float  # of the first bin's right edge
-    step_rad: float
-    range_m: Floats  # (n,) of the nearest upright surface; NaN: none was seen
+    # The sensor.
+    origin_w: Floats  # (2,) its position on the ground
+    azimuth_w: float  # of the right edge of the first bin
+    step_rad: float  # width of a bin
+    # The nearest upright surface in each bin.
+    range_m: Floats  # (n,) NaN: none was seen
     points_w: Floats  # (n, 2) on that surface; NaN: none
     sd_m: Floats  # (n,) of each point, along the ray
-    free_m: Floats  # (n,) up to here nothing stands; 0: unknown
     top_m: Floats  # (n,) highest point seen on the surface, above the ground; NaN: none
+    # Free space.
+    free_m: Floats  # (n,) up to here nothing stands; 0: unknown
 
-    def bins_of(self, points_w: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """Bin and range of points (..., 2); bin -1 is outside the view."""
+    def find_bins(self, points_w: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """Return the bin and the range of points (..., 2); the bin is -1 outside the view."""
         offset = points_w - self.origin_w
         azimuth = np.arctan2(offset[..., 1], offset[..., 0]) - self.azimuth_w
-        found = np.floor(np.mod(azimuth, 2 * math.pi) / self.step_rad).astype(np.intp)
-        return np.where(found < len(self.range_m), found, -1), np.hypot(offset[..., 0], offset[..., 1])
+        bins = np.floor(np.mod(azimuth, 2 * math.pi) / self.step_rad).astype(np.intp)
+        ranges_m = np.hypot(offset[..., 0], offset[..., 1])
+        return np.where(bins < len(self.range_m), bins, -1), ranges_m
 
     def clear_m(self) -> Floats:
-        """How far one can see in each bin and both its neighbors: what is nearer is not there, (n,)."""
-        seen = np.where(np.isnan(self.range_m), self.free_m, self.range_m)
-        padded = np.pad(seen, 1, mode="edge")
-        return np.minimum(np.minimum(padded[:-2], padded[2:]), seen)
+        """Return the distance, (n,), up to which the sensor saw nothing in a bin and both its neighbors."""
+        seen_m = np.where(np.isnan(self.range_m), self.free_m, self.range_m)
+        padded_m = np.pad(seen_m, 1, mode="edge")
+        neighbors_m = np.minimum(padded_m[:-2], padded_m[2:])
+        return np.minimum(neighbors_m, seen_m)
 
-    def without(self, hidden: NDArray[np.bool_]) -> "Scan":
-        """The scan in which the hits of some bins (n,) count for nothing, such as those on the own body."""
-        gone = np.where(hidden, np.nan, self.range_m)
-        points = np.where(hidden[:, None], np.nan, self.points_w)
-        free = np.where(hidden, 0.0, self.free_m)
-        return replace(self, range_m=gone, points_w=points, free_m=free)
+    def without(self, is_hidden: NDArray[np.bool_]) -> "Scan":
+        """Return the scan without the points and free space of some bins (n,), such as those on the own body."""
+        return replace(
+            self,
+            range_m=np.where(is_hidden, np.nan, self.range_m),
+            points_w=np.where(is_hidden[:, None], np.nan, self.points_w),
+            free_m=np.where(is_hidden, 0.0, self.free_m),
+        )
 
     def moved(self, from_w: Floats, to_w: Floats) -> "Scan":
-        """The scan as it is when its base was not at `from_w` but at `to_w`, both (3,): x, y, heading."""
-        turn = to_w[2] - from_w[2]
-        c, s = math.cos(turn), math.sin(turn)
-        rotation = np.array([[c, -s], [s, c]])
-        origin = to_w[:2] + rotation @ (self.origin_w - from_w[:2])
-        points = to_w[:2] + (self.points_w - from_w[:2]) @ rotation.T
-        return replace(self, origin_w=origin, points_w=points, azimuth_w=self.azimuth_w + turn)
+        """Return the scan as it is if its base was not at `from_w` but at `to_w`, both (3,): x, y, heading."""
+        turn_rad = to_w[2] - from_w[2]
+        cosine = math.cos(turn_rad)
+        sine = math.sin(turn_rad)
+        rotation = np.array([[cosine, -sine], [sine, cosine]])
+        return replace(
+            self,
+            origin_w=to_w[:2] + rotation @ (self.origin_w - from_w[:2]),
+            points_w=to_w[:2] + (self.points_w - from_w[:2]) @ rotation.T,
+            azimuth_w=self.azimuth_w + turn_rad,
+        )
 
 
-def scan_of_ranges(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: float, noise: Noise) -> Scan:
-    """The scan of a range finder or lidar.
+def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: float, noise: Noise) -> Scan:
+    """Return the scan of a range finder or lidar.
 
-    position_w: (3,) of the sensor; rotation: (3, 3) world_from_sensor. Beams that end on the ground or above the body's
-    band tell only what is free.
+    Beams that end on the ground or above the body's band show only free space.
+
+    Args:
+        ranges: the message.
+        position_w: (3,) of the sensor.
+        rotation: (3, 3) world_from_sensor.
+        ground_z_m: height of the ground in the world.
+        noise: of the ranges.
     """
-    measured = np.array([np.nan if r is None else r for r in ranges.range_m], dtype=np.float64)
-    count, step = len(measured), ranges.angle_step_rad or 1e-3
-    angle = ranges.angle_min_rad + step * np.arange(count)
-    beams = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1) @ rotation.T
-    beams = beams if step > 0 else beams[::-1]
-    measured = measured if step > 0 else measured[::-1]
-    height = position_w[2] - ground_z_m + measured * beams[:, 2]
-    flat = measured * np.hypot(beams[:, 0], beams[:, 1])
-    near = (flat <= MAX_RANGE_M) & (measured < ranges.range_max_m)
-    hit = near & (height > BAND_M[0]) & (height < BAND_M[1])
-    points = position_w[:2] + measured[:, None] * beams[:, :2]
+    measured_m = np.array([np.nan if r is None else r for r in ranges.range_m], dtype=np.float64)
+    count = len(measured_m)
+    step_rad = ranges.angle_step_rad or UNKNOWN_STEP_RAD
+    angles_rad = ranges.angle_min_rad + step_rad * np.arange(count)
+    beams_l = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(count)], axis=1)
+    beams = beams_l @ rotation.T
+    if step_rad <= 0:
+        # The bins of a scan are counter-clockwise.
+        beams = beams[::-1]
+        measured_m = measured_m[::-1]
+    height_m = position_w[2] - ground_z_m + measured_m * beams[:, 2]
+    range_m = measured_m * np.hypot(beams[:, 0], beams[:, 1])  # on the ground
+    is_near = (range_m <= MAX_RANGE_M) & (measured_m < ranges.range_max_m)
+    is_hit = is_near & (height_m > BAND_M[0]) & (height_m < BAND_M[1])
+    points_w = position_w[:2] + measured_m[:, None] * beams[:, :2]
     return Scan(
         timestamp_ns=ranges.timestamp_ns,
         origin_w=position_w[:2],
-        azimuth_w=math.atan2(beams[0, 1], beams[0, 0]) - 0.5 * abs(step),
-        step_rad=abs(step),
-        range_m=np.where(hit, flat, np.nan),
-        points_w=np.where(hit[:, None], points, np.nan),
-        sd_m=noise.at(np.nan_to_num(flat)),
-        free_m=np.where(np.isnan(flat), 0.0, np.minimum(flat, MAX_RANGE_M)),
-        top_m=np.where(hit, height, np.nan),
+        azimuth_w=math.atan2(beams[0, 1], beams[0, 0]) - 0.5 * abs(step_rad),
+        step_rad=abs(step_rad),
+        range_m=np.where(is_hit, range_m, np.nan),
+        points_w=np.where(is_hit[:, None], points_w, np.nan),
+        sd_m=noise.sd_m(np.nan_to_num(range_m)),
+        top_m=np.where(is_hit, height_m, np.nan),
+        free_m=np.where(np.isnan(range_m), 0.0, np.minimum(range_m, MAX_RANGE_M)),
     )

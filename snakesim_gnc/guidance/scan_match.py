@@ -1,68 +1,131 @@
-"""Scan matching: the pose of the base at which a scan fits the map, to correct dead reckoning. Pure.
-
-Gauss-Newton on the distances of the scan's points from the outlines of well known obstacles. The same points refine the
-map afterwards, so their information is counted at a share only.
-"""
+"""Scan matching: estimates the pose of the base at which a scan fits the map, to correct dead reckoning. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.scan import Scan
-from snakesim_gnc.guidance.tracks import Track, outlines_of, position_sd_m
+from snakesim_gnc.guidance.tracks import Track, list_position_sd_m, make_outlines
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.outlines import Outlines
 
-GATE_M = 0.05
+# Obstacles that the scan is matched to.
+MIN_LOG_ODDS = 1.0  # seen a few times
+MAX_MAP_SD_M = 0.02  # obstacles known less precisely do not help to localize
+
+# Points that count.
+GATE_M = 0.05  # distance from an outline; also the largest plausible correction
 MIN_POINTS = 8
-MIN_BELIEF = 1.0  # log odds: seen a few times
-SHARE = 0.1  # of the points' information
-STEPS = 4
-PROBE_M = 0.001
+SENSOR_FLOOR_SD_M = 0.003  # range noise that the sensor model leaves out
+HUBER_SD = 2.0  # standard deviations from which on a point counts less
+
+# The iteration.
+ITERATIONS = 4
+PROBE_M = 0.001  # step of the numerical derivative
+DAMPING = np.diag([1.0, 1.0, 0.1])
+MAX_ROTATION_RAD = 0.1  # a larger correction means that the scan was matched to the wrong obstacles
+INFORMATION_RATIO = 0.1  # of the points' information that counts: the same points refine the map afterwards
 
 
 @dataclass(frozen=True)
 class PoseMeasurement:
-    """A measurement of the base's pose at the scan's stamp."""
+    """A measurement of the base's pose at the scan's timestamp."""
 
     planar_w: Floats  # (3,) x, y, heading
-    covariance: Floats  # (3, 3) against the map
-    map_m2: float  # variance of the map's own place in the world
+    covariance: Floats  # (3, 3) relative to the map
+    map_m2: float  # variance of the map's own position in the world
 
 
-def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> PoseMeasurement | None:
-    """base_w: (3,) the base as it was thought to be at the scan's stamp; None when too little of the scan is known."""
-    known = [t for t in tracks if t.log_odds >= MIN_BELIEF and t.position_sd_m < 0.02 and t.size_sd_m < 0.02]
+@dataclass(frozen=True)
+class _Residuals:
+    """Distances of the scan's points from the outlines, at one correction; m is the number of points."""
+
+    nearest: NDArray[np.intp]  # (m,) index of the nearest outline
+    weight: Floats  # (m,) in 1 / m²; 0 for outliers
+    information: Floats  # (3, 3) J^T W J
+    gradient: Floats  # (3,) J^T W e
+    inliers: int
+
+
+def match_scan(scan: Scan, tracks: Sequence[Track], predicted_w: Floats) -> PoseMeasurement | None:
+    """Estimate the base pose by aligning a range scan with known obstacles.
+
+    Gauss-Newton with Huber weights on the distance from each scan point to the nearest obstacle outline (iterative
+    closest point with point-to-outline residuals).
+
+    Args:
+        scan: its points are in the world, computed with the predicted pose.
+        tracks: obstacles of the map; uncertain and imprecise ones are ignored.
+        predicted_w: (3,) x, y and heading of the base at the scan's timestamp.
+
+    Returns:
+        The corrected pose, or None if too few points match or the correction is implausibly large.
+    """
+    landmarks = [track for track in tracks if _is_landmark(track)]
     hits = np.flatnonzero(np.isfinite(scan.range_m))
-    if not known or len(hits) < MIN_POINTS:
+    if not landmarks or len(hits) < MIN_POINTS:
         return None
-    outlines, sd = outlines_of(known), position_sd_m(known)
-    arm = scan.points_w[hits] - base_w[:2]
-    by = np.zeros(3)
-    information, weight, nearest = np.zeros((3, 3)), np.zeros(len(hits)), np.zeros(len(hits), dtype=np.intp)
-    for _ in range(STEPS):
-        c, s = np.cos(by[2]), np.sin(by[2])
-        turned = arm @ np.array([[c, s], [-s, c]])
-        points = base_w[:2] + by[:2] + turned
-        distances = outlines.distance_m(points)
-        nearest = np.abs(distances).argmin(axis=1)
-        rows = np.arange(len(hits))
-        off = distances[rows, nearest]
-        slope = np.stack(
-            [(outlines.distance_m(points + PROBE_M * axis)[rows, nearest] - off) / PROBE_M for axis in np.eye(2)],
-            axis=1,
-        )
-        spread = np.hypot(np.hypot(scan.sd_m[hits], sd[nearest]), 0.003)
-        ours = np.abs(off) < GATE_M
-        if np.count_nonzero(ours) < MIN_POINTS:
+    outlines = make_outlines(landmarks)
+    landmark_sd_m = list_position_sd_m(landmarks)
+    arms = scan.points_w[hits] - predicted_w[:2]
+    correction = np.zeros(3)
+    residuals: _Residuals | None = None
+    for _ in range(ITERATIONS):
+        residuals = _compute_residuals(arms, scan.sd_m[hits], outlines, landmark_sd_m, predicted_w, correction)
+        if residuals.inliers < MIN_POINTS:
             return None
-        weight = ours / spread**2 * np.minimum(1.0, 2.0 * spread / np.maximum(np.abs(off), 1e-9))
-        jacobian = np.column_stack([slope, slope[:, 1] * turned[:, 0] - slope[:, 0] * turned[:, 1]])
-        information = jacobian.T @ (jacobian * weight[:, None])
-        damping = np.diag([1.0, 1.0, 0.1])
-        by = by - np.linalg.solve(information + damping, jacobian.T @ (weight * off))
-    if np.hypot(by[0], by[1]) > GATE_M or abs(by[2]) > 0.1:
+        correction = correction - np.linalg.solve(residuals.information + DAMPING, residuals.gradient)
+    if residuals is None or not _is_plausible(correction):
         return None
-    covariance = np.asarray(np.linalg.inv(SHARE * information + np.eye(3)), dtype=np.float64)
-    map_m2 = float(np.average([known[k].born_m2 for k in nearest], weights=weight))
-    return PoseMeasurement(base_w + by, covariance, map_m2)
+    information = INFORMATION_RATIO * residuals.information + np.eye(3)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    map_m2 = float(np.average([landmarks[k].born_m2 for k in residuals.nearest], weights=residuals.weight))
+    return PoseMeasurement(predicted_w + correction, covariance, map_m2)
+
+
+def _compute_residuals(
+    arms: Floats, sd_m: Floats, outlines: Outlines, landmark_sd_m: Floats, predicted_w: Floats, correction: Floats
+) -> _Residuals:
+    """Compute distances e and their derivatives J after a correction (x, y, heading) of the predicted pose.
+
+    arms: (m, 2) points from the predicted base; sd_m: (m,) of the points; landmark_sd_m: of each outline.
+    """
+    cosine = np.cos(correction[2])
+    sine = np.sin(correction[2])
+    turned = arms @ np.array([[cosine, sine], [-sine, cosine]])
+    points_w = predicted_w[:2] + correction[:2] + turned
+    rows = np.arange(len(arms))
+    all_distances_m = outlines.distance_m(points_w)  # (m, outlines)
+    nearest = np.abs(all_distances_m).argmin(axis=1)
+    distance_m = all_distances_m[rows, nearest]
+
+    slopes: list[Floats] = []  # of the distance along x and y
+    for axis in np.eye(2):
+        moved_m = outlines.distance_m(points_w + PROBE_M * axis)[rows, nearest]
+        slopes.append((moved_m - distance_m) / PROBE_M)
+    slope = np.stack(slopes, axis=1)
+    jacobian = np.column_stack([slope, slope[:, 1] * turned[:, 0] - slope[:, 0] * turned[:, 1]])
+
+    spread_m = np.hypot(np.hypot(sd_m, landmark_sd_m[nearest]), SENSOR_FLOOR_SD_M)
+    is_inlier = np.abs(distance_m) < GATE_M
+    huber = np.minimum(1.0, HUBER_SD * spread_m / np.maximum(np.abs(distance_m), 1e-9))
+    weight = is_inlier / spread_m**2 * huber
+    return _Residuals(
+        nearest=nearest,
+        weight=weight,
+        information=jacobian.T @ (jacobian * weight[:, None]),
+        gradient=jacobian.T @ (weight * distance_m),
+        inliers=int(np.count_nonzero(is_inlier)),
+    )
+
+
+def _is_landmark(track: Track) -> bool:
+    return track.log_odds >= MIN_LOG_ODDS and track.position_sd_m < MAX_MAP_SD_M and track.size_sd_m < MAX_MAP_SD_M
+
+
+def _is_plausible(correction: Floats) -> bool:
+    is_too_far = np.hypot(correction[0], correction[1]) > GATE_M
+    is_turned_too_far = abs(correction[2]) > MAX_ROTATION_RAD
+    return not (is_too_far or is_turned_too_far)

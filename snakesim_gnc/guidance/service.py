@@ -1,13 +1,18 @@
-"""The guidance process: sensors in, `guidance/world` out."""
+"""The guidance process: reads the sensors, and publishes `guidance/world`."""
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any, Protocol, get_args
 
 import numpy as np
 
 from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.core import WorldModel
-from snakesim_gnc.guidance.estimated_contacts import ContactEstimator, with_estimated
+from snakesim_gnc.guidance.estimated_contacts import (
+    ContactEstimator,
+    EstimatedContacts,
+    can_estimate_contacts,
+    mark_estimated,
+)
 from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.reckoned_pose import ReckonedPose
@@ -30,131 +35,179 @@ from snakesim_hal.wire.messages import (
     World,
 )
 
-MIN_NOISE_M = 0.001
+MIN_NOISE_M = 0.001  # of a ranging sensor; one without noise in the robot's file is not trusted without limit
 
 
 class Guidance(Service):
-    """Sensors to world model."""
+    """Makes world models from sensor samples.
+
+    With `map = "known"` the obstacles of the scene are known as from a survey. Otherwise guidance does not use them.
+    """
 
     name = "guidance"
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """With `map = "known"` the scene's obstacles are known as from a survey; else they are never looked at."""
-        perceived = config.mission.map == "perceived"
-        self._view = _Perceived(client, config) if perceived else _Surveyed(client, config)
+        """Subscribe to the sensors of the robot."""
+        self._source: _WorldSource
+        if config.mission.map == "perceived":
+            self._source = _PerceivedSource(client, config)
+        else:
+            self._source = _SurveyedSource(client, config)
 
     def configure(self, robot: Description) -> None:
         """Create the model for this robot."""
-        self._view.configure(robot)
+        self._source.configure(robot)
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """The world at this tick; None while it is unknown."""
-        world = self._view.world(clock)
-        return None if world is None else [(keys.WORLD, world)]
+        """Return the world model at this tick; None while it is unknown."""
+        world = self._source.make_world(clock)
+        if world is None:
+            return None
+        return [(keys.WORLD, world)]
 
 
-class _Surveyed:
-    """The map is the scene's; the pose that of the sensor, or reckoned; contacts those of the sensor, or estimated."""
+class _WorldSource(Protocol):
+    """Makes world models in one of the ways."""
+
+    def configure(self, robot: Description) -> None:
+        """Create the model for this robot."""
+        ...
+
+    def make_world(self, clock: Clock) -> World | None:
+        """Return the world model at this tick, from the newest samples; None while it is unknown."""
+        ...
+
+
+class _SurveyedSource:
+    """Uses the scene's map. Dead reckoning replaces a missing pose sensor, an estimate missing contact sensors."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
         sensors = config.robot.sensors
+        self._client = client
+        self._config = config
         self._known: Sequence[Obstacle] = surveyed(config)
+
+        # Subscriptions.
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts) if sensors.contacts else None
         self._pose = client.subscribe(keys.POSE, Pose)
         self._imu = client.subscribe(keys.IMU, Imu) if sensors.imu else None
-        self._client, self._config = client, config
+
+        # Models of the robot.
         self._model: WorldModel | None = None
-        self._reckoned: ReckonedPose | None = None
-        self._estimator: ContactEstimator | None = None
+        self._reckoned: ReckonedPose | None = None  # for a robot without a pose sensor
+        self._estimator: ContactEstimator | None = None  # for a robot without contact sensors
 
     def configure(self, robot: Description) -> None:
         self._model = WorldModel(robot, self._known)
-        reckons = self._config.dead_reckons(robot)
-        self._reckoned = ReckonedPose(robot, _start(self._config), self._known) if reckons else None
-        sensed = any(sensor.key == keys.CONTACTS for sensor in robot.sensors)
-        self._estimator = None if sensed else ContactEstimator.of(robot)
-        if self._reckoned is not None:
-            print_stderr("nobody measures the pose: it is reckoned from the start, by joints, contacts and the map")
-        if self._estimator is not None:
-            print_stderr("no sensor tells contacts: they are estimated from the torques of the joints")
+        self._reckoned = None
+        if self._config.dead_reckons(robot):
+            self._reckoned = ReckonedPose(robot, _start_pose(self._config), self._known)
+            print_stderr("no pose sensor: the pose is reckoned from the start, by joints, contacts and the map")
+        self._estimator = None
+        has_contact_sensor = any(sensor.key == keys.CONTACTS for sensor in robot.sensors)
+        if not has_contact_sensor and can_estimate_contacts(robot):
+            self._estimator = ContactEstimator(robot)
+            print_stderr("no contact sensors: contacts are estimated from the torques of the joints")
 
-    def world(self, clock: Clock) -> World | None:
+    def make_world(self, clock: Clock) -> World | None:
         read = self._client.read
         joints = read(self._joints)
-        pose = read(self._pose) if self._reckoned is None else None
-        if self._model is None or joints is None or (self._reckoned is None and pose is None):
+        pose = None
+        if self._reckoned is None:
+            pose = read(self._pose)
+            if pose is None:
+                return None
+        if self._model is None or joints is None:
             return None
-        contacts, estimated = read(self._contacts) if self._contacts else None, None
-        if contacts is None and self._estimator is not None:
-            imu = read(self._imu) if self._imu and self._reckoned is None else None
-            estimated = self._estimator.contacts(joints, imu, pose)
+        contacts = read(self._contacts) if self._contacts else None
+        estimated = None
+        if contacts is None:
+            estimated = self._estimate_contacts(joints, pose)
             contacts = None if estimated is None else estimated.contacts
         if self._reckoned is not None:
             pose = self._reckoned.move(joints, contacts, estimated=estimated is not None)
         assert pose is not None
         world = self._model.update(clock.tick, clock.timestamp_ns, joints, contacts, pose)
         if estimated is not None:
-            world = with_estimated(world, estimated)
-        return world if self._reckoned is None else self._reckoned.told_in(world)
+            world = mark_estimated(world, estimated)
+        if self._reckoned is not None:
+            world = self._reckoned.mark_reckoned(world)
+        return world
+
+    def _estimate_contacts(self, joints: JointState, pose: Pose | None) -> EstimatedContacts | None:
+        if self._estimator is None:
+            return None
+        # With dead reckoning no IMU is used at all, see `reckoned_pose`.
+        imu = self._client.read(self._imu) if self._imu and self._reckoned is None else None
+        return self._estimator.contacts(joints, imu, pose)
 
 
-class _Perceived:
-    """Map and pose are what the sensors measure. Of the scene only the place where the snake is laid down is used."""
+class _PerceivedSource:
+    """Uses only what the sensors measure, and the pose in which the robot starts."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        self._start, robot = _start(config), config.robot
-        sensed = robot.sensors.pose
-        self._noise = PoseNoise() if sensed is None else PoseNoise(sensed.position_noise_m, sensed.angle_noise_rad)
+        robot = config.robot
+        pose_sensor = robot.sensors.pose
+        self._client = client
+        self._start = _start_pose(config)
+        self._pose_noise = PoseNoise()
+        if pose_sensor is not None:
+            self._pose_noise = PoseNoise(pose_sensor.position_noise_m, pose_sensor.angle_noise_rad)
+
+        # Subscriptions.
+        uses_pose = config.mission.localization == "pose_sensor"
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts) if robot.sensors.contacts else None
         self._imu = client.subscribe(keys.IMU, Imu) if robot.sensors.imu else None
-        by_pose = config.mission.localization == "pose_sensor"
-        self._pose = client.subscribe(keys.POSE, Pose) if by_pose else None
-        self._looks = [
-            (client.subscribe(key, kind), _noise(sensor))
-            for key, sensor in robot.sensors.mounted()
-            if isinstance(sensor, Looking) and (kind := keys.message_at(key)) is not None and kind in get_args(Look)
-        ]
-        self._client = client
+        self._pose = client.subscribe(keys.POSE, Pose) if uses_pose else None
+        self._looks: list[tuple[Any, Noise]] = []  # subscription to a ranging sensor, and its noise
+        for key, sensor in robot.sensors.mounted():
+            message_type = keys.message_at(key)
+            if isinstance(sensor, Looking) and message_type is not None and message_type in get_args(Look):
+                self._looks.append((client.subscribe(key, message_type), _range_noise(sensor)))
+
         self._model: PerceivedWorld | None = None
-        self._taken: dict[str, int] = {}  # stamp of the newest sample used, by key
+        self._used_ns: dict[str, int] = {}  # timestamp of the newest sample that was used, by key
 
     def configure(self, robot: Description) -> None:
-        self._model = PerceivedWorld(robot, self._start, self._noise)
-        self._taken.clear()
+        self._model = PerceivedWorld(robot, self._start, self._pose_noise)
+        self._used_ns.clear()
 
-    def world(self, clock: Clock) -> World | None:
-        read, model = self._client.read, self._model
+    def make_world(self, clock: Clock) -> World | None:
+        read = self._client.read
+        model = self._model
         joints = read(self._joints)
         if model is None or joints is None:
             return None
         contacts = read(self._contacts) if self._contacts else None
-        model.take_joints(joints, contacts, read(self._imu) if self._imu else None)
-        pose = None if self._pose is None else read(self._pose)
+        imu = read(self._imu) if self._imu else None
+        model.add_joints(joints, contacts, imu)
+        pose = read(self._pose) if self._pose else None
         if pose is not None:
-            model.take_pose(pose)
+            model.add_pose(pose)
         if contacts is not None and self._is_new(keys.CONTACTS, contacts.timestamp_ns):
-            model.take_contacts(contacts)
+            model.add_contacts(contacts)
         for feed, noise in self._looks:
-            look: Any = read(feed)
+            look = read(feed)
             if look is not None and self._is_new(feed.key, look.timestamp_ns):
-                model.take_look(look, noise)
-        return model.world(clock.tick, clock.timestamp_ns)
+                model.add_look(look, noise)
+        return model.make_world(clock.tick, clock.timestamp_ns)
 
     def _is_new(self, key: str, timestamp_ns: int) -> bool:
-        new = self._taken.get(key) != timestamp_ns
-        self._taken[key] = timestamp_ns
-        return new
+        """Return whether a sample was not used yet, and remember it."""
+        is_new = self._used_ns.get(key) != timestamp_ns
+        self._used_ns[key] = timestamp_ns
+        return is_new
 
 
-def _start(config: RunConfig) -> Base:
-    """Where the robot is laid down."""
+def _start_pose(config: RunConfig) -> Base:
+    """Return the pose of the base at the start of the run."""
     start = start_of(config)
     return Base(np.array([*start.position_w, start.yaw_rad]), config.robot.module.radius_m, np.eye(3))
 
 
-def _noise(sensor: Looking) -> Noise:
-    """As the robot's file has it. One without noise is not trusted without end."""
+def _range_noise(sensor: Looking) -> Noise:
+    """Return the noise that the robot's file declares, or a minimum."""
     per_m2 = sensor.noise_m_per_m2 if isinstance(sensor, DepthCamera) else 0.0
     return Noise(max(sensor.noise_m, MIN_NOISE_M), per_m2)

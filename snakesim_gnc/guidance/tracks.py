@@ -1,7 +1,8 @@
-"""One obstacle of the map: its surface, its shape with covariance, and the evidence that it exists. Pure.
+"""One obstacle of the map: its surface, its shape with standard deviations, and the evidence that it exists. Pure.
 
-The shape is fitted again whenever the surface has changed: circle or box, whichever explains it with fewer parameters
-(Bayesian information criterion). So what began as a short arc becomes the box that it turns out to be.
+The shape is fitted again whenever the surface has changed. It is a circle or a box, whichever explains the surface
+better at the price of its parameters (Bayesian information criterion). So an obstacle that began as a short arc becomes
+a box when more of it is seen.
 """
 
 import math
@@ -11,129 +12,184 @@ from typing import Literal
 
 import numpy as np
 
-from snakesim_gnc.guidance.box_fit import fit_boxes
-from snakesim_gnc.guidance.circle_fit import RADIUS_M, fit_circles
-from snakesim_gnc.guidance.surfaces import Surface, batched
+from snakesim_gnc.guidance.box_fit import Boxes, fit_boxes
+from snakesim_gnc.guidance.circle_fit import RADIUS_M, Circles, fit_circles
+from snakesim_gnc.guidance.surfaces import Surface, stack_surfaces
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-BOX_FROM = 5  # cells; fewer are a circle
-ROUND_LIMIT_M = 0.16  # rounder things are boxes
-ROUND_MISFIT = 0.8  # a cell: what a circle explains this well need not be tried as a box
-LOYALTY = 4.0  # by which another shape must be better than the present one
-LOST = np.full(2, np.nan)
-HIT, MISS, TOUCH = 0.5, -0.8, 3.0  # log odds
-SUREST = 5.0
-BELIEVED = 0.2  # from here on it is reported
-GONE = -1.0
-MEMORY_S = 60.0  # belief in what is not seen again falls to 1/e
-UNKNOWN_HEIGHT_M = 0.2
+# Circle or box.
+MIN_BOX_CELLS = 5  # a surface of fewer cells is a circle
+MAX_CIRCLE_RADIUS_M = 0.16  # a larger round thing is taken for a box
+TOO_LARGE_COST = 1e3
+GOOD_CIRCLE_MISFIT = 0.8  # per cell: if a circle explains it this well, no box is tried
+SWITCH_COST = 4.0  # by which another shape must be better than the present one
+CIRCLE_PARAMETERS = 3
+BOX_PARAMETERS = 5
+SINGLE_FACE_PARAMETERS = 4  # of a box of which one face was seen: its depth is not fitted
+NO_CENTER = np.full(2, np.nan)
+
+# Evidence, as log odds.
+HIT_LOG_ODDS = 0.5
+MISS_LOG_ODDS = -0.8
+TOUCH_LOG_ODDS = 3.0
+MAX_LOG_ODDS = 5.0
+REPORT_LOG_ODDS = 0.2  # an obstacle above this is reported
+DROP_LOG_ODDS = -1.0  # below this it is dropped
+MEMORY_S = 60.0  # belief in what is not seen again falls to 1/e in this time
+
+UNKNOWN_HEIGHT_M = 0.2  # reported while nothing higher was seen
+MAX_SD_M = 10.0  # upper limit of what is reported
 
 
 @dataclass
 class Track:
-    """An obstacle under observation."""
+    """An obstacle under observation. Its name stays, even if the obstacle turns out to be something else."""
 
+    # Identity.
     number: int
-    name: str  # stays, also when it turns out to be something else
+    name: str
+    # What was measured.
     surface: Surface = field(default_factory=Surface)
-    felt: bool = False
+    felt: bool = False  # the body has touched it
     log_odds: float = 0.0
     last_seen_ns: int = 0
-    top_m: float = 0.0
+    top_m: float = 0.0  # highest point seen, above the ground
     born_m2: float = 0.0  # variance of the robot's position when it was first seen: the map is no better than that
     drift_m2: float = 0.0  # of the robot's position, when the surface was last brought up to date
+    # The shape, in the world.
     shape: Literal["cylinder", "box"] = "cylinder"
     center_w: Floats = field(default_factory=lambda: np.zeros(2))
-    yaw_rad: float = 0.0
-    radius_m: float = RADIUS_M
-    half_m: Floats = field(default_factory=lambda: np.zeros(2))
+    yaw_rad: float = 0.0  # of a box
+    radius_m: float = RADIUS_M  # of a cylinder
+    half_m: Floats = field(default_factory=lambda: np.zeros(2))  # half size of a box along and across yaw
     position_sd_m: float = math.inf
     size_sd_m: float = math.inf
-    cost: float = math.inf  # misfit and parameters of the shape
+    cost: float = math.inf  # misfit of the shape, and the price of its parameters
 
     @property
     def fitted(self) -> bool:
         """Whether the shape has been fitted to the surface."""
         return math.isfinite(self.cost)
 
-    def believe(self, by: float) -> None:
-        """More or less than before."""
-        self.log_odds = min(self.log_odds + by, SUREST)
+    def add_evidence(self, log_odds: float) -> None:
+        """Add evidence that the obstacle exists, or, if negative, that it does not."""
+        self.log_odds = min(self.log_odds + log_odds, MAX_LOG_ODDS)
 
-    def believed(self, now_ns: int) -> float:
-        """Log odds that it is there, now."""
-        return self.log_odds * math.exp(-max(now_ns - self.last_seen_ns, 0) * 1e-9 / MEMORY_S)
+    def belief_at(self, now_ns: int) -> float:
+        """Return the log odds that the obstacle is there now."""
+        age_ns = max(now_ns - self.last_seen_ns, 0)
+        return self.log_odds * math.exp(-age_ns * 1e-9 / MEMORY_S)
 
-    def obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
-        """As a message."""
-        height = max(self.top_m, UNKNOWN_HEIGHT_M)
+    def to_obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
+        """Return the obstacle as a message."""
+        height_m = max(self.top_m, UNKNOWN_HEIGHT_M)
         x, y = self.center_w.tolist()
-        boxy = self.shape == "box"
+        yaw_rad = 0.0
+        radius_m = 0.0
+        half_size_m = (0.0, 0.0, 0.0)
+        if self.shape == "box":
+            yaw_rad = self.yaw_rad
+            half_size_m = (float(self.half_m[0]), float(self.half_m[1]), height_m / 2)
+        else:
+            radius_m = self.radius_m
         return Obstacle(
             name=self.name,
             shape=self.shape,
-            position_w=(x, y, ground_z_m + height / 2),
-            yaw_rad=self.yaw_rad if boxy else 0.0,
-            radius_m=0.0 if boxy else self.radius_m,
-            half_size_m=(float(self.half_m[0]), float(self.half_m[1]), height / 2) if boxy else (0.0, 0.0, 0.0),
-            height_m=height,
-            confidence=1.0 / (1.0 + math.exp(-self.believed(now_ns))),
-            position_sd_m=min(self.position_sd_m, 10.0),
-            size_sd_m=min(self.size_sd_m, 10.0),
+            position_w=(x, y, ground_z_m + height_m / 2),
+            yaw_rad=yaw_rad,
+            radius_m=radius_m,
+            half_size_m=half_size_m,
+            height_m=height_m,
+            confidence=1.0 / (1.0 + math.exp(-self.belief_at(now_ns))),
+            position_sd_m=min(self.position_sd_m, MAX_SD_M),
+            size_sd_m=min(self.size_sd_m, MAX_SD_M),
             last_seen_ns=self.last_seen_ns,
             felt=self.felt,
         )
 
+    def use_circle(self, circles: Circles, row: int, cost: float) -> None:
+        """Take the shape from a row of a circle fit."""
+        covariance = circles.covariance[row]
+        self.shape = "cylinder"
+        self.cost = cost
+        self.center_w = circles.center_w[row]
+        self.radius_m = float(circles.radius_m[row])
+        self.position_sd_m = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+        self.size_sd_m = math.sqrt(float(covariance[2, 2]))
 
-def fit(tracks: Sequence[Track]) -> None:
+    def use_box(self, boxes: Boxes, row: int, cost: float) -> None:
+        """Take the shape from a row of a box fit."""
+        self.shape = "box"
+        self.cost = cost
+        self.center_w = boxes.center_w[row]
+        self.half_m = boxes.half_m[row]
+        self.yaw_rad = float(boxes.yaw_rad[row])
+        self.position_sd_m = float(boxes.center_sd_m[row].max())
+        self.size_sd_m = float(boxes.half_sd_m[row].max())
+
+
+def fit_shapes(tracks: Sequence[Track]) -> None:
     """Fit the shapes of tracks to their surfaces, all at once."""
     if not tracks:
         return
-    points, weight, outward, normal = batched([track.surface for track in tracks])
-    began = np.array([track.center_w if track.shape == "cylinder" and track.fitted else LOST for track in tracks])
-    circles = fit_circles(points, weight, outward, normal, began)
+    points, weight, outward, normal_weight = stack_surfaces([track.surface for track in tracks])
     cells = np.array([len(track.surface) for track in tracks])
-    as_circle = circles.misfit + 3 * np.log(np.maximum(cells, 2))
-    as_circle[circles.radius_m > ROUND_LIMIT_M] += 1e3
-    as_box, boxes, row = np.full(len(tracks), np.inf), None, {}
-    doubtful = np.flatnonzero((cells >= BOX_FROM) & (circles.misfit > ROUND_MISFIT * cells))
-    if len(doubtful):
-        most = int(cells[doubtful].max())
-        boxes = fit_boxes(points[doubtful, :most], weight[doubtful, :most], outward[doubtful, :most])
-        per = np.log(np.maximum(cells[doubtful], 2))
-        as_box[doubtful] = boxes.misfit + np.where(boxes.faces > 1, 5, 4) * per
-        row = {int(i): k for k, i in enumerate(doubtful)}
-    for i, track in enumerate(tracks):
-        loyalty = LOYALTY * (track.shape == "cylinder" or -1) if track.fitted else 0.0
-        if boxes is None or as_circle[i] <= as_box[i] + loyalty:
-            track.shape, track.cost = "cylinder", float(as_circle[i])
-            track.center_w, track.radius_m = circles.center_w[i], float(circles.radius_m[i])
-            spread = circles.covariance[i]
-            track.position_sd_m = math.sqrt(float(np.linalg.eigvalsh(spread[:2, :2])[-1]))
-            track.size_sd_m = math.sqrt(float(spread[2, 2]))
+    log_cells = np.log(np.maximum(cells, 2))
+
+    began_w = np.array([_known_center(track) for track in tracks])
+    circles = fit_circles(points, weight, outward, normal_weight, began_w)
+    circle_cost = circles.misfit + CIRCLE_PARAMETERS * log_cells
+    circle_cost[circles.radius_m > MAX_CIRCLE_RADIUS_M] += TOO_LARGE_COST
+
+    box_cost = np.full(len(tracks), np.inf)
+    box_rows: dict[int, int] = {}  # row in `boxes`, by index of the track
+    boxes: Boxes | None = None
+    candidates = np.flatnonzero((cells >= MIN_BOX_CELLS) & (circles.misfit > GOOD_CIRCLE_MISFIT * cells))
+    if len(candidates):
+        max_cells = int(cells[candidates].max())
+        boxes = fit_boxes(
+            points[candidates, :max_cells], weight[candidates, :max_cells], outward[candidates, :max_cells]
+        )
+        parameters = np.where(boxes.faces > 1, BOX_PARAMETERS, SINGLE_FACE_PARAMETERS)
+        box_cost[candidates] = boxes.misfit + parameters * log_cells[candidates]
+        box_rows = {int(index): row for row, index in enumerate(candidates)}
+
+    for index, track in enumerate(tracks):
+        if boxes is None or circle_cost[index] <= box_cost[index] + _circle_preference(track):
+            track.use_circle(circles, index, float(circle_cost[index]))
         else:
-            k = row[i]
-            track.shape, track.cost = "box", float(as_box[i])
-            track.center_w, track.half_m, track.yaw_rad = boxes.center_w[k], boxes.half_m[k], float(boxes.yaw_rad[k])
-            track.position_sd_m = float(boxes.center_sd_m[k].max())
-            track.size_sd_m = float(boxes.half_sd_m[k].max())
+            track.use_box(boxes, box_rows[index], float(box_cost[index]))
 
 
-def outlines_of(tracks: Sequence[Track]) -> Outlines:
-    """The shapes of tracks, for distances to all of them."""
-    boxy = np.array([t.shape == "box" for t in tracks], dtype=bool)
-    yaw = np.array([t.yaw_rad for t in tracks], dtype=np.float64)
-    half = np.array([t.half_m for t in tracks], dtype=np.float64).reshape(-1, 2)
+def _known_center(track: Track) -> Floats:
+    """Return the center from which a circle fit begins; NaN without an earlier one."""
+    if track.shape == "cylinder" and track.fitted:
+        return track.center_w
+    return NO_CENTER
+
+
+def _circle_preference(track: Track) -> float:
+    """Return by how much a circle may cost more than a box. It favors the shape that the track has."""
+    if not track.fitted:
+        return 0.0
+    return SWITCH_COST if track.shape == "cylinder" else -SWITCH_COST
+
+
+def make_outlines(tracks: Sequence[Track]) -> Outlines:
+    """Return the shapes of tracks, for distances to all of them."""
+    is_box = np.array([track.shape == "box" for track in tracks], dtype=bool)
+    yaw_rad = np.array([track.yaw_rad for track in tracks], dtype=np.float64)
+    half_m = np.array([track.half_m for track in tracks], dtype=np.float64).reshape(-1, 2)
     return Outlines(
-        center_w=np.array([t.center_w for t in tracks], dtype=np.float64).reshape(-1, 2),
-        turn=np.column_stack([np.cos(yaw), np.sin(yaw)]),
-        half_m=np.where(boxy[:, None], half, 0.0),
-        rounding_m=np.where(boxy, 0.0, [t.radius_m for t in tracks]),
+        center_w=np.array([track.center_w for track in tracks], dtype=np.float64).reshape(-1, 2),
+        turn=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
+        half_m=np.where(is_box[:, None], half_m, 0.0),
+        rounding_m=np.where(is_box, 0.0, [track.radius_m for track in tracks]),
     )
 
 
-def position_sd_m(tracks: Sequence[Track]) -> Floats:
-    """Of each, (n,)."""
-    return np.array([t.position_sd_m for t in tracks], dtype=np.float64)
+def list_position_sd_m(tracks: Sequence[Track]) -> Floats:
+    """Return the standard deviations of the positions of tracks, (n,)."""
+    return np.array([track.position_sd_m for track in tracks], dtype=np.float64)

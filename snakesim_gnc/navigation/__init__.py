@@ -1,8 +1,14 @@
 """Navigation: path and speed of the snake, from a mission or an operator's intent.
 
-`core`, `intents`           along a given route; speed and direction, and whose desired they are
-`clutter`                   along a path of its own, planned again and again: `beam` searches, `margin` says whether a
-                            body can push itself there, `snap` pulls the path to what it pushes off; `obstacle_map`
-                            and `line` are their geometry
-`service`                   the process
+`service`           the process
+`intents`           which intent is valid, and the speed and direction that follow from it
+`known_path`        follows a given route
+`clutter`           plans a path towards a goal, again and again, with bounded work in each update
+`planning_goal`     where that goal is, and whether it is reached
+`plan`              makes one plan: search, path fit, push-points
+`beam`              searches a path: from `search_nodes` along `search_arcs`, with the costs of `search_parameters`
+`margin`            how hard a body can push itself with the contacts that it has
+`path_fit`          fits a path to the obstacles that the body pushes off, and smooths it
+`obstacle_grid`     finds the nearest obstacle of many points
+`platform_rises`    where a path leads over platforms
 """

@@ -1,12 +1,13 @@
 """The propulsion margin: how hard a body can push itself along its own curve with the contacts that it has. Pure.
 
-Sliding forward, contact c pushes with lambda_c >= 0 along `d_c = n_c - mu t_c` (its normal, less friction on the
-obstacle). The contacts push a body of length L forward along its curve gamma with force F when
+Sliding forward, contact c pushes with the force lambda_c >= 0 along `d_c = n_c - mu t_c`: its normal, less friction on
+the obstacle. The contacts push a body of length L forward along its curve gamma with force F if
 
     sum_c lambda_c [d_c ; o_c x d_c] = F (1/L) integral [t ; gamma x t] d sigma,   0 <= lambda_c <= lambda_max
 
-and the margin F* is the greatest such F. It is sought among all threes of contacts: three equations have a basic
-solution with three unknowns. More contacts could share the load, so this is a lower bound. See `docs/poal.md`.
+o_c is the place of contact c, t the unit tangent of the curve. The margin F* is the largest such F. The search for it
+goes through all sets of three contacts, because three equations have a basic solution with three unknowns. More
+contacts could share the load, so the result is a lower bound. See `docs/poal.md`.
 """
 
 from functools import cache
@@ -17,50 +18,65 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 
-LARGEST_N = 80.0  # lambda_max: force on one contact
-SINGULAR = 1e-4  # of a determinant of three unit wrenches, with moments over half a metre
+MAX_CONTACT_FORCE_N = 80.0  # lambda_max
+MIN_DETERMINANT = 1e-4  # of three unit wrenches with scaled moments; smaller ones cannot balance every load
+WRENCH_SCALE = (1.0, 1.0, 2.0)  # moments count over half a meter, so that they are of the order of the forces
+MIN_FORCE_PER_N = 1e-9  # avoids a division by zero
+
+
+def compute_margins_n(contacts: Floats, drag: Floats) -> Floats:
+    """Return the propulsion margin F* of n bodies, (n,); zero where no three contacts can push.
+
+    Args:
+        contacts: (n, k, 3) wrenches [d_c ; o_c x d_c] of unit pushes, zero where a body has fewer than k contacts.
+        drag: (n, 3) right-hand side for F = 1 N. All moments are about one point near the bodies.
+    """
+    margins_n = np.zeros(len(contacts))
+    is_contact: NDArray[np.bool_] = np.any(contacts != 0.0, axis=2)
+    contact_count = is_contact.sum(axis=1)
+    # Most bodies have far fewer than k contacts, so those with the same number are computed together.
+    for count in range(3, contacts.shape[1] + 1):
+        rows = np.flatnonzero(contact_count == count)
+        if len(rows):
+            packed = contacts[rows][is_contact[rows]].reshape(-1, count, 3)
+            margins_n[rows] = _margins_with_all_contacts_n(packed, drag[rows])
+    return margins_n
+
+
+def _margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floats:
+    """Return the margins of bodies that all have k contacts: contacts (n, k, 3), drag (n, 3).
+
+    Cramer's rule gives the forces of three contacts a, b, c under the drag d, with V = a . (b x c):
+
+        lambda_a = d . (b x c) / V,   lambda_b = -c . (d x a) / V,   lambda_c = b . (d x a) / V
+    """
+    scaled = contacts * WRENCH_SCALE
+    scaled_drag = drag * WRENCH_SCALE
+    first, second, third = _sets_of_three(contacts.shape[1])
+    a = scaled[:, first].transpose(2, 0, 1)  # (3, n, sets)
+    b = scaled[:, second].transpose(2, 0, 1)
+    c = scaled[:, third].transpose(2, 0, 1)
+    d = scaled_drag.T[:, :, None]  # (3, n, 1)
+    b_cross_c = _cross(b, c)
+    d_cross_a = _cross(d, a)
+    volume = _dot(a, b_cross_c)
+    is_regular = np.abs(volume) > MIN_DETERMINANT
+    inverse = 1.0 / np.where(is_regular, volume, 1.0)
+    forces = np.stack([_dot(d, b_cross_c) * inverse, -_dot(c, d_cross_a) * inverse, _dot(b, d_cross_a) * inverse])
+    can_push = is_regular & (forces.min(axis=0) >= 0.0)
+    max_force = np.maximum(forces.max(axis=0), MIN_FORCE_PER_N)
+    return MAX_CONTACT_FORCE_N / np.where(can_push, max_force, np.inf).min(axis=1)
 
 
 @cache
-def _threes(count: int) -> tuple[NDArray[np.intp], ...]:
+def _sets_of_three(count: int) -> tuple[NDArray[np.intp], ...]:
+    """Return the indices of the first, second and third contact of all sets of three."""
     indices = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
     return indices[:, 0], indices[:, 1], indices[:, 2]
 
 
-def margins_n(contacts: Floats, drag: Floats) -> Floats:
-    """F* of n bodies, (n,); zero where no three contacts can push.
-
-    contacts: (n, k, 3) wrenches of the contacts' unit pushes, zero where a body has fewer; drag: (n, 3) mean wrench of
-    the tangent, the right-hand side for 1 N. All moments about one point near the bodies.
-    """
-    margins = np.zeros(len(contacts))
-    there: NDArray[np.bool_] = np.any(contacts != 0.0, axis=2)
-    has = there.sum(axis=1)
-    for count in range(3, contacts.shape[1] + 1):  # most have far fewer than k: those of equal number together
-        rows = np.flatnonzero(has == count)
-        if len(rows):
-            margins[rows] = _of_as_many(contacts[rows][there[rows]].reshape(-1, count, 3), drag[rows])
-    return margins
-
-
-def _of_as_many(contacts: Floats, drag: Floats) -> Floats:
-    """The same for bodies that all have k contacts."""
-    first, second, third = _threes(contacts.shape[1])
-    scaled = contacts * (1.0, 1.0, 2.0)  # moments over half a metre
-    wanted = drag * (1.0, 1.0, 2.0)
-    a, b, c = (scaled[:, k].transpose(2, 0, 1) for k in (first, second, third))
-    d = wanted.T[:, :, None]
-    cross_bc = _cross(b, c)
-    volume = _dot(a, cross_bc)
-    regular = np.abs(volume) > SINGULAR
-    inverse = 1.0 / np.where(regular, volume, 1.0)
-    cross_da = _cross(d, a)
-    forces = np.stack([_dot(d, cross_bc) * inverse, -_dot(c, cross_da) * inverse, _dot(b, cross_da) * inverse])
-    pushes = regular & (forces.min(axis=0) >= 0.0)
-    return LARGEST_N / np.where(pushes, np.maximum(forces.max(axis=0), 1e-9), np.inf).min(axis=1)
-
-
 def _cross(a: Floats, b: Floats) -> Floats:
+    """Return a x b of vectors whose components are the first axis."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

@@ -1,7 +1,7 @@
-"""One plan: a path for the whole body, from where it lies to where the goal is. Pure.
+"""One plan: a path for the whole body, from where it lies towards the goal. Pure.
 
-`plan` is a generator as the searches of `beam` are: it yields what its next step costs, in nodes to expand, before it
-does it. It depends on its arguments alone, so the path is the same in however many slices it was made.
+`make_plan` is a generator like the searches of `beam`: it yields the cost of its next step, in nodes to expand, before
+doing the step. The plan depends on the arguments alone, not on how many steps the caller does at a time.
 """
 
 import math
@@ -10,132 +10,181 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from snakesim_gnc.navigation.beam import MIN_TOWARDS, STEP_M, Beam, PathSearch, PlannedPath, Search
-from snakesim_gnc.navigation.line import SPACING_M, evenly
-from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
-from snakesim_gnc.navigation.snap import Fit, snap
+from snakesim_gnc.geometry.planar import SPACING_M, space_evenly
+from snakesim_gnc.navigation.beam import MIN_PUSH, BeamSearch, PathSearch, SearchedPath
+from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
+from snakesim_gnc.navigation.path_fit import PathFitParameters, fit_path
+from snakesim_gnc.navigation.search_arcs import STEP_M
+from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 
-START, STANDS, BACKED_OUT = "the first path", "the body stands", "the body has backed out"
-ENDS_SOON, MAP_CHANGED, TURNED = "the path ends soon", "the map has changed", "the direction has changed"
-LOST, SHIFTED = "the body is off its path", "the body has left the place where it stood"
-HORIZON_M = 4.4
-AGAIN_M = 2.0
-REACHES_M = (0.05, 0.09)
-COMMITTED_M = 0.05  # of the path ahead of where the head will be that is not changed any more
-SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head points; further ones follow
-FIRST_WIDTH, FIRST_CROWD = 2700, 48  # of the search of the first path on a known map
-MIN_AHEAD = 10  # arcs of a new path beyond the head
-JOIN_M = 0.1  # between a path and the trail: nearer, and beside its begin, they would fold it
-TRAIL = 20  # points of the trail that a path keeps
+# Reasons for a plan; `Trajectory.searching` shows them.
+START = "the first path"
+ENDS_SOON = "the path ends soon"
+MAP_CHANGED = "the map has changed"
+GOAL_TURNED = "the direction has changed"
+OFF_PATH = "the body is off its path"
+SHIFTED = "the body has left the place where it stood"
+STUCK = "the body stands"
+BACKED_OUT = "the body has backed out"
+
+# Lengths of path that are searched ahead of the head.
+LONG_HORIZON_M = 4.4  # of a path that does not begin with the present one
+HORIZON_M = 2.0
+COMMITTED_M = 0.05  # of the present path ahead of where the head will be: it does not change any more
+MIN_ARCS_AHEAD = 10  # of a path for the whole body, beyond its head; a shorter one is a dead end
+
+# The search for a path of the whole body.
+MAX_SIDEWAYS_M = (0.05, 0.09)  # how far the path may be from the body: tried in this order
+BETTER_BY_M = 0.1  # a path farther away must cost less by this
+GOOD_MARGIN_RATIO = 0.5  # of the wanted margin: with more, no path farther away is tried
+GOOD_MARGIN_ARCS = 6  # over which the margin must be good, from where the head lies
+
+# The search for the first path on a known map is wider: the robot does not move yet.
+FIRST_KEPT_NODES = 2700
+FIRST_KEPT_PER_WIDE_CELL = 48
+
+MAX_TURN_RAD = 1.2  # between where the head points and the direction of one path; later paths turn further
+MIN_TRAIL_GAP_M = 0.1  # between the path's begin and the trail behind it; nearer points would fold the path
+MAX_TRAIL_POINTS = 20  # that a path begins with
+HEAD_POINTS = 3  # at the head end of the body that the path fit may move
 MAX_REPORTED = 512  # push-points in a message
-SNAP_NODES = 12  # that could be expanded in the time that a point in `snap` takes
+NODES_PER_FITTED_POINT = 12  # nodes that could be expanded in the time that the path fit takes for a point
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A path, and what the body is to push off on it."""
+class Plan:
+    """A path, and the obstacles that the body pushes off on it."""
 
     route: Route
     push_points: list[str]
 
 
 @dataclass(frozen=True)
-class Situation:
-    """What a plan is made from."""
+class PlanningTask:
+    """What a plan is made from. Points are in the world frame."""
 
-    why: str
+    reason: str
     body_w: Floats  # (n, 2) evenly spaced, tail to head
-    goal: Floats  # (2,) unit vector
-    obstacles: ObstacleMap | Sequence[Obstacle]
+    goal_w: Floats  # (2,) unit vector
+    obstacles: ObstacleGrid | Sequence[Obstacle]
     route: Route  # the present one
-    committed_m: float  # of it, ahead of the head
-    failed_w: Floats | None  # (k, 2) of paths on which the body got stuck here
-    trail_w: list[Floats]  # where the tail was, the newest last
+    committed_m: float  # length of the present route ahead of the head that stays
+    failed_w: Floats | None  # (k, 2) points of paths on which the body got stuck here
+    trail_w: list[Floats]  # (2,) each: where the tail was, the newest last
 
 
-def plan(situation: Situation, search: Search) -> Generator[int, None, Planned]:
-    """The path for a situation."""
-    why, body, goal, obstacles = situation.why, situation.body_w, situation.goal, situation.obstacles
-    known = isinstance(obstacles, ObstacleMap)
-    if not isinstance(obstacles, ObstacleMap):
-        obstacles = yield from ObstacleMap.in_steps(obstacles)
-    if why == START and known:  # nobody waits for it while something moves
-        search = replace(search, kept_nodes=FIRST_WIDTH, kept_per_wide_cell=FIRST_CROWD)
-    beam, heading_rad = Beam(obstacles, search), within_reach(body, goal)
-    begin, kept = body, len(body) - 3
-    if why in (ENDS_SOON, MAP_CHANGED, TURNED):
-        begin = _lies(situation, search.body_length_m)
-        kept = len(begin) - 3
-        found = yield from beam.ahead(begin, heading_rad, round(AGAIN_M / STEP_M))
-    elif why in (START, LOST, SHIFTED):
-        horizon_m = AGAIN_M if why == SHIFTED else HORIZON_M
-        found = yield from beam.ahead(body, heading_rad, round(horizon_m / STEP_M))
+def make_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[int, None, Plan]:
+    """Make a plan, and return it.
+
+    Yields:
+        The cost of the next step in nodes, before doing it.
+    """
+    if isinstance(task.obstacles, ObstacleGrid):
+        grid = task.obstacles
+        if task.reason == START:
+            parameters = replace(parameters, kept_nodes=FIRST_KEPT_NODES, kept_per_wide_cell=FIRST_KEPT_PER_WIDE_CELL)
     else:
-        found = yield from _replanned(beam, situation, search, heading_rad)
-        begin, kept = body[:0], 0
+        grid = yield from ObstacleGrid.build_in_steps(task.obstacles)
+    begin_w, found = yield from _search(task, grid, parameters)
     if found is None:
-        points = straight_on(body)
+        points_w = extend_straight(task.body_w)
     else:
-        points = np.concatenate([begin, evenly(found.points_w)[min(len(begin), 1) :]])
-        yield SNAP_NODES * len(points)
-        fit = Fit(radius_m=search.radius_m, segment_m=search.segment_m)
-        points = snap(points, kept, obstacles, goal, fit)
-    along = points[5] - points[0]
-    along /= max(float(np.hypot(*along)), 1e-9)
-    behind = [place for place in situation.trail_w if (place - points[0]) @ along < -JOIN_M][-TRAIL:]
-    if behind:
-        points = np.concatenate([np.array(behind), points])
-    return Planned(Route(points), _pushed_off(points, obstacles, goal, search.radius_m))
+        points_w = np.concatenate([begin_w, space_evenly(found.points_w)[min(len(begin_w), 1) :]])
+        yield NODES_PER_FITTED_POINT * len(points_w)
+        fit_parameters = PathFitParameters(radius_m=parameters.radius_m, segment_m=parameters.segment_m)
+        fixed_points = max(len(begin_w) - HEAD_POINTS, 0)
+        points_w = fit_path(points_w, fixed_points, grid, task.goal_w, fit_parameters)
+    points_w = _prepend_trail(points_w, task.trail_w)
+    push_points = _find_push_points(points_w, grid, task.goal_w, parameters.radius_m)
+    return Plan(Route(points_w), push_points)
 
 
-def straight_on(body_w: Floats) -> Floats:
-    """A path along the body, and straight on from its head."""
+def extend_straight(body_w: Floats) -> Floats:
+    """Return a path along the body (n, 2), and straight on from its head for 1 m."""
     ahead = body_w[-1] - body_w[-4]
-    return np.concatenate([body_w, body_w[-1] + np.linspace(0.1, 1.0, 10)[:, None] * ahead / np.hypot(*ahead)])
+    distances_m = np.linspace(0.1, 1.0, 10)[:, None]
+    return np.concatenate([body_w, body_w[-1] + distances_m * ahead / np.hypot(ahead[0], ahead[1])])
 
 
-def within_reach(body_w: Floats, goal: Floats) -> float:
-    """Heading of a goal's direction, or as far towards it as the head can turn on one path."""
+def limit_turn_rad(body_w: Floats, goal_w: Floats) -> float:
+    """Return the heading of the goal's direction (2,), or the nearest one to which one path can turn the head."""
     x, y = body_w[-1] - body_w[-4]
     head_rad = math.atan2(y, x)
-    turn_rad = math.remainder(math.atan2(goal[1], goal[0]) - head_rad, math.tau)
-    return head_rad + min(max(turn_rad, -SHARPEST_RAD), SHARPEST_RAD)
+    turn_rad = math.remainder(math.atan2(goal_w[1], goal_w[0]) - head_rad, math.tau)
+    return head_rad + min(max(turn_rad, -MAX_TURN_RAD), MAX_TURN_RAD)
 
 
-def _lies(situation: Situation, body_length_m: float) -> Floats:
-    """The present path as far as the body lies on it, and will have gone on when another one is there."""
-    route, body = situation.route, situation.body_w
-    tail_s = route.project(body[0])
-    head_s = route.project(body[-1], tail_s + body_length_m)
-    if head_s - tail_s <= 0.5 * body_length_m:  # a path that crosses itself does not tell the order of tail and head
-        return body
-    committed_m = max(min(situation.committed_m, route.length_m - head_s), COMMITTED_M)
-    return evenly(route.position_w(np.arange(tail_s, head_s + committed_m, SPACING_M)))
+def _search(
+    task: PlanningTask, grid: ObstacleGrid, parameters: SearchParameters
+) -> Generator[int, None, tuple[Floats, SearchedPath | None]]:
+    """Run the search that fits the reason of the plan.
+
+    Returns:
+        The curve (k, 2) to which the found path is joined, which is empty for a path of the whole body; and that path.
+    """
+    beam = BeamSearch(grid, parameters)
+    heading_rad = limit_turn_rad(task.body_w, task.goal_w)
+    if task.reason in (ENDS_SOON, MAP_CHANGED, GOAL_TURNED):
+        begin_w = _committed_path(task, parameters.body_length_m)
+        path = yield from beam.search_ahead(begin_w, heading_rad, round(HORIZON_M / STEP_M))
+        return begin_w, path
+    if task.reason in (START, OFF_PATH, SHIFTED):
+        horizon_m = HORIZON_M if task.reason == SHIFTED else LONG_HORIZON_M
+        path = yield from beam.search_ahead(task.body_w, heading_rad, round(horizon_m / STEP_M))
+        return task.body_w, path
+    path = yield from _search_whole_body(beam, task, parameters, heading_rad)
+    return task.body_w[:0], path
 
 
-def _replanned(beam: Beam, situation: Situation, search: Search, heading_rad: float) -> PathSearch:
-    """A path for the whole body: the least change of shape that can push well."""
-    best: PlannedPath | None = None
-    arcs = round(search.body_length_m / STEP_M)
-    for reach_m in REACHES_M:
-        found = yield from beam.whole(
-            situation.body_w, heading_rad, round(AGAIN_M / STEP_M), reach_m, situation.failed_w
+def _committed_path(task: PlanningTask, body_length_m: float) -> Floats:
+    """Return the present path (k, 2) from the tail to where the head will be when the plan is there."""
+    route = task.route
+    tail_s_m = route.project(task.body_w[0])
+    head_s_m = route.project(task.body_w[-1], tail_s_m + body_length_m)
+    if head_s_m - tail_s_m <= 0.5 * body_length_m:
+        # The path crosses itself, so that the projections of tail and head are on the wrong branches.
+        return task.body_w
+    committed_m = max(min(task.committed_m, route.length_m - head_s_m), COMMITTED_M)
+    return space_evenly(route.position_w(np.arange(tail_s_m, head_s_m + committed_m, SPACING_M)))
+
+
+def _search_whole_body(
+    beam: BeamSearch, task: PlanningTask, parameters: SearchParameters, heading_rad: float
+) -> PathSearch:
+    """Search a path for the whole body that changes its shape as little as possible, and on which it can push well."""
+    best: SearchedPath | None = None
+    head_arc = round(parameters.body_length_m / STEP_M)
+    for max_sideways_m in MAX_SIDEWAYS_M:
+        path = yield from beam.search_whole_body(
+            task.body_w, heading_rad, round(HORIZON_M / STEP_M), max_sideways_m, task.failed_w
         )
-        if found is None or len(found.points_w) < arcs + MIN_AHEAD:
+        if path is None or len(path.points_w) < head_arc + MIN_ARCS_AHEAD:
             continue
-        if best is None or found.cost_m < best.cost_m - 0.1:
-            best = found
-        if np.min(found.margins_n[arcs : arcs + 6]) > 0.5 * search.wanted_margin_n:
+        if best is None or path.cost_m < best.cost_m - BETTER_BY_M:
+            best = path
+        margins_n = path.margins_n[head_arc : head_arc + GOOD_MARGIN_ARCS]
+        if np.min(margins_n) > GOOD_MARGIN_RATIO * parameters.wanted_margin_n:
             break
     return best
 
 
-def _pushed_off(points_w: Floats, obstacles: ObstacleMap, goal: Floats, radius_m: float) -> list[str]:
-    """Obstacles that a body on the path touches or nearly does, and that push it on, in order along the path."""
-    near = obstacles.near(points_w[:, 0], points_w[:, 1])
-    beside = (near.distance_m < radius_m + Fit.touch_m) & (near.normal_w @ goal > MIN_TOWARDS)
-    found = dict.fromkeys(near.obstacle[beside & (near.obstacle != NONE)].tolist())
-    return [obstacles.obstacles[k].name for k in found][:MAX_REPORTED]
+def _prepend_trail(points_w: Floats, trail_w: Sequence[Floats]) -> Floats:
+    """Return the path with the trail of the tail before it, along which the body can back out."""
+    along = points_w[5] - points_w[0]
+    along /= max(float(np.hypot(along[0], along[1])), 1e-9)
+    behind = [point_w for point_w in trail_w if (point_w - points_w[0]) @ along < -MIN_TRAIL_GAP_M]
+    if not behind:
+        return points_w
+    return np.concatenate([np.array(behind[-MAX_TRAIL_POINTS:]), points_w])
+
+
+def _find_push_points(points_w: Floats, grid: ObstacleGrid, goal_w: Floats, radius_m: float) -> list[str]:
+    """Return the names of obstacles that a body on the path touches and that push it on, in order along the path."""
+    nearest = grid.find_nearest(points_w[:, 0], points_w[:, 1])
+    is_contact = (nearest.obstacle != NO_OBSTACLE) & (nearest.distance_m < radius_m + PathFitParameters.contact_gap_m)
+    is_push_point = is_contact & (nearest.normal_w @ goal_w > MIN_PUSH)
+    indices = dict.fromkeys(nearest.obstacle[is_push_point].tolist())  # each once, in order
+    return [grid.obstacles[index].name for index in indices][:MAX_REPORTED]

@@ -1,14 +1,16 @@
-"""The navigation process: world model and intent in, `navigation/trajectory` out."""
+"""The navigation process: reads the world model and intents, and publishes `navigation/trajectory`."""
+
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 
 from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
-from snakesim_gnc.navigation.beam import Search
 from snakesim_gnc.navigation.clutter import ClutterPlanner
-from snakesim_gnc.navigation.core import KnownPath
-from snakesim_gnc.navigation.intents import Intents
-from snakesim_gnc.navigation.rises import Rises
+from snakesim_gnc.navigation.intents import DesiredMotion, Intents
+from snakesim_gnc.navigation.known_path import KnownPath
+from snakesim_gnc.navigation.platform_rises import PlatformRises
+from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, start_of, surveyed
 from snakesim_hal.model.scenario import Service as Schedule
@@ -18,75 +20,96 @@ from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Intent, JointState, Message, Obstacle, Trajectory, World
 
-NO_ROUTE_LENGTH_M = 100.0
+NO_ROUTE_LENGTH_M = 100.0  # of the straight line that a scene without a route gets
 
 
 class Navigation(Service):
-    """Mission and intent to trajectory.
+    """Makes trajectories from the mission and intents.
 
-    Along the scene's route, or a straight line from where the snake starts. A mission with a goal, or an intent with a
-    heading, is for the planner, which finds a path of its own, a little each turn: no turn waits for a plan.
+    Without a goal the robot follows the scene's route, or a straight line from its start. For a mission with a goal, or
+    an intent with a heading, the clutter planner plans paths, a limited amount of work in each update.
     """
 
     name = "navigation"
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Subscribes."""
+        """Subscribe to the world model, intents and joint states."""
         self._config = config
+        self._client = client
         self._world = client.subscribe(keys.WORLD, World)
         self._intent = client.subscribe(keys.INTENT, Intent)
         self._joints = client.subscribe(keys.JOINTS, JointState)
-        self._client = client
         self._intents = Intents(config.mission.speed_m_s)
 
     def configure(self, robot: Description) -> None:
-        """Works for any robot; its position is unknown again."""
+        """Create the planners for a robot, whose position is unknown again."""
         config = self._config
-        self._intents.start_over()
-        self._body, self._recent = PlanarBody(robot), RecentAngles()
         known = surveyed(config)
-        climbs = config.mission.map == "known" and any(joint.axis == "pitch" for joint in robot.joints)
-        platforms = surveyed(config, walkable=True) if climbs else []
-        self._rises = Rises([one for one in platforms if one.height_m <= config.mission.max_climb_m])
-        self._along = _along_route(config, known) if config.mission.goal is None else None
-        search = Search(
-            body_length_m=self._body.length_m,
-            radius_m=self._body.radius_m,
-            segment_m=max(self._body.segments_m),
-            peg_friction=config.mission.peg_friction,
-        )
-        turn = config.services.get(self.name, Schedule())
+        self._intents.start_over()
+        self._body = PlanarBody(robot)
+        self._recent_angles = RecentAngles()
+        self._rises = PlatformRises(_find_platforms(config, robot))
+        self._known_path = _make_known_path(config, known) if config.mission.goal is None else None
+        schedule = config.services.get(self.name, Schedule())
         self._planner = ClutterPlanner(
             config.mission.goal or HeadingGoal(),
             known if config.mission.map == "known" else None,
-            search=search,
-            turn_s=min(turn.decimation, turn.latency_ticks) / config.rate_hz,
+            search=SearchParameters(
+                body_length_m=self._body.length_m,
+                radius_m=self._body.radius_m,
+                segment_m=max(self._body.segments_m),
+                peg_friction=config.mission.peg_friction,
+            ),
+            turn_s=min(schedule.decimation, schedule.latency_ticks) / config.rate_hz,
         )
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """The trajectory at this tick. An operator's intent is used as soon as it arrives."""
-        world, joints = self._client.read(self._world), self._client.read(self._joints)
+        """Return the trajectory at this tick. An operator's intent is used as soon as it arrives."""
+        world = self._client.read(self._world)
+        joints = self._client.read(self._joints)
         desired = self._intents.desired(self._intent.newest(), clock.timestamp_ns)
         if joints is not None:
-            self._recent.put(joints.timestamp_ns, joints.angle_rad)
-        if self._along is not None and desired.heading_w_rad is None:
-            trajectory = self._along.update(clock.tick, world, desired)
-            self._planner.follow(self._along.route, trajectory.push_points)
-            return [(keys.TRAJECTORY, self._with_rises(trajectory))]
-        if world is None or not self._recent:
+            self._recent_angles.add(joints.timestamp_ns, joints.angle_rad)
+        if self._known_path is not None and desired.heading_w_rad is None:
+            trajectory = self._known_path.update(clock.tick, world, desired)
+            self._planner.follow(self._known_path.route, trajectory.push_points)
+        else:
+            trajectory = self._plan(clock, world, desired)
+        if trajectory is None:
             return None
-        nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
-        trajectory = self._planner.update(clock.tick, world, nodes.T, desired)
-        if not self._planner.ready and clock.clock_mode == "lockstep" and clock.arm_session == 0:
-            return None  # time stands until the robot is armed, and nobody arms it before there is a path
-        return [(keys.TRAJECTORY, self._with_rises(trajectory))]
+        return [(keys.TRAJECTORY, self._add_rises(trajectory))]
 
-    def _with_rises(self, trajectory: Trajectory) -> Trajectory:
-        rises = self._rises.along(trajectory.path_id, trajectory.path_w)
-        return msgspec.structs.replace(trajectory, rises=rises) if rises else trajectory
+    def _plan(self, clock: Clock, world: World | None, desired: DesiredMotion) -> Trajectory | None:
+        """Return the clutter planner's trajectory, or None while there is none to follow."""
+        if world is None or not self._recent_angles:
+            return None
+        angles_rad = self._recent_angles.nearest_to(pose_instant_ns(world))
+        nodes_w = self._body.nodes_w(world, angles_rad)
+        trajectory = self._planner.update(clock.tick, world, nodes_w.T, desired)
+        is_paused = clock.clock_mode == "lockstep" and clock.arm_session == 0
+        if is_paused and not self._planner.ready:
+            # Robot time is paused until the robot is armed, and the robot is armed only when there is a path.
+            return None
+        return trajectory
+
+    def _add_rises(self, trajectory: Trajectory) -> Trajectory:
+        rises = self._rises.find_rises(trajectory.path_id, trajectory.path_w)
+        if not rises:
+            return trajectory
+        return msgspec.structs.replace(trajectory, rises=rises)
 
 
-def _along_route(config: RunConfig, known: list[Obstacle]) -> KnownPath:
+def _find_platforms(config: RunConfig, robot: Description) -> Sequence[Obstacle]:
+    """Return the surveyed obstacles that the robot may climb; none without pitch joints or a known map."""
+    can_pitch = any(joint.axis == "pitch" for joint in robot.joints)
+    if config.mission.map != "known" or not can_pitch:
+        return []
+    platforms = surveyed(config, walkable=True)
+    return [platform for platform in platforms if platform.height_m <= config.mission.max_climb_m]
+
+
+def _make_known_path(config: RunConfig, known: Sequence[Obstacle]) -> KnownPath:
+    """Return the path along the scene's route, or straight ahead from the start if it has none."""
     route = route_of(config.scene)
     if route is None:
         start = start_of(config)

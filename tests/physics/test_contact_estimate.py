@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
+from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.plugins import BACKENDS, offered
@@ -56,7 +56,7 @@ def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
     for samples, true in seen:
         imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
         assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
-        felt = estimate(
+        felt = estimate_pushes(
             robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
         )
         result.add(true, pushes(robot, felt))
@@ -85,7 +85,7 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
         return run.host.description, seen
 
 
-def pushes(robot: Description, felt: list[FeltContact]) -> list[Push]:
+def pushes(robot: Description, felt: list[EstimatedPush]) -> list[Push]:
     """Where along the body."""
     starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
     return [(starts[c.link] + c.along_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]

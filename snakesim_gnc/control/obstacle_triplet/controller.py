@@ -126,11 +126,11 @@ class ObstacleTriplet:
         """Reference of the joints in position mode; starts, and continues from another place, without a jump."""
         set_, s, before = self._set, located.tail_s_m, self._body_pose
         if before is None or located.restarted:
-            body_pose = located.on_path.at(s)
+            body_pose = located.on_path.pose_at(s)
         else:
             max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_ratio * view.period_s
             followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + max_advance_m)
-            body_pose = located.on_path.at(max(followed, s - set_.brake_m))
+            body_pose = located.on_path.pose_at(max(followed, s - set_.brake_m))
         lifted = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
         reference = self._body.all_angles(body_pose) + lifted
         if not len(self._reference):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.progress import Located, Progress
-from snakesim_gnc.geometry.body_on_path import BodyOnPath, chain_nodes, heading_of
+from snakesim_gnc.geometry.body_on_path import BodyOnPath, chain_nodes, compute_heading_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.route import lay_chain
@@ -19,7 +19,7 @@ BODY = BodyOnPath(ROUTE, SEGMENTS)
 
 @given(st.floats(-1.0, 7.0))
 def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
-    lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.at(tail_s_m)
+    lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.pose_at(tail_s_m)
     assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=5e-3)
     assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=3e-4)
     assert np.hypot(*np.diff(lie.nodes_w)) == pytest.approx(SEGMENTS, abs=2e-4)
@@ -30,13 +30,13 @@ def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
 def test_a_body_on_the_path_is_found_again(tail_s_m, off_m):
     lay = lay_chain(ROUTE, tail_s_m, SEGMENTS)
     nodes = chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad.tolist(), SEGMENTS)
-    assert BODY.find(nodes) == pytest.approx(tail_s_m, abs=3e-4)
-    assert BODY.fit(nodes, tail_s_m + off_m) == pytest.approx(tail_s_m, abs=3e-4)
+    assert BODY.find_tail_s_m(nodes) == pytest.approx(tail_s_m, abs=3e-4)
+    assert BODY.refine_tail_s_m(nodes, tail_s_m + off_m) == pytest.approx(tail_s_m, abs=3e-4)
 
 
 def test_a_body_beside_the_path_is_where_it_fits_best():
     nodes = nodes_of(make_stage(), 0.4) + np.array([[0.0], [0.02]])
-    assert BODY.find(nodes) == pytest.approx(0.4, abs=0.003)
+    assert BODY.find_tail_s_m(nodes) == pytest.approx(0.4, abs=0.003)
 
 
 def test_nodes_are_those_of_the_3d_kinematics():
@@ -50,7 +50,7 @@ def test_nodes_are_those_of_the_3d_kinematics():
 
 @given(st.floats(-3.1, 3.1))
 def test_heading_of_a_quaternion(yaw_rad):
-    assert heading_of(quaternion_from_yaw(yaw_rad)) == pytest.approx(yaw_rad)
+    assert compute_heading_rad(quaternion_from_yaw(yaw_rad)) == pytest.approx(yaw_rad)
 
 
 def test_pitch_joints_count_as_straight():
@@ -58,7 +58,7 @@ def test_pitch_joints_count_as_straight():
     assert body.bends == [0, 2]
     assert body.segments_m == pytest.approx([0.055, 0.22, 0.165])
     assert body.node_s_m == pytest.approx([0.0, 0.055, 0.275, 0.44])
-    lie = BodyOnPath(ROUTE, body.segments_m).at(0.1)
+    lie = BodyOnPath(ROUTE, body.segments_m).pose_at(0.1)
     assert body.all_angles(lie) == pytest.approx([lie.angles_rad[0], 0.0, lie.angles_rad[1], 0.0])
     joints = body.joints_w(lie)
     assert joints[1] == pytest.approx((joints[0] + joints[2]) / 2)

@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_gnc.control.climb import ABOVE_M, Climb, line_height_m
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
-from snakesim_gnc.navigation.rises import Rises
+from snakesim_gnc.navigation.platform_rises import PlatformRises
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle, Rise
@@ -27,12 +27,12 @@ def platform(x_m: float, length_m: float, yaw_rad: float = 0.0) -> Obstacle:
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.5])
 def test_a_path_rises_where_it_leads_over_a_platform(yaw_rad: float) -> None:
-    rises = Rises([platform(1.3, 0.6, yaw_rad), platform(3.0, 0.2)])
-    first, second = rises.along(1, STRAIGHT)
+    rises = PlatformRises([platform(1.3, 0.6, yaw_rad), platform(3.0, 0.2)])
+    first, second = rises.find_rises(1, STRAIGHT)
     half_m = 0.3 / math.cos(yaw_rad)
     assert (first.from_s_m, first.to_s_m) == pytest.approx((1.3 - half_m, 1.3 + half_m), abs=0.011)
     assert first.height_m == pytest.approx(0.1) and second.from_s_m == pytest.approx(2.9, abs=0.011)
-    assert rises.along(2, [(0.0, 2.0), (4.0, 2.0)]) == []
+    assert rises.find_rises(2, [(0.0, 2.0), (4.0, 2.0)]) == []
 
 
 @pytest.mark.parametrize("tail_s_m", [-0.9, -0.3, 0.2, 0.6, 1.1, 1.5])
@@ -54,6 +54,6 @@ def test_who_only_turns_left_and_right_does_not_climb() -> None:
 
 def test_seen_from_above_a_body_on_a_ramp_is_shorter() -> None:
     segments = [0.1, *[0.2] * 8, 0.1]
-    level, climbing = (BodyOnPath(Route(STRAIGHT), segments, rises).at(0.0).nodes_w[0] for rises in ([], [RISE]))
+    level, climbing = (BodyOnPath(Route(STRAIGHT), segments, rises).pose_at(0.0).nodes_w[0] for rises in ([], [RISE]))
     assert np.all(level[:4] == climbing[:4]) and level[-1] == pytest.approx(1.8)
     assert 0.005 < level[-1] - climbing[-1] < 0.05

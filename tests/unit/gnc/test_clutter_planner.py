@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.geometry.body_on_path import chain_nodes
-from snakesim_gnc.navigation.beam import Beam, PathSearch, PlannedPath, Search
+from snakesim_gnc.navigation.beam import BeamSearch, PathSearch, SearchedPath
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
-from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
+from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, ObstacleGrid
+from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, load, parse_set, place_all, start_of
@@ -19,7 +20,7 @@ from tests.unit.gnc.stage import make_world
 
 TURN_S = 0.08  # a plan takes some of them
 SECOND = 10**9
-SEARCH = Search(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
+SEARCH = SearchParameters(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
 
 
 @cache
@@ -57,7 +58,7 @@ def planned(
     return found
 
 
-def path_of(search: PathSearch) -> PlannedPath | None:
+def path_of(search: PathSearch) -> SearchedPath | None:
     while True:
         try:
             next(search)
@@ -67,13 +68,13 @@ def path_of(search: PathSearch) -> PlannedPath | None:
 
 def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
     obstacles, _ = field()
-    made, random = ObstacleMap(obstacles), np.random.default_rng(0)
+    made, random = ObstacleGrid(obstacles), np.random.default_rng(0)
     points = random.uniform((0.0, -1.2), (6.5, 1.2), (300, 2))
-    near = made.near(points[:, 0], points[:, 1])
+    near = made.find_nearest(points[:, 0], points[:, 1])
     for k, point in enumerate(points):
         least = min(outline_distance_m(o, point) for o in obstacles)
-        assert near.distance_m[k] == pytest.approx(min(least, REACH_M), abs=0.011)
-        if near.obstacle[k] != NONE and near.distance_m[k] > 1e-6:
+        assert near.distance_m[k] == pytest.approx(min(least, MAX_DISTANCE_M), abs=0.011)
+        if near.obstacle[k] != NO_OBSTACLE and near.distance_m[k] > 1e-6:
             assert np.hypot(*near.normal_w[k]) == pytest.approx(1.0)
             moved = point + 1e-4 * near.normal_w[k]
             grown = outline_distance_m(obstacles[near.obstacle[k]], moved) - near.distance_m[k]
@@ -83,16 +84,18 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
 @pytest.mark.parametrize("density", [8.0, 12.0])
 def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -> None:
     obstacles, body = field(density)
-    made = ObstacleMap(obstacles)
-    found = path_of(Beam(made, SEARCH).ahead(body, 0.0, 60))
+    made = ObstacleGrid(obstacles)
+    found = path_of(BeamSearch(made, SEARCH).search_ahead(body, 0.0, 60))
     assert found is not None and len(found.points_w) == 61
-    near = made.near(found.points_w[1:, 0], found.points_w[1:, 1])
+    near = made.find_nearest(found.points_w[1:, 0], found.points_w[1:, 1])
     assert near.distance_m.min() >= SEARCH.radius_m + SEARCH.clearance_m
     assert found.points_w[-1, 0] - found.points_w[0, 0] > 2.0
     assert np.median(found.margins_n) > 20.0
     smooth = planned(planner(obstacles), body)
     points = np.array(smooth.path_w)
-    assert made.near(points[:, 0], points[:, 1]).distance_m.min() > SEARCH.radius_m - 0.012  # pressed, not through
+    assert (
+        made.find_nearest(points[:, 0], points[:, 1]).distance_m.min() > SEARCH.radius_m - 0.012
+    )  # pressed, not through
     assert points[0] == pytest.approx(body[0], abs=0.01)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
+from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
@@ -44,8 +44,8 @@ def readings(pushes, *, friction=0.0, acceleration=(0.0, 0.0)):
     return torques, imu, np.sum([load for _, _, load in loads], axis=0), turning_nm
 
 
-def estimated(torques, imu, pose: Pose | None = None) -> list[FeltContact]:
-    return estimate(ROBOT, SHAPE.tolist(), [0.0] * COUNT, torques, imu, pose)
+def estimated(torques, imu, pose: Pose | None = None) -> list[EstimatedPush]:
+    return estimate_pushes(ROBOT, SHAPE.tolist(), [0.0] * COUNT, torques, imu, pose)
 
 
 @pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, pose(velocity_w=(0.3, 0.0, 0.0)))])
@@ -89,4 +89,4 @@ def test_pitch_joints_give_no_equation_and_break_nothing():
     mixed = make_robot(axes=("yaw", "pitch"))
     torques, imu, *_ = readings([])
     torques = [3.0 if joint.axis == "pitch" else torque for joint, torque in zip(mixed.joints, torques, strict=True)]
-    assert estimate(mixed, [0.0] * COUNT, [0.0] * COUNT, torques, imu, None) == []
+    assert estimate_pushes(mixed, [0.0] * COUNT, [0.0] * COUNT, torques, imu, None) == []

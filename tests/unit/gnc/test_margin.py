@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.push import Touches, find_touches, push_forward
 from snakesim_gnc.geometry.planar import wrenches
-from snakesim_gnc.navigation.margin import LARGEST_N, margins_n
+from snakesim_gnc.navigation.margin import MAX_CONTACT_FORCE_N, compute_margins_n
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
@@ -43,8 +43,8 @@ def test_the_margin_is_that_of_the_best_three_contacts(seed: int, count: int) ->
             if abs(np.linalg.det(matrix)) > 1e-3:
                 forces = np.linalg.solve(matrix, drag[body])
                 if forces.min() > 1e-9:
-                    best = max(best, LARGEST_N / forces.max())
-        found = margins_n(contacts, drag)[body]
+                    best = max(best, MAX_CONTACT_FORCE_N / forces.max())
+        found = compute_margins_n(contacts, drag)[body]
         assert found >= best * (1 - 1e-6)
         assert found <= best * (1 + 1e-6) or best == 0.0 or found > best  # nearly singular threes may be better still
 
@@ -53,8 +53,8 @@ def test_contacts_on_one_side_cannot_push() -> None:
     points = np.array([[0.2, 0.04], [0.6, 0.04], [1.0, 0.04], [1.3, 0.04]])
     contacts = wrenches(points, np.tile([0.0, -1.0], (4, 1)))
     drag = np.array([1.0, 0.0, 0.0])
-    assert margins_n(contacts[None], drag[None])[0] == 0.0
-    assert margins_n(contacts[None, :2], drag[None])[0] == 0.0  # nor can two
+    assert compute_margins_n(contacts[None], drag[None])[0] == 0.0
+    assert compute_margins_n(contacts[None, :2], drag[None])[0] == 0.0  # nor can two
 
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])

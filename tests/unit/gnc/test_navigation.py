@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.navigation.intents import LONGEST_NS, DesiredMotion, Intents
+from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
 from tests.unit.gnc.stage import make_world

@@ -36,7 +36,7 @@ def planned_row():
 
 def points_at(tail_s_m, *, kept=(), off_w=(0.0, 0.0)):
     stage = make_stage()
-    lie = BodyOnPath(stage.route, SEGMENTS).at(tail_s_m)
+    lie = BodyOnPath(stage.route, SEGMENTS).pose_at(tail_s_m)
     measured = nodes_of(stage, tail_s_m) + np.array(off_w)[:, None]
     return push_points(planned_row(), kept, lie, measured, NODE_S, **LIMITS), lie
 
@@ -174,6 +174,6 @@ def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list
     planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:5]]
     points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
     triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.choices(points, BodyOnPath(route, SEGMENTS).at(0.2).nodes_w, NODE_S, None, None)
+    found, refused = triplets.choices(points, BodyOnPath(route, SEGMENTS).pose_at(0.2).nodes_w, NODE_S, None, None)
     assert ["".join(name[-1] for name in c.triplet.names) for c in found] == pushes
     assert all("lambda_1" in why for why in refused)

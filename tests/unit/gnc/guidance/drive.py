@@ -76,14 +76,14 @@ class Drive:
             self.turn = turn
             here, before = self.place(self.turn), self.place(self.turn - 1)
             timestamp_ns = self.turn * STEP_NS
-            self.world.take_joints(self.joints(here, before), None, self.imu(here, before) if imu else None)
+            self.world.add_joints(self.joints(here, before), None, self.imu(here, before) if imu else None)
             if pose:
-                self.world.take_pose(self.pose(here))
+                self.world.add_pose(self.pose(here))
             if images and self.turn % IMAGE_EVERY == 0:
                 self.under_way.append((self.turn + DELAY_TURNS, self.image(here, timestamp_ns)))
             while self.under_way and self.under_way[0][0] <= self.turn:
-                self.world.take_look(self.under_way.pop(0)[1], NOISE)
-            self.world.world(self.turn, timestamp_ns)
+                self.world.add_look(self.under_way.pop(0)[1], NOISE)
+            self.world.make_world(self.turn, timestamp_ns)
             yield here
         self.turn += 1
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from snakesim_gnc.guidance.depth_scan import Intrinsics
-from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
+from snakesim_gnc.guidance.scan import Noise, Scan, make_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
 from snakesim_operator.features.robots.urdf_tree import rotation
@@ -147,7 +147,7 @@ def scanned(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), timestam
     """What that lidar sees from a place near the ground, looking along x."""
     position, ahead = np.array([*at, 0.05]), turned(0.0)
     ranges = lidar(obstacles, position, ahead, beams=361, timestamp_ns=timestamp_ns)
-    return scan_of_ranges(ranges, position, ahead, 0.0, Noise(0.002, 0.0))
+    return make_scan(ranges, position, ahead, 0.0, Noise(0.002, 0.0))
 
 
 def turned(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:

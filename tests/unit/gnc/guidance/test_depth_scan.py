@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_gnc.guidance.depth_scan import DepthScanner, metres_of
-from snakesim_gnc.guidance.ground import plane_under, refined
-from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
+from snakesim_gnc.guidance.depth_scan import DepthScanner, decode_depth_m
+from snakesim_gnc.guidance.ground import fit_plane_under, refine_plane
+from snakesim_gnc.guidance.scan import Noise, Scan, make_scan
 from snakesim_hal.model.outlines import outline_distance_m
 from tests.unit.gnc.guidance.rendered import INTRINSICS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
 
@@ -22,7 +22,7 @@ def look(obstacles, rotation, *, ground=flat, eye=None, at=(0.0, 0.0)) -> Scan:
     position = np.array([*at, z])
     image = depth_image(obstacles, position, rotation, ground=ground, eye=eye)
     scanner = DepthScanner(INTRINSICS, Noise(0.002, 0.003))
-    return scanner.scan(metres_of(image), 0, position, rotation, np.array([z - EYE_M, 0.0, 0.0]))
+    return scanner.scan(decode_depth_m(image), 0, position, rotation, np.array([z - EYE_M, 0.0, 0.0]))
 
 
 def errors_m(scan, obstacles) -> np.ndarray:
@@ -66,10 +66,10 @@ def test_hills_are_ground(seed):
 
 def test_free_space_ends_at_the_first_obstacle():
     scan = look(SCENE, turned(0.0))
-    bins, ranges = scan.bins_of(np.array([[0.5, 0.083], [2.0, 0.333]]))  # before and behind the near one
+    bins, ranges = scan.find_bins(np.array([[0.5, 0.083], [2.0, 0.333]]))  # before and behind the near one
     assert bins[0] == bins[1] >= 0
     assert ranges[0] < scan.clear_m()[bins[0]] < ranges[1]
-    assert scan.bins_of(np.array([-1.0, 0.0]))[0] == -1
+    assert scan.find_bins(np.array([-1.0, 0.0]))[0] == -1
 
 
 def test_nothing_seen_is_nothing_known():
@@ -80,7 +80,7 @@ def test_nothing_seen_is_nothing_known():
 def test_a_lidar_sees_the_same_shapes_all_around():
     position, rotation = np.array([0.0, 0.0, 0.05]), turned(0.3)
     around = [*SCENE, cylinder("left", 0.1, 0.5)]
-    scan = scan_of_ranges(lidar(around, position, rotation), position, rotation, 0.0, Noise())
+    scan = make_scan(lidar(around, position, rotation), position, rotation, 0.0, Noise())
     off = errors_m(scan, around)
     assert len(off) > 30 and off.max() < 1e-6
     names = {min(around, key=lambda o: abs(outline_distance_m(o, p))).name for p in scan.points_w if np.isfinite(p[0])}
@@ -90,18 +90,18 @@ def test_a_lidar_sees_the_same_shapes_all_around():
 def test_a_beam_into_the_ground_is_no_obstacle():
     position, rotation = np.array([0.0, 0.0, 0.05]), turned(0.0, 0.1)
     ranges = lidar([], position, rotation, beams=1)
-    scan = scan_of_ranges(ranges, position, rotation, 0.0, Noise())
+    scan = make_scan(ranges, position, rotation, 0.0, Noise())
     assert not np.isfinite(scan.range_m).any()
 
 
 def test_the_plane_follows_a_slope_and_not_what_stands_on_it():
     bottoms = np.column_stack([np.linspace(-1.4, 0, 14), np.zeros(14), 0.05 * np.linspace(-1.4, 0, 14)])
-    plane = plane_under(bottoms, np.zeros(2))
+    plane = fit_plane_under(bottoms, np.zeros(2))
     assert plane == pytest.approx([0.0, 0.05, 0.0], abs=0.01)
     random = np.random.default_rng(0)
     x, y = random.uniform(0, 1, 400), random.uniform(-0.5, 0.5, 400)
     ground = np.column_stack([x, y, 0.05 * x - 0.03 * y])
     peg = np.column_stack([np.full(80, 0.5), np.full(80, 0.1), random.uniform(0, 0.2, 80)])
-    found = refined(plane, np.vstack([ground, peg]))
+    found = refine_plane(plane, np.vstack([ground, peg]))
     assert found == pytest.approx([0.0, 0.05, -0.03], abs=0.005)
-    assert math.isclose(refined(plane, ground[:5])[1], plane[1])  # too few points to say
+    assert math.isclose(refine_plane(plane, ground[:5])[1], plane[1])  # too few points to say

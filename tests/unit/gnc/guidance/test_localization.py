@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.body_history import Base, BodyHistory
-from snakesim_gnc.guidance.perceived_world import quaternion_of
+from snakesim_gnc.guidance.perceived_world import quaternion_from_rotation
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from tests.unit.gnc.guidance.drive import STEP_NS, Drive, random_field
 from tests.unit.gnc.guidance.rendered import turned
@@ -53,10 +53,10 @@ def test_a_pose_that_jumps_is_not_believed_until_it_stays():
     drive = Drive([])
     *_, here = drive.turns(50, images=False)
     for here in drive.turns(10, pose=False, images=False):
-        drive.world.take_pose(drive.pose(here, off_m=0.3))
+        drive.world.add_pose(drive.pose(here, off_m=0.3))
     assert abs(drive.world.localizer.base.planar_w[0] - here.base_w[0]) < 0.03 and drive.world.localizer.refused == 10
     for here in drive.turns(20, pose=False, images=False):
-        drive.world.take_pose(drive.pose(here, off_m=0.3))
+        drive.world.add_pose(drive.pose(here, off_m=0.3))
     assert drive.world.localizer.base.planar_w[0] == pytest.approx(here.base_w[0] + 0.3, abs=0.005)
 
 
@@ -66,7 +66,7 @@ def test_a_late_pose_corrects_what_has_happened_since():
     for here in drive.turns(150, pose=False, images=False):
         late.append(drive.pose(here))
         if len(late) > 10:  # 0.2 s, in which it goes 4 cm
-            drive.world.take_pose(late.pop(0))
+            drive.world.add_pose(late.pop(0))
     assert math.dist(drive.world.localizer.base.planar_w[:2], drive.place(drive.turn - 1).base_w[:2]) < 0.012
 
 
@@ -82,7 +82,7 @@ def test_the_history_gives_the_body_at_any_stamp_it_has_and_no_other():
     middle = 0.5 * (places[40].head_w + places[41].head_w)
     assert np.abs(half.head_w - middle).max() < 1e-4
     assert history.body_at(59 * STEP_NS + 10 * STEP_NS) is None
-    history.move(np.array(places[50].base_w[:2]), np.array([0.1, 0.0, 0.0]))
+    history.shift(np.array(places[50].base_w[:2]), np.array([0.1, 0.0, 0.0]))
     moved = history.base_at(55 * STEP_NS)
     assert moved is not None and moved.planar_w[0] == pytest.approx(places[55].base_w[0] + 0.1)
 
@@ -90,4 +90,4 @@ def test_the_history_gives_the_body_at_any_stamp_it_has_and_no_other():
 def test_quaternions_go_there_and_back():
     for angles in ((0.3, 0.2, -0.1), (3.1, 0.0, 0.0), (-2.0, 1.2, 3.0), (0.0, -1.5, 1.0)):
         rotation = turned(*angles)
-        assert rotation_from_quaternion(quaternion_of(rotation)) == pytest.approx(rotation)
+        assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(rotation)

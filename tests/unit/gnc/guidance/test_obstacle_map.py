@@ -20,14 +20,14 @@ BODY_M = 0.04
 def mapped(*obstacles, looks=4) -> ObstacleMap:
     map_ = ObstacleMap()
     for k in range(looks):
-        map_.take_scan(scanned(*obstacles, timestamp_ns=k * S // 20))
+        map_.add_scan(scanned(*obstacles, timestamp_ns=k * S // 20))
     return map_
 
 
 def touch(map_, center, radius_m, angle_rad) -> None:
     """A contact with a round thing, from outside."""
     normal = np.array([math.cos(angle_rad), math.sin(angle_rad)])
-    map_.take_touches([(np.array(center) + radius_m * normal, normal)], 0)
+    map_.add_touches([(np.array(center) + radius_m * normal, normal)], 0)
 
 
 def only(map_, now_ns=0) -> Obstacle:
@@ -61,7 +61,7 @@ def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_
     touch(map_, (0.8, 0.0), 0.05, 3.0)
     reported = only(map_)
     assert reported.felt and reported.name == name
-    assert map_.at(np.array([0.75, 0.0])) is map_.tracks[0] and map_.at(np.array([0.5, 0.5])) is None
+    assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0] and map_.find_track(np.array([0.5, 0.5])) is None
     touch(map_, (0.8, 0.4), 0.05, 3.0)
     assert len(map_.obstacles(0, 0.0)) == 2
 
@@ -69,7 +69,7 @@ def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_
 def test_what_one_can_see_through_is_dropped():
     map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
     for k in range(8):
-        map_.take_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k))
+        map_.add_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k))
     assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.obstacles(0, 0.0))
     assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
 
@@ -77,10 +77,10 @@ def test_what_one_can_see_through_is_dropped():
 def test_what_is_hidden_or_out_of_view_is_kept():
     map_ = mapped(cylinder("a", 1.2, 0.0))
     for k in range(20):
-        map_.take_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
+        map_.add_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
     for k in range(20):
-        map_.take_scan(scanned(at=(2.0, 0.0), timestamp_ns=k))
+        map_.add_scan(scanned(at=(2.0, 0.0), timestamp_ns=k))
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
@@ -88,7 +88,7 @@ def test_what_the_body_passes_through_does_not_exist():
     map_ = mapped(cylinder("smoke", 0.6, 0.0), cylinder("beside", 0.6, 0.3))
     for k in range(40):
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
-        map_.take_body(axis, BODY_M)
+        map_.carve_body(axis, BODY_M)
     reported = map_.obstacles(0, 0.0)
     assert len(reported) == 1 and math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
 
@@ -96,11 +96,11 @@ def test_what_the_body_passes_through_does_not_exist():
 def test_where_the_body_lies_nothing_reaches():
     map_ = ObstacleMap()
     for k in range(4):  # one face of a box: how deep it is, is a guess
-        map_.take_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
+        map_.add_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
     axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
     assert (outer := only(map_)).half_size_m and _depth_beyond(outer, axis) > 0.02
     for _ in range(5):
-        map_.take_body(axis, BODY_M)
+        map_.carve_body(axis, BODY_M)
     assert _depth_beyond(only(map_), axis) < 0.012
 
 
@@ -113,7 +113,7 @@ def test_the_newest_look_counts_most_after_drift():
     still, drifted = mapped(cylinder("a", 0.8, 0.0)), mapped(cylinder("a", 0.8, 0.0))
     drifted.drift(0.02**2)
     for map_ in (still, drifted):
-        map_.take_scan(scanned(cylinder("a", 0.815, 0.0)))
+        map_.add_scan(scanned(cylinder("a", 0.815, 0.0)))
     assert only(drifted).position_w[0] == pytest.approx(0.815, abs=0.003)
     assert only(still).position_w[0] < 0.812
 
@@ -125,7 +125,7 @@ def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
     assert len(map_.tracks) == 1
     map_.forget(np.array([[KEPT_M + 1.0, 0.0]]))
     assert not map_.tracks
-    map_.take_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
+    map_.add_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
     assert len(map_.tracks) == 100
     map_.forget(np.zeros((1, 2)))
     assert len(map_.tracks) == 64

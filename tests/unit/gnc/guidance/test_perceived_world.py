@@ -14,7 +14,7 @@ from tests.unit.hal.rig import contact
 
 
 def reported(drive: Drive) -> World:
-    world = drive.world.world(drive.turn, drive.turn * STEP_NS)
+    world = drive.world.make_world(drive.turn, drive.turn * STEP_NS)
     assert world is not None
     return world
 
@@ -64,14 +64,14 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     drive = Drive(random_field(1))
     *_, here = drive.turns(30)
     image, before = drive.image(here, 30 * STEP_NS), reported(drive)
-    drive.world.take_look(msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE)  # older than what is in the map
-    drive.world.take_look(msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE)  # of the future
+    drive.world.add_look(msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE)  # older than what is in the map
+    drive.world.add_look(msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE)  # of the future
     joints = drive.joints(here, here)
     broken = msgspec.structs.replace(
         joints, timestamp_ns=joints.timestamp_ns + STEP_NS, valid=[False] * len(joints.valid)
     )
-    drive.world.take_joints(broken, None, None)
-    drive.world.take_look(image, NOISE)
+    drive.world.add_joints(broken, None, None)
+    drive.world.add_look(image, NOISE)
     assert sum(drive.world.refused.values()) == 3 and len(drive.world.refused) == 3
     after = reported(drive)
     assert after.depth_timestamp_ns == before.depth_timestamp_ns and len(after.obstacles) == len(before.obstacles)
@@ -99,8 +99,8 @@ def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():
     touch = contact(7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0))
     drive = Drive([])
     for _ in drive.turns(10, images=False):
-        drive.world.take_contacts(Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch]))
-    world = drive.world.world(9, 9 * STEP_NS)
+        drive.world.add_contacts(Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch]))
+    world = drive.world.make_world(9, 9 * STEP_NS)
     assert world is not None and world.contacts
     assert {c.obstacle for c in world.contacts} <= {o.name for o in world.obstacles}
     assert all(o.felt for o in world.obstacles) and "simulator" not in repr(world)
@@ -111,7 +111,7 @@ def test_a_lidar_maps_as_a_camera_does():
     here = drive.place(0)
     for here in drive.turns(60, images=False):
         beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], timestamp_ns=drive.turn * STEP_NS)
-        drive.world.take_look(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
+        drive.world.add_look(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
     total = score(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
     assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
 
@@ -119,4 +119,4 @@ def test_a_lidar_maps_as_a_camera_does():
 def test_before_the_first_joint_state_there_is_no_world():
     drive = Drive([])
     world = PerceivedWorld(drive.robot, drive.world.localizer.base, PoseNoise())
-    assert world.world(0, 0) is None
+    assert world.make_world(0, 0) is None

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_gnc.guidance.clusters import clusters_of
+from snakesim_gnc.guidance.clusters import find_clusters
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, Surface
-from snakesim_gnc.guidance.tracks import Track, fit
+from snakesim_gnc.guidance.tracks import Track, fit_shapes
 from snakesim_hal.model.outlines import outline_distance_m
 from tests.unit.gnc.guidance.rendered import box, cylinder, scanned
 
@@ -29,11 +29,11 @@ def seen(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
         if random is not None:
             points = points - towards * noise_m * random.standard_normal(len(points))[:, None]
         track.surface.add(points, np.full(len(hits), noise_m), towards)
-    fit([track])
+    fit_shapes([track])
     return track
 
 
-def test_things_apart_are_clusters_of_their_own():
+def test_things_apart_are_find_clusters_their_own():
     things = [
         cylinder("a", 0.8, 0.3),
         cylinder("b", 0.8, 0.1),
@@ -41,7 +41,7 @@ def test_things_apart_are_clusters_of_their_own():
         box("c", 0.7, -0.3, (0.1, 0.2)),
     ]
     scan = scanned(*things)
-    clusters = clusters_of(scan)
+    clusters = find_clusters(scan)
     owners = [
         {min(things, key=lambda o: abs(outline_distance_m(o, scan.points_w[i]))).name for i in c} for c in clusters
     ]
@@ -51,8 +51,8 @@ def test_things_apart_are_clusters_of_their_own():
 
 def test_a_concave_corner_is_two_things():
     walls = [box("ahead", 1.0, 0.0, (0.05, 1.0)), box("beside", 0.5, 0.5, (1.0, 0.05))]
-    assert len(clusters_of(scanned(*walls))) >= 2
-    assert len(clusters_of(scanned(walls[0]))) == 1
+    assert len(find_clusters(scanned(*walls))) >= 2
+    assert len(find_clusters(scanned(walls[0]))) == 1
 
 
 @given(st.floats(0.03, 0.08), st.floats(0.3, 1.2), st.floats(-0.5, 0.5), st.integers(0, 1000))
@@ -97,7 +97,7 @@ def test_a_short_arc_leaves_the_line_of_sight_uncertain():
     whole, part = seen(cylinder("it", 0.8, 0.0)), Track(2, "part")
     few = slice(len(whole.surface) // 2 - 2, len(whole.surface) // 2 + 2)
     part.surface.add(whole.surface.points_w[few], np.full(4, NOISE_M), whole.surface.outward_w[few])
-    fit([part])
+    fit_shapes([part])
     assert part.position_sd_m > 5 * whole.position_sd_m
 
 
@@ -125,8 +125,8 @@ def test_fusing_looks_lowers_the_scatter_and_the_told_error():
 def test_pieces_of_a_wall_become_one():
     map_ = ObstacleMap()
     hidden = [box("wall", 1.0, 0.0, (0.05, 1.6)), cylinder("post", 0.5, 0.0, 0.03)]
-    map_.take_scan(scanned(*hidden))
+    map_.add_scan(scanned(*hidden))
     assert len(map_.tracks) == 3  # the post hides the middle of the wall
     for _ in range(8):
-        map_.take_scan(scanned(hidden[0]))
-    assert [t.shape for t in map_.tracks if t.believed(0) > 0.4] == ["box"]
+        map_.add_scan(scanned(hidden[0]))
+    assert [t.shape for t in map_.tracks if t.belief_at(0) > 0.4] == ["box"]
