@@ -112,10 +112,10 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _report(arguments: argparse.Namespace) -> int:
     from snakesim_hal.model.textfiles import write_text
-    from snakesim_operator.results.ended import ended
-    from snakesim_operator.results.incomplete import exit_code
+    from snakesim_operator.results.missing_data import exit_code
     from snakesim_operator.results.record import REPORT, RunRecord
     from snakesim_operator.results.report import page
+    from snakesim_operator.results.run_ending import ended
     from snakesim_operator.results.summary import summarise
 
     given: Path = arguments.recording

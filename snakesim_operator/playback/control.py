@@ -36,13 +36,13 @@ from snakesim_hal.wire.messages import (
     JointCommand,
     SettingsRequest,
 )
-from snakesim_operator.playback.order import in_robot_order
+from snakesim_operator.playback.play import in_robot_order
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import CONFIG
-from snakesim_operator.results.recorded import Contents, read_recording
+from snakesim_operator.results.recording_contents import Contents, read_recording
 
 MADE_BY = {
     "guidance": (keys.WORLD,),

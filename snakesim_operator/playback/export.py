@@ -23,7 +23,7 @@ from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 
 LACKS = b"snakesim.lacks"  # metadata of a Parquet file: JSON

@@ -22,10 +22,9 @@ from snakesim_hal.wire.messages import ControlSettings, Status
 from snakesim_operator.recording.losses import Gap
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.gaps import unread
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import describe_undecodable, exit_code
 from snakesim_operator.results.record import GIVE
-from snakesim_operator.results.recorded import ALL, Contents
+from snakesim_operator.results.recording_contents import ALL, Contents
 from snakesim_operator.robot_commands.parameters import PREFIX, differing
 
 # Published on a change too, so that nothing is missing there.
@@ -114,7 +113,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         file=str(path),
         size_bytes=path.stat().st_size,
         finished=reader.finished,
-        lacks=[*reader.lacks, *_skipped(found, reader.losses.lost, irregular), *unread(contents.refused)],
+        lacks=[*reader.lacks, *_skipped(found, reader.losses.lost, irregular), *describe_undecodable(contents.refused)],
         gaps=[gap for gap in reader.losses.gaps if gap.lost],
         robot=None if robot is None else robot.robot,
         backend=None if robot is None else robot.backend,

@@ -15,7 +15,7 @@ from snakesim_hal.base.terminal import Say, say
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.textfiles import exported
 from snakesim_operator.base import extras
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 
 Picture = NDArray[np.uint8]

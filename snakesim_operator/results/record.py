@@ -22,8 +22,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
-from snakesim_operator.results.gaps import cleaned, unread, unwritten
-from snakesim_operator.results.recorded import OUTPUTS, Contents, read_recording
+from snakesim_operator.results.missing_data import describe_undecodable, describe_unwritten, replace_invalid_numbers
+from snakesim_operator.results.recording_contents import OUTPUTS, Contents, read_recording
 
 CONFIG = "config.json"
 SUMMARY = "summary.json"
@@ -131,13 +131,15 @@ class RunRecord:
         columns: dict[str, NDArray[Any]],
     ) -> "RunRecord":
         host = msgspec.structs.replace(host, lost_ticks=max(host.lost_ticks, host.ticks - len(columns["tick"])))
-        cleaned_columns, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
+        cleaned_columns, lacks = replace_invalid_numbers(
+            columns, description, has_pose=config.robot.sensors.pose is not None
+        )
         control = contents.streams[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
         refused = contents.refused.copy()
         own = contents.own_columns(description, cleaned_columns["time_s"])
-        lacks += unread(contents.refused - refused)
+        lacks += describe_undecodable(contents.refused - refused)
         known = {name: column for name, column in cleaned_columns.items() if name != "tick"}
         streams = (control, contents.streams[keys.WORLD], contents.streams[keys.TRAJECTORY])
         return RunRecord(
@@ -149,7 +151,7 @@ class RunRecord:
             **known,
             own=own,
             searched_nodes=contents.searched_nodes,
-            lacks=lacks + unwritten(host) + contents.unreached + contents.lacks,
+            lacks=lacks + describe_unwritten(host) + contents.unreached + contents.lacks,
             unreached=contents.unreached,
             replay_of=contents.replay_of,
             alone=folder == contents.path,

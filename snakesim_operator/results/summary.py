@@ -10,12 +10,12 @@ from msgspec import Meta
 from snakesim_hal.base.arithmetic import foreign
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, Mode, Timing
-from snakesim_operator.results.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
-from snakesim_operator.results.effort import Directions, Effort
-from snakesim_operator.results.estimates import Estimates
-from snakesim_operator.results.force_tracking import force_tracking
-from snakesim_operator.results.motion import Motion, motion_of
-from snakesim_operator.results.propulsion import count_hand_overs, propulsion_periods
+from snakesim_operator.results.metrics.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
+from snakesim_operator.results.metrics.effort import Directions, Effort
+from snakesim_operator.results.metrics.estimates import Estimates
+from snakesim_operator.results.metrics.force_tracking import force_tracking
+from snakesim_operator.results.metrics.motion import Motion, motion_of
+from snakesim_operator.results.metrics.propulsion import count_hand_overs, propulsion_periods
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit

@@ -9,7 +9,7 @@ from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 
 PAGE = "compare.html"

@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
-from snakesim_operator.results.propulsion import Propulsion, propulsion_periods
+from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_periods
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.compare.difference import Advance, Difference, Gap
+from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
-from snakesim_operator.results.propulsion import propulsion_intervals
 
 A, B = "--measured", "--reference"
 

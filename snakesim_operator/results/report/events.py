@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from snakesim_operator.results.motion import motion_of
-from snakesim_operator.results.propulsion import propulsion_periods
+from snakesim_operator.results.metrics.motion import motion_of
+from snakesim_operator.results.metrics.propulsion import propulsion_periods
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unmeasured
 from snakesim_operator.results.report.timeline import jam_bands

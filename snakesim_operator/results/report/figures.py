@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_operator.results.motion import MOVING, STANDING, motion_of
+from snakesim_operator.results.metrics.motion import MOVING, STANDING, motion_of
+from snakesim_operator.results.metrics.propulsion import Propulsion
 from snakesim_operator.results.page.charts import Bar, Figure, Floats, Line, Mark, bars, joint_map, lines
-from snakesim_operator.results.propulsion import Propulsion
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import (
     Series,

@@ -8,8 +8,8 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
+from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.html import render
-from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import Event, drawn_instants, events, listed

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.motion import MOVING, STANDING, Motion, motion_of
+from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, motion_of
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels

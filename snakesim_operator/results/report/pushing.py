@@ -8,8 +8,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
-from snakesim_operator.results.map_score import MapScore, score
-from snakesim_operator.results.motion import motion_of
+from snakesim_operator.results.metrics.map_score import MapScore, score
+from snakesim_operator.results.metrics.motion import motion_of
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import longest_reason, state_bands

@@ -8,8 +8,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.motion import Motion
-from snakesim_operator.results.propulsion import Propulsion
+from snakesim_operator.results.metrics.motion import Motion
+from snakesim_operator.results.metrics.propulsion import Propulsion
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.summary import arc_position_m
 from snakesim_operator.results.time_axis import Interval, merge_reports, reported_at_s, reported_spans, zero_s

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from snakesim_hal.model.locomotion import STANDING_STILL
-from snakesim_operator.results.ended import COMPLETE, UNKNOWN
-from snakesim_operator.results.motion import Motion, motion_of
+from snakesim_operator.results.metrics.motion import Motion, motion_of
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.purpose import purpose_of
 from snakesim_operator.results.report.timeline import longest_reason, reported_while_moving
+from snakesim_operator.results.run_ending import COMPLETE, UNKNOWN
 from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 from snakesim_operator.results.time_axis import end_s, reported_at_s
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, events

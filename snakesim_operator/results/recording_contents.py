@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.recording.message import RecordedMessage
-from snakesim_operator.results.gaps import unread
+from snakesim_operator.results.missing_data import describe_undecodable
 
 SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 """What guidance, navigation and control publish."""
@@ -224,7 +224,7 @@ def read_recording(
             hear(recorded)
         if recorded.key in wanted or keys.row_key(recorded.key) in wanted:
             contents.take(recorded)
-    contents.lacks += unread(contents.refused)
+    contents.lacks += describe_undecodable(contents.refused)
     contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
     contents.whole, losses = reader.finished, reader.losses
     known = losses.lost[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)

@@ -6,8 +6,8 @@ import numpy as np
 
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_operator.results.advance import MIN_DISTANCE_M, Advance, energy_j, energy_j_per_m
-from snakesim_operator.results.form_closure import contacts_beside, form_closure_margin
+from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, Advance, energy_j, energy_j_per_m
+from snakesim_operator.results.metrics.form_closure import contacts_beside, form_closure_margin
 from snakesim_operator.results.record import RunRecord
 
 
