@@ -12,7 +12,7 @@ from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.html import render
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
+from snakesim_operator.results.report.events import Event, drawn_instants, find_events, select_listed
 from snakesim_operator.results.report.instants import measured_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
@@ -34,7 +34,8 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_
 
 def page(record: RunRecord, summary: RunSummary) -> str:
     """The whole page."""
-    found, every = events(record, summary), propulsion_intervals(record)
+    found = find_events(record, summary)
+    every = propulsion_intervals(record)
     intervals = joined(every, end_s(record) / TURNS_SHOWN)
     return render(
         HERE / "report.html",
@@ -49,7 +50,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         in_words=in_words,
         film=playback(record),
         names=[joint.name for joint in record.description.joints],
-        events=listed(found),
+        events=select_listed(found),
         instants=_instants(record, found),
         pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
@@ -83,7 +84,7 @@ def playback_page(record: RunRecord, summary: RunSummary) -> str:
         title=record.config.title or summary.scenario,
         verdict=verdict(record, summary),
         film=playback(record),
-        events=listed(events(record, summary)),
+        events=select_listed(find_events(record, summary)),
         names=[joint.name for joint in record.description.joints],
     )
 

@@ -25,7 +25,7 @@ def force_polygon(
     balance: Balance, felt: list[WorldContact], width: float, height: float, scale: float, *, upright: bool = False
 ) -> str:
     """A drawing. felt: measured then; scale: units per newton; upright: turned by a quarter, as the view beside it."""
-    *kinds, sum_kind = balance.kinds(felt)
+    kinds, sum_kind = balance.force_classes(felt)
     corners_n = _turned(balance, upright)
     middle = (corners_n.min(axis=0) + corners_n.max(axis=0)) / 2
     corners: list[Point] = [

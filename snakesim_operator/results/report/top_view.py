@@ -133,7 +133,7 @@ def _solved(instant: Instant, view: View, labels: Labels) -> str:
     if instant.balance is None:
         return ""
     parts: list[str] = []
-    *kinds, sum_kind = instant.balance.kinds(instant.felt)
+    kinds, sum_kind = instant.balance.force_classes(instant.felt)
     for contact, force, kind in zip(instant.balance.contacts, instant.balance.contact_n, kinds, strict=True):
         at = view.at(contact.position_w)
         tip = view.along(at, force, view.force_scale)
