@@ -10,7 +10,7 @@ from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Balance, Instant
 from snakesim_operator.results.report.labels import Labels
-from snakesim_operator.results.report.polygon import pretty
+from snakesim_operator.results.report.polygon import with_subscript
 from snakesim_operator.results.report.svg import (
     arrow,
     element,
@@ -44,11 +44,11 @@ def top_view(record: RunRecord, instant: Instant, view: View) -> str:
         what += f", {name} propels"
         fill = f"fill:var(--joint-{joint})"
         parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_="propelling", style=fill))
-        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
+        parts.append(labels.place_label(at, name, "halo strong", gaps=(16, 22, 30, 40)))
     if instant.balance is not None:
         parts += [_push_point(i, instant.balance, view, labels) for i in range(len(instant.balance.contacts))]
     for end, word in ((nodes[0], "tail"), (nodes[-1], "head")):
-        parts.append(labels.put(view.at(end), word, "halo soft", gaps=(16, 24, 34)))
+        parts.append(labels.place_label(view.at(end), word, "halo soft", gaps=(16, 24, 34)))
     return figure(view.width, view.height, what, *parts, scales(view))
 
 
@@ -125,7 +125,7 @@ def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
     tip = view.along(start, contact.force_w, cut * view.force_scale)
     labels.keep_off_line(start, tip, 3)
     drawn = arrow(start, tip, "felt", head=8)
-    return drawn + labels.put(tip, f"{size:.0f} N", "halo felt-text", gaps=(6, 12)) if cut < 1.0 else drawn
+    return drawn + labels.place_label(tip, f"{size:.0f} N", "halo felt-text", gaps=(6, 12)) if cut < 1.0 else drawn
 
 
 def _solved(instant: Instant, view: View, labels: Labels) -> str:
@@ -151,8 +151,8 @@ def _push_point(i: int, balance: Balance, view: View, labels: Labels) -> str:
     contact, size = balance.contacts[i], balance.size_n[i]
     foot = view.at(contact.position_w)
     tip, behind = (view.along(foot, contact.normal_w, far) for far in (size * view.force_scale, -18.0))
-    force = labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot)
-    return force + labels.put(behind, pretty(f"o_{i + 1}"), "halo strong", away_from=foot)
+    force = labels.place_label(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot)
+    return force + labels.place_label(behind, with_subscript(f"o_{i + 1}"), "halo strong", away_from=foot)
 
 
 def scales(view: View) -> str:
