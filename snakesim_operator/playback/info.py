@@ -96,7 +96,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         one.time_ns.append(recorded.time_ns)
         one.bytes += len(recorded.payload)
         if recorded.key in ALL:
-            contents.take(recorded)
+            contents.add(recorded)
         if recorded.key == keys.SETTINGS_IN_FORCE:
             with contextlib.suppress(WireError):
                 in_force.append(decoder.decode(recorded.payload, recorded.encoding))
