@@ -17,11 +17,12 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
 NEAR_M = 1.0
-VIEW_RAD = math.pi / 2  # of the camera
-NEAREST_M = 0.15  # a camera sees nothing nearer
+FOV_RAD = math.pi / 2  # of the camera
+VISIBLE_FRACTION = 0.45  # of the field of view on each side; at its edge half of an obstacle is outside
+MIN_RANGE_M = 0.15  # a camera sees nothing nearer
 MATCH_M = 0.05  # between a reported outline and the true one
-POINTS = 48  # on an outline
-SIGHT = np.linspace(0.0, 1.0, 24)[1:-1]  # of a line of sight, where it is looked whether something hides
+OUTLINE_POINTS = 48
+SIGHT = np.linspace(0.0, 1.0, 24)[1:-1]  # fractions of a line of sight at which an obstacle may hide what is behind
 
 
 @dataclass
@@ -38,11 +39,13 @@ class MapScore:
     visible: int = 0  # true ones that could be seen
 
     def add(self, other: "MapScore") -> None:
-        """Add another map's."""
+        """Add the score of another map."""
         for name in ("position_m", "surface_m", "size_m", "in_sd"):
             getattr(self, name).extend(getattr(other, name))
-        self.misses, self.ghosts = self.misses + other.misses, self.ghosts + other.ghosts
-        self.reported, self.visible = self.reported + other.reported, self.visible + other.visible
+        self.misses += other.misses
+        self.ghosts += other.ghosts
+        self.reported += other.reported
+        self.visible += other.visible
 
 
 def score(
@@ -51,88 +54,116 @@ def score(
     head_w: Sequence[float] | Floats,
     heading_rad: float,
 ) -> MapScore:
-    """Score the obstacles whose outlines are within NEAR_M of the head's front (2,)."""
+    """Score the obstacles whose outlines are within NEAR_M of the head.
+
+    Args:
+        reported: The obstacles of the map.
+        truth: The true obstacles.
+        head_w: (2,) or more, the front of the head.
+        heading_rad: Direction in which the camera looks.
+    """
     head = np.asarray(head_w, dtype=np.float64)[:2]
-    near = _within(truth, head, NEAR_M + MATCH_M)
-    true_outlines = Outlines.of(near)
-    found = MapScore()
+    near_truth = _within(truth, head, NEAR_M + MATCH_M)
+    true_outlines = Outlines.of(near_truth)
+    result = MapScore()
     matched: set[str] = set()
-    for one in _within(reported, head, NEAR_M):
-        found.reported += 1
-        errors = np.abs(true_outlines.distance_m(facing_points_w(one, head))).mean(axis=0)
-        best = int(np.argmin(errors)) if near else -1
-        if best < 0 or errors[best] > MATCH_M:
-            found.ghosts += 1
+    for obstacle in _within(reported, head, NEAR_M):
+        result.reported += 1
+        errors_m = np.abs(true_outlines.distance_m(facing_points_w(obstacle, head))).mean(axis=0)
+        best = int(np.argmin(errors_m)) if near_truth else -1
+        if best < 0 or errors_m[best] > MATCH_M:
+            result.ghosts += 1
             continue
-        true = near[best]
+        true = near_truth[best]
         matched.add(true.name)
-        off = math.dist(one.position_w[:2], true.position_w[:2])
-        found.position_m.append(off)
-        found.surface_m.append(float(errors[best]))
-        found.size_m.append(_size_m(one) - _size_m(true))
-        found.in_sd.append(off / max(one.position_sd_m, 1e-4))
+        position_error_m = math.dist(obstacle.position_w[:2], true.position_w[:2])
+        result.position_m.append(position_error_m)
+        result.surface_m.append(float(errors_m[best]))
+        result.size_m.append(_size_m(obstacle) - _size_m(true))
+        result.in_sd.append(position_error_m / max(obstacle.position_sd_m, 1e-4))
     for true in visible(truth, head, heading_rad):
-        found.visible += 1
-        found.misses += true.name not in matched
-    return found
+        result.visible += 1
+        if true.name not in matched:
+            result.misses += 1
+    return result
 
 
 def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
-    """True obstacles near the head whose center lies in view, and half of whose facing side no other one hides."""
+    """Return the obstacles near the head that a camera there sees.
+
+    The center of such an obstacle is in the field of view, and no other obstacle hides half of its facing side.
+    """
     near = _within(truth, head_w, NEAR_M)
-    outlines, found = Outlines.of(near), list[Obstacle]()
-    for i, true in enumerate(near):
-        to = np.array(true.position_w[:2]) - head_w
-        off = (math.atan2(to[1], to[0]) - heading_rad + math.pi) % (2 * math.pi) - math.pi
-        if abs(off) > 0.45 * VIEW_RAD or outlines.distance_m(head_w)[i] < NEAREST_M:
+    outlines = Outlines.of(near)
+    seen: list[Obstacle] = []
+    for i, obstacle in enumerate(near):
+        x, y = np.array(obstacle.position_w[:2]) - head_w
+        bearing_rad = (math.atan2(y, x) - heading_rad + math.pi) % (2 * math.pi) - math.pi
+        if abs(bearing_rad) > VISIBLE_FRACTION * FOV_RAD or outlines.distance_m(head_w)[i] < MIN_RANGE_M:
             continue
-        facing = facing_points_w(true, head_w)
-        sight = head_w + SIGHT[:, None, None] * (facing - head_w)  # (steps, points, 2)
-        inside = outlines.distance_m(sight) < 0
-        inside[..., i] = False
-        if inside.any(axis=(0, 2)).mean() < 0.5:
-            found.append(true)
-    return found
+        facing = facing_points_w(obstacle, head_w)
+        sight_w = head_w + SIGHT[:, None, None] * (facing - head_w)  # (steps, points, 2)
+        is_inside = outlines.distance_m(sight_w) < 0  # (steps, points, obstacles)
+        is_inside[..., i] = False
+        hidden_fraction = is_inside.any(axis=(0, 2)).mean()
+        if hidden_fraction < 0.5:
+            seen.append(obstacle)
+    return seen
 
 
 def facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
-    """Points (n, 2) on the part of the outline that can be seen from a place, were nothing else there."""
-    turn = (np.arange(POINTS) + 0.5) * 2 * math.pi / POINTS
-    normal = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    """Return points (n, 2) on the part of the outline that faces a place, whatever stands between."""
     if obstacle.shape == "box":
-        half = np.array(obstacle.half_size_m[:2])
-        along = (np.arange(POINTS // 4) + 0.5) / (POINTS // 4) * 2 - 1
-        sides = [(np.array([s, 0.0]), np.array([0.0, 1.0])) for s in (1.0, -1.0)]
-        sides += [(np.array([0.0, s]), np.array([1.0, 0.0])) for s in (1.0, -1.0)]
-        points = np.vstack([(side + along[:, None] * run) * half for side, run in sides])
-        normal = np.vstack([np.broadcast_to(side, (len(along), 2)) for side, _ in sides])
-        c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
-        turned = np.array([[c, s], [-s, c]])
-        points, normal = points @ turned, normal @ turned
+        points, normals = _box_outline(obstacle)
     else:
-        points = obstacle.radius_m * normal
+        angles = (np.arange(OUTLINE_POINTS) + 0.5) * 2 * math.pi / OUTLINE_POINTS
+        normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        points = obstacle.radius_m * normals
     points = points + np.array(obstacle.position_w[:2])
-    seen = ((from_w - points) * normal).sum(axis=1) > 0
-    return points[seen] if seen.any() else points
+    is_facing = ((from_w - points) * normals).sum(axis=1) > 0
+    return points[is_facing] if is_facing.any() else points
+
+
+def _box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
+    """Return points around a box's center, and the outward normals there, both (n, 2)."""
+    side_points = OUTLINE_POINTS // 4
+    half_size = np.array(obstacle.half_size_m[:2])
+    along = (np.arange(side_points) + 0.5) / side_points * 2 - 1  # -1 to 1
+    sides = [(np.array([sign, 0.0]), np.array([0.0, 1.0])) for sign in (1.0, -1.0)]  # normal and direction
+    sides += [(np.array([0.0, sign]), np.array([1.0, 0.0])) for sign in (1.0, -1.0)]
+    points = np.vstack([(normal + along[:, None] * direction) * half_size for normal, direction in sides])
+    normals = np.vstack([np.broadcast_to(normal, (len(along), 2)) for normal, _ in sides])
+    cos = math.cos(obstacle.yaw_rad)
+    sin = math.sin(obstacle.yaw_rad)
+    rotation = np.array([[cos, sin], [-sin, cos]])
+    return points @ rotation, normals @ rotation
 
 
 def moved(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
-    """Obstacles as they are when the base, thought to be at `from_w`, is at `to_w`, both x, y, heading.
+    """Return the obstacles as they are if the base, estimated at `from_w`, is really at `to_w`.
 
-    It takes a wrong pose out of a map's errors: what is left is the map as the robot sees it.
+    This removes a wrong pose from a map's errors: what remains is the map as the robot perceives it.
+
+    Args:
+        reported: Obstacles of the map.
+        from_w: Estimated x, y and heading.
+        to_w: True x, y and heading.
     """
-    turn = to_w[2] - from_w[2]
-    c, s = math.cos(turn), math.sin(turn)
-    found: list[Obstacle] = []
-    for one in reported:
-        x, y = one.position_w[0] - from_w[0], one.position_w[1] - from_w[1]
-        place = (to_w[0] + c * x - s * y, to_w[1] + s * x + c * y, one.position_w[2])
-        found.append(msgspec.structs.replace(one, position_w=place, yaw_rad=one.yaw_rad + turn))
-    return found
+    rotation_rad = to_w[2] - from_w[2]
+    cos = math.cos(rotation_rad)
+    sin = math.sin(rotation_rad)
+    corrected: list[Obstacle] = []
+    for obstacle in reported:
+        x = obstacle.position_w[0] - from_w[0]
+        y = obstacle.position_w[1] - from_w[1]
+        position_w = (to_w[0] + cos * x - sin * y, to_w[1] + sin * x + cos * y, obstacle.position_w[2])
+        yaw_rad = obstacle.yaw_rad + rotation_rad
+        corrected.append(msgspec.structs.replace(obstacle, position_w=position_w, yaw_rad=yaw_rad))
+    return corrected
 
 
 def _within(obstacles: Sequence[Obstacle], head_w: Floats, within_m: float) -> list[Obstacle]:
-    """Those whose outline is so near."""
+    """Return the obstacles whose outline is within a distance of the head."""
     near = Outlines.of(obstacles).distance_m(head_w) <= within_m
     return [one for one, is_near in zip(obstacles, near.tolist(), strict=True) if is_near]
 
