@@ -13,7 +13,7 @@ from snakesim_operator.results.record import RunRecord
 
 @dataclass(frozen=True)
 class Estimates:
-    """Of the last world model, and of all that were reckoned. None: unknown, or there was nothing to compare."""
+    """Sources of the last world model, and errors of dead reckoning. None: unknown, or nothing to compare with."""
 
     pose_from: str | None = None
     contacts_from: str | None = None
@@ -22,28 +22,38 @@ class Estimates:
 
     @staticmethod
     def of(record: RunRecord) -> "Estimates":
-        """Distances only where the pose was reckoned."""
+        """Return the estimates of a run. Distances are known only where the pose was dead reckoned."""
         if not record.worlds or len(record.time_s) == 0:
             return Estimates()
         last = record.worlds[-1]
         reckoned = [world for world in record.worlds if world.pose_from == "dead_reckoning"]
-        offs = [off for world in reckoned if (off := _off_m(record, world)) is not None]
-        moved = _moved_m(record, reckoned[0], reckoned[-1]) if len(reckoned) > 1 else None
-        return Estimates(last.pose_from, last.contacts_from, moved, max(offs, default=None))
+        errors_m = [_position_error_m(record, world) for world in reckoned]
+        known_errors_m = [error_m for error_m in errors_m if error_m is not None]
+        distance_m = _distance_between_m(record, reckoned[0], reckoned[-1]) if len(reckoned) > 1 else None
+        return Estimates(
+            pose_from=last.pose_from,
+            contacts_from=last.contacts_from,
+            reckoned_distance_m=distance_m,
+            reckoned_off_m=max(known_errors_m, default=None),
+        )
 
     def in_words(self) -> list[str]:
-        """A sentence for each estimate."""
-        said: list[str] = []
+        """Return a phrase for each estimate."""
+        phrases: list[str] = []
         if self.pose_from == "dead_reckoning":
-            moved = "" if self.reckoned_distance_m is None else f", {self.reckoned_distance_m:.3f} m far"
-            off = "" if self.reckoned_off_m is None else f", at most {100 * self.reckoned_off_m:.1f} cm off"
-            said.append(f"the pose is reckoned{moved}{off}")
+            phrase = "the pose is reckoned"
+            if self.reckoned_distance_m is not None:
+                phrase += f", {self.reckoned_distance_m:.3f} m far"
+            if self.reckoned_off_m is not None:
+                phrase += f", at most {100 * self.reckoned_off_m:.1f} cm off"
+            phrases.append(phrase)
         if self.contacts_from == "joint_torques":
-            said.append("contacts are estimated from joint torques")
-        return said
+            phrases.append("contacts are estimated from joint torques")
+        return phrases
 
 
-def _off_m(record: RunRecord, world: World) -> float | None:
+def _position_error_m(record: RunRecord, world: World) -> float | None:
+    """Return the distance from an estimated position to the measured one, or None if none was measured."""
     row = record.row_at(world.timestamp_ns * 1e-9)
     if not record.posed[row]:
         return None
@@ -51,18 +61,21 @@ def _off_m(record: RunRecord, world: World) -> float | None:
     return math.dist((x, y), world.base_position_w[:2])
 
 
-def _moved_m(record: RunRecord, first: World, last: World) -> float | None:
-    """Along the route; without one, of the body's middle."""
-    begin, end = _nodes_w(record, first), _nodes_w(record, last)
+def _distance_between_m(record: RunRecord, first: World, last: World) -> float | None:
+    """Return the advance along the route between two world models; without a route, of the body's middle."""
+    begin = _estimated_nodes_w(record, first)
+    end = _estimated_nodes_w(record, last)
     if not (np.isfinite(begin).all() and np.isfinite(end).all()):
         return None
-    if record.route is None:
-        return float(np.hypot(*(end - begin).mean(axis=0)))
     route = record.route
-    before_m, after_m = (float(np.mean([route.project(node) for node in nodes])) for nodes in (begin, end))
+    if route is None:
+        return float(np.hypot(*(end - begin).mean(axis=0)))
+    before_m = float(np.mean([route.project(node) for node in begin]))
+    after_m = float(np.mean([route.project(node) for node in end]))
     return after_m - before_m
 
 
-def _nodes_w(record: RunRecord, world: World) -> Floats:
-    angles = record.angle_rad[record.row_at(world.timestamp_ns * 1e-9)]
-    return nodes_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles)[:, :2]
+def _estimated_nodes_w(record: RunRecord, world: World) -> Floats:
+    """Return tail end, joints and head end on the ground by the estimated pose, (joints + 2, 2)."""
+    angles_rad = record.angle_rad[record.row_at(world.timestamp_ns * 1e-9)]
+    return nodes_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles_rad)[:, :2]

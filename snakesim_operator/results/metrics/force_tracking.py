@@ -1,9 +1,9 @@
-"""Whether the forces that a controller asked of obstacles came true: solved against measured, contact by contact.
+"""Whether contact forces followed the ones that a controller requested: desired against measured, by contact.
 
-A force that is asked for now is felt by the controller later: the command needs its time on the way, the sensor, too,
-and what is felt is a mean over 50 ms. So each measured force is held against what was asked of the same obstacle a
-moment before. While the body does not move, the ground's friction takes any difference, and of
-less than ASKED_N always may.
+The controller measures a force some time after it requested it: the command and the sensor have latencies, and the
+measured force is a mean over 50 ms. So each measured force is compared with the one that was requested at the same
+obstacle a moment before. While the body does not move, the friction of the ground takes any difference, so only
+locomotion counts; a request of less than ASKED_N does not count either.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,10 +14,10 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, WorldContact
 
-DELAY_S = 0.06  # from the setpoint to the mean that shows it
+DELAY_S = 0.06  # from the setpoint to the mean in which it appears
 ASKED_N = 1.0  # about a quarter of the drag of the shipped robots: less is not judged
 EMPTY_N = 0.1  # less than this is no contact
-FEWEST = 20  # pairs from which a correlation is told
+MIN_PAIRS = 20  # a correlation of fewer means nothing
 
 
 @dataclass(frozen=True)
@@ -40,48 +40,54 @@ class ForceTracking:
 
 
 def is_measured(push_point: WorldContact, contacts: Iterable[WorldContact]) -> bool:
-    """Whether one of the measured contacts is on the push-point's obstacle.
+    """Return whether one of the measured contacts is on the push-point's obstacle.
 
-    Elsewhere the force that a controller has solved for is asked for, and not there.
+    Otherwise the force that the controller solved for is only requested.
     """
     return any(contact.obstacle == push_point.obstacle for contact in contacts)
 
 
 def pairs(states: Sequence[ControlState]) -> list[Pair]:
-    """Solved and measured forces of all push-points while the body locomotes; in order of time."""
-    found: list[Pair] = []
+    """Return desired and measured forces of all push-points while the body locomotes, in order of time."""
+    delay_ns = round(DELAY_S * 1e9)
+    matched: list[Pair] = []
     before = 0
     for state in states:
         if state.state != "Locomoting" or len(state.measured_force_n) != len(state.push_points):
             continue
-        asked_ns = state.timestamp_ns - round(DELAY_S * 1e9)
-        while before + 1 < len(states) and states[before + 1].timestamp_ns <= asked_ns:
+        requested_ns = state.timestamp_ns - delay_ns
+        while before + 1 < len(states) and states[before + 1].timestamp_ns <= requested_ns:
             before += 1
-        then = states[before]
-        if not asked_ns - round(DELAY_S * 1e9) <= then.timestamp_ns <= asked_ns:
+        request = states[before]
+        if not requested_ns - delay_ns <= request.timestamp_ns <= requested_ns:
             continue
-        asked = {point.obstacle: n for point, n in zip(then.push_points, then.desired_force_n, strict=False)}
+        desired_n: dict[str | None, float] = {}
+        for point, force_n in zip(request.push_points, request.desired_force_n, strict=False):
+            desired_n[point.obstacle] = force_n
         for point, measured_force_n in zip(state.push_points, state.measured_force_n, strict=True):
-            desired_force_n = asked.get(point.obstacle, 0.0)
+            desired_force_n = desired_n.get(point.obstacle, 0.0)
             if point.obstacle is not None and measured_force_n is not None and desired_force_n >= ASKED_N:
-                found.append(Pair(state.timestamp_ns, point.obstacle, desired_force_n, measured_force_n))
-    return found
+                matched.append(Pair(state.timestamp_ns, point.obstacle, desired_force_n, measured_force_n))
+    return matched
 
 
 def force_tracking(states: Sequence[ControlState]) -> ForceTracking | None:
-    """None when nothing was asked for while the body locomoted, or no sensor told what was felt."""
-    found = pairs(states)
-    if not found:
+    """Return how well the measured forces follow the desired ones.
+
+    None if the controller requested no force during locomotion, or no sensor measured any.
+    """
+    compared = pairs(states)
+    if not compared:
         return None
-    solved, felt = np.array([(pair.desired_force_n, pair.measured_force_n) for pair in found]).T
+    solved, measured = np.array([(pair.desired_force_n, pair.measured_force_n) for pair in compared]).T
     return ForceTracking(
-        correlation=_correlation(solved, felt),
-        median_error=float(np.median(np.abs(felt - solved) / solved)),
-        empty=float(np.mean(felt < EMPTY_N)),
+        correlation=_correlation(solved, measured),
+        median_error=float(np.median(np.abs(measured - solved) / solved)),
+        empty=float(np.mean(measured < EMPTY_N)),
     )
 
 
-def _correlation(solved: Floats, felt: Floats) -> float | None:
-    if len(solved) < FEWEST or solved.std() < 1e-9 or felt.std() < 1e-9:
+def _correlation(solved: Floats, measured: Floats) -> float | None:
+    if len(solved) < MIN_PAIRS or solved.std() < 1e-9 or measured.std() < 1e-9:
         return None
-    return float(np.corrcoef(solved, felt)[0, 1])
+    return float(np.corrcoef(solved, measured)[0, 1])
