@@ -1,10 +1,10 @@
-"""Whether obstacles hold a body whose joints hold: first-order form closure, in the plane, without friction. Pure.
+"""Whether obstacles hold a body whose joints are stiff: first-order form closure in the plane, without friction.
 
-A contact with place o and normal n allows the twists x for which w.x >= 0, with w = [n ; o x n / l]. Contacts close
-the form when they allow no twist at all. Where they allow some, then also one that leaves two of them alone, as a turn
-about the pole in which their normals meet: x = w_i x w_j. So for each pair the others are asked which way they let the
-body turn about its pole; the margin is the least, over all pairs, of -(max w_k.x)(min w_k.x), with unit x. Above 0 is
-closed.
+A contact at o with normal n allows the twists x for which w . x >= 0, where w = [n ; o x n / l] is its wrench. Contacts
+close the form if they allow no twist at all. If they allow some, they also allow one with w . x = 0 at two contacts: a
+rotation about the pole at which the normals of both meet, x = w_i x w_j. So it is enough to test these twists, one for
+each pair of contacts. The margin is the minimum over all pairs of -(max_k w_k . x)(min_k w_k . x) with unit x.
+The form is closed if the margin is above 0.
 """
 
 from itertools import combinations
@@ -14,21 +14,36 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines, nearest_on_chain
 
-REACH_M = 0.02  # an obstacle so near to the body counts
+MAX_GAP_M = 0.02  # an obstacle this near to the body counts as a contact
 SINGULAR = 1e-6  # |x| of two contacts whose normals are on one line
 
 
 def contacts_beside(nodes_w: Floats, radius_m: float, outlines: Outlines) -> tuple[Floats, Floats]:
-    """Places and normals (k, 2) of the obstacles beside a chain with nodes (n, 2): each where it is nearest."""
+    """Return the places and normals, both (k, 2), of the obstacles beside a body, each where it is nearest.
+
+    Args:
+        nodes_w: (n, 2) nodes of the chain.
+        radius_m: Radius of its links.
+        outlines: The obstacles.
+    """
     _, nearest, distances = nearest_on_chain(nodes_w, outlines)
-    which = np.flatnonzero(distances - radius_m < REACH_M)
+    which = np.flatnonzero(distances - radius_m < MAX_GAP_M)
     at = nearest[which]
     _, normals = outlines.towards(at, which)
     return at - radius_m * normals, normals
 
 
 def form_closure_margin(places_w: Floats, normals_w: Floats, length_m: float) -> float:
-    """Without unit, at most 1, of contacts (k, 2); 0: fewer than four, which close nothing. length_m: l, of moments."""
+    """Return the margin of form closure, without unit and at most 1; above 0 the contacts close the form.
+
+    Args:
+        places_w: (k, 2) places of the contacts.
+        normals_w: (k, 2) normals there.
+        length_m: The length l by which moments are divided.
+
+    Returns:
+        The margin; 0 for fewer than four contacts, which cannot close the form.
+    """
     if len(places_w) < 4:
         return 0.0
     arms = (places_w - places_w.mean(axis=0)) / length_m
@@ -36,6 +51,9 @@ def form_closure_margin(places_w: Floats, normals_w: Floats, length_m: float) ->
     first, second = np.array(list(combinations(range(len(wrenches)), 2))).T
     twists = np.cross(wrenches[first], wrenches[second])
     sizes = np.linalg.norm(twists, axis=1)
-    turns = (twists[sizes > SINGULAR] / sizes[sizes > SINGULAR, None]) @ wrenches.T
-    turns[np.abs(turns) < SINGULAR] = 0.0  # the pair's own
-    return float(np.min(-turns.max(axis=1) * turns.min(axis=1))) if len(turns) else 0.0
+    is_regular = sizes > SINGULAR
+    products = (twists[is_regular] / sizes[is_regular, None]) @ wrenches.T  # w_k . x, (pairs, k)
+    products[np.abs(products) < SINGULAR] = 0.0  # of the two contacts of the pair
+    if not len(products):
+        return 0.0
+    return float(np.min(-products.max(axis=1) * products.min(axis=1)))

@@ -103,7 +103,7 @@ def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
 
 
 def reference_rad(record: RunRecord, joint: int) -> Floats:
-    """Return a joint's reference, (n,): its target in position mode, else as the controller reported it; NaN: unknown."""
+    """Return a joint's reference, (n,): its target in position mode, else as the controller reported it."""
     reference = np.full(len(record.time_s), np.nan)
     states = [state for state in record.control if len(state.reference_rad) > joint]
     if states:
