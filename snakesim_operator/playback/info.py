@@ -108,7 +108,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
     status = contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
     duration_s = _duration_s(by_key)
-    irregular = list(IRREGULAR)
+    irregular: list[str] = [*IRREGULAR]
     if robot is not None and robot.backend == "can":  # joint modules on a bus send their IMUs by turns
         irregular.append(keys.IMU)
     host = None
