@@ -18,9 +18,9 @@ from snakesim.chart import Chart, framed
 from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
-from snakesim_operator.results.ended import COMPLETE
 from snakesim_operator.results.page.charts import Line, lines
 from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.summary import RunSummary, distance_m
 
 PLAYBACK_PX = 580

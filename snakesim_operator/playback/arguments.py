@@ -13,17 +13,30 @@ from snakesim_hal.programs.arguments import add_json, number
 
 
 def add_commands(commands: Any) -> None:
-    """Add them to the parser of `snakesim`."""
+    """Add the commands to the parser of `snakesim`."""
+    _add_info(commands)
+    _add_report(commands)
+    _add_compare(commands)
+    _add_replay(commands)
+    _add_export(commands)
+    _add_video(commands)
+
+
+def _add_info(commands: Any) -> None:
     info = commands.add_parser("info", help="print what a recording holds: keys, rates, sizes, gaps")
     _add_recording(info)
     add_json(info)
     info.set_defaults(act=_info)
 
+
+def _add_report(commands: Any) -> None:
     report = commands.add_parser("report", help="rewrite the page of a run, also from a recording alone")
     _add_recording(report)
     report.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: beside the recording)")
     report.set_defaults(act=_report)
 
+
+def _add_compare(commands: Any) -> None:
     compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
     compare.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of a run; percentages refer to this one")
     compare.add_argument(
@@ -36,6 +49,8 @@ def add_commands(commands: Any) -> None:
     add_json(compare)
     compare.set_defaults(act=_compare)
 
+
+def _add_replay(commands: Any) -> None:
     replay = commands.add_parser(
         "replay",
         help="play a recording on Zenoh, or its sensors into guidance, navigation and control",
@@ -64,6 +79,8 @@ def add_commands(commands: Any) -> None:
     replay.add_argument("--out", type=Path, metavar="DIR", help="with --control: folder for a run that compare reads")
     replay.set_defaults(act=_replay)
 
+
+def _add_export(commands: Any) -> None:
     exported = commands.add_parser(
         "export", help="write a run as CSV, Parquet, NumPy, a LeRobot dataset or a whole MCAP"
     )
@@ -80,6 +97,8 @@ def add_commands(commands: Any) -> None:
     )
     exported.set_defaults(act=_export)
 
+
+def _add_video(commands: Any) -> None:
     video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
     video.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
     video.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
@@ -94,7 +113,7 @@ def add_commands(commands: Any) -> None:
 
 
 def add_span(parser: argparse.ArgumentParser) -> None:
-    """Add `--from` and `--to`, of a part of a run."""
+    """Add `--from` and `--to`, which select a part of a run."""
     for flag, name, default, verb in (("--from", "from_s", 0.0, "begin"), ("--to", "to_s", inf, "end")):
         about = f"{verb} S seconds in"
         parser.add_argument(flag, dest=name, type=number(0.0, inf, "s"), default=default, metavar="S", help=about)
@@ -112,10 +131,10 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _report(arguments: argparse.Namespace) -> int:
     from snakesim_hal.model.textfiles import write_text
-    from snakesim_operator.results.ended import ended
-    from snakesim_operator.results.incomplete import exit_code
+    from snakesim_operator.results.missing_data import exit_code
     from snakesim_operator.results.record import REPORT, RunRecord
     from snakesim_operator.results.report import page
+    from snakesim_operator.results.run_ending import ended
     from snakesim_operator.results.summary import summarise
 
     given: Path = arguments.recording

@@ -36,20 +36,20 @@ from snakesim_hal.wire.messages import (
     JointCommand,
     SettingsRequest,
 )
-from snakesim_operator.playback.order import in_robot_order
+from snakesim_operator.playback.play import in_robot_order
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import CONFIG
-from snakesim_operator.results.recorded import Contents, read_recording
+from snakesim_operator.results.recording_contents import Contents, read_recording
 
-MADE_BY = {
+SERVICE_OUTPUTS = {
     "guidance": (keys.WORLD,),
     "navigation": (keys.TRAJECTORY,),
     "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE, keys.SETTINGS_IN_FORCE),
 }
-"""What the replayed services publish: these messages are made again."""
+"""The keys at which the replayed services publish. Recorded messages at these keys are not replayed."""
 
 
 @dataclass
@@ -61,40 +61,55 @@ class Comparison:
 
     @property
     def common(self) -> list[int]:
-        """Ticks that both answer."""
+        """The ticks that both answer."""
         return sorted(self.recorded.keys() & self.replayed.keys())
 
     @property
     def different(self) -> list[int]:
-        """Ticks that they answer differently, or that only one answers."""
-        unlike = {tick for tick in self.common if not same(self.recorded[tick], self.replayed[tick])}
-        return sorted(unlike | (self.recorded.keys() ^ self.replayed.keys()))
+        """The ticks that they answer differently, or that only one answers."""
+        unequal = {tick for tick in self.common if not same(self.recorded[tick], self.replayed[tick])}
+        only_one = self.recorded.keys() ^ self.replayed.keys()
+        return sorted(unequal | only_one)
 
-    def forgive(self, last_tick: int) -> None:
-        """A run ends without waiting for the answer to its last tick, so that a recording may lack it."""
+    def ignore_unanswered(self, last_tick: int) -> None:
+        """Ignore the last tick if its recorded answer is missing: a run ends without waiting for that answer."""
         if last_tick not in self.recorded:
             self.replayed.pop(last_tick, None)
 
+    def ignore_after(self, last_tick: int) -> None:
+        """Ignore the recorded commands after a tick, because the replay ended there."""
+        self.recorded = {tick: command for tick, command in self.recorded.items() if tick <= last_tick}
+
     def largest(self) -> tuple[int, int, float] | None:
-        """Tick, joint and size of the largest difference of a target; None when there is none."""
-        sizes = [
-            (abs(a - b), tick, joint)
-            for tick in self.common
-            for joint, (a, b) in enumerate(zip(self.recorded[tick].target, self.replayed[tick].target, strict=True))
-        ]
+        """Return tick, joint and size of the largest difference of a target, or None if there is none."""
+        sizes: list[tuple[float, int, int]] = []
+        for tick in self.common:
+            targets = zip(self.recorded[tick].target, self.replayed[tick].target, strict=True)
+            for joint, (recorded, replayed) in enumerate(targets):
+                sizes.append((abs(recorded - replayed), tick, joint))
         size, tick, joint = max(sizes, default=(0.0, 0, 0))
         return (tick, joint, size) if size else None
 
 
 def same(a: JointCommand, b: JointCommand) -> bool:
-    """Whether two commands drive the motors alike, to the bit. How often a service was asked at tick 0 is no matter."""
+    """Return whether two commands drive the motors alike, to the bit.
+
+    The sequence number is not compared: it counts how often a service acted at tick 0.
+    """
     return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (b.arm_session, b.mode, b.target, b.torque_limit_nm)
 
 
 def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
-    """The configuration of a recording, with changes. Raises ConfigError.
+    """Return the configuration of a recording, with changes.
 
-    run_recorded_code: otherwise a controller or service in a Python file is refused, unless `overrides` name it.
+    Args:
+        contents: The recording.
+        overrides: The changes.
+        run_recorded_code: Allow a controller or service in a Python file. Otherwise it is refused, unless `overrides`
+            name it.
+
+    Raises:
+        ConfigError: There is no configuration, it is invalid, or it names Python files that are not allowed.
     """
     if contents.config is None:
         raise ConfigError(f"{contents.path}: holds no hal/config, so it is not known which controller was at work")
@@ -103,19 +118,27 @@ def config_of(contents: Contents, overrides: list[Override], *, run_recorded_cod
         path.write_text(contents.config.content)
         config = load(str(path), overrides).config
     if not run_recorded_code:
-        _refuse_its_files(contents.path, config, {override.key for override in overrides})
+        _refuse_recorded_files(contents.path, config, {override.key for override in overrides})
     return config
 
 
-def _refuse_its_files(path: Path, config: RunConfig, named_here: set[str]) -> None:
-    """named_here: what the command line says itself. The backend and other services are not replayed."""
+def _refuse_recorded_files(path: Path, config: RunConfig, overridden: set[str]) -> None:
+    """Raise ConfigError for a Python file that only the recording names.
+
+    Backend and other services are not replayed, so their files do not run.
+
+    Args:
+        path: The recording.
+        config: Its configuration, with the changes of the command line.
+        overridden: Keys that the command line sets.
+    """
     named = [("controller", "--controller ", "its controller", config.controller)]
-    for name in MADE_BY:
+    for name in SERVICE_OUTPUTS:
         key = f"services.{name}.code"
         code = config.services[name].code if name in config.own_services else ""
         named.append((key, f"--set {key}=", f"its service {name}", code))
     for key, flag, what, code in named:
-        if in_file(code) and key not in named_here:
+        if in_file(code) and key not in overridden:
             raise ConfigError(
                 f"{path}: the recording names {short(code)!r} as {what}, and would have that Python file run on this "
                 f"computer. If you trust the file, name it yourself, with {flag}{short(code)}, or run what the "
@@ -124,12 +147,22 @@ def _refuse_its_files(path: Path, config: RunConfig, named_here: set[str]) -> No
 
 
 class Replay:
-    """Services that believe to be in the run of a recording."""
+    """Runs services on the sensors of a recording, as if they were in its run."""
 
     def __init__(
         self, path: Path, overrides: list[Override], out: Path | None = None, *, run_recorded_code: bool = False
     ) -> None:
-        """out: a recording of the replay. Raises ConfigError."""
+        """Read the configuration of a recording.
+
+        Args:
+            path: The recording.
+            overrides: Changes of its configuration.
+            out: A recording of the replay; None: it is not recorded.
+            run_recorded_code: Allow Python files that only the recording names.
+
+        Raises:
+            ConfigError: The recording cannot be replayed.
+        """
         contents = read_recording(path, (keys.DESCRIPTION, keys.CONFIG, keys.CLOCK))
         self.lacks = contents.lacks
         self.config = config_of(contents, overrides, run_recorded_code=run_recorded_code)
@@ -138,136 +171,186 @@ class Replay:
             raise ConfigError(f"{path}: holds no hal/description")
         self.robot: Description = contents.description
         self.clock_mode = self.config.clock_mode
-        self.stopped = ""  # why it could not go on to the end of a recording that lacks something
+        self.stopped = ""  # why it did not reach the end of a recording that lacks something
         self.comparison = Comparison()
-        self._path, self._network = path, LocalNetwork()
-        self._session = self._network.session()
-        self._names = [name for name in MADE_BY if name in self.config.own_services]
-        self._made = {key for name in self._names for key in MADE_BY[name]} | {keys.done(name) for name in self._names}
+
+        # What is replayed.
+        self._path = path
+        self._services = [name for name in SERVICE_OUTPUTS if name in self.config.own_services]
+        self._output_keys = {key for name in self._services for key in SERVICE_OUTPUTS[name]}
+        self._output_keys |= {keys.done(name) for name in self._services}
         clocks: list[tuple[int, Clock]] = sorted(contents.at[keys.CLOCK].items())
         self._last_tick = clocks[-1][0] if clocks else -1
         self._epochs = [(tick, clock.lease_epoch) for tick, clock in clocks if clock.lease_epoch]
-        self._now_ns = 0
+
+        # The network and the services on it.
+        self._network = LocalNetwork()
+        self._session = self._network.session()
         self._publishers: dict[str, Publisher[Any]] = {}
         self._loops: list[ServiceLoop] = []
         self._joined = False
-        self._by_sequence: dict[int, JointCommand] = {}  # of the recording
-        self._commands, self._applied = Decoder(JointCommand), Decoder(AppliedCommand)
-        self._settings = Decoder(ControlSettings)
-        self._kept = {o.key.removeprefix(CHOSEN[0]): o.value for o in overrides if o.key.startswith(CHOSEN[0])}
-        self._asked: list[tuple[ControlSettings, LocalQuery]] = []  # changes of settings without an answer yet
         self._recording = Recording(out, self.config.robot.name) if out is not None else None
 
+        # Commands.
+        self._now_ns = 0
+        self._recorded_by_sequence: dict[int, JointCommand] = {}
+        self._command_decoder = Decoder(JointCommand)
+        self._applied_decoder = Decoder(AppliedCommand)
+
+        # Parameters of the controller.
+        self._settings_decoder = Decoder(ControlSettings)
+        self._overridden_settings = {
+            override.key.removeprefix(CHOSEN[0]): override.value
+            for override in overrides
+            if override.key.startswith(CHOSEN[0])
+        }
+        self._pending_changes: list[tuple[ControlSettings, LocalQuery]] = []  # without an answer yet
+
     def run(self) -> Comparison:
-        """Replay it all. Raises SnakesimError when a service fails."""
+        """Replay the whole recording. Raises SnakesimError if a service fails."""
         with ExitStack() as opened:
             opened.enter_context(threadpool_limits(1))  # as in the run
             if self._recording is not None:
                 opened.callback(self._recording.close, {"replay_of": str(self._path)})
                 for row in keys.SPACE:
                     self._session.on_latched_arrival(row.key, self._recording.take)
-            self._session.on_question(keys.LEASE, self._lend)
-            self._session.on_arrival(keys.JOINT_COMMAND, self._keep)
-            effective = Configuration(config_hash=self.robot.config_hash, content=written(self.config).decode())
-            self._session.latched_publisher(keys.CONFIG, Configuration).put(effective)
-            self._session.latched_publisher(keys.DESCRIPTION, Description).put(self.robot)
-            for name in self._names:
+            self._session.on_question(keys.LEASE, self._grant_lease)
+            self._session.on_arrival(keys.JOINT_COMMAND, self._keep_command)
+            self._publish_description()
+            for name in self._services:
                 loop = ServiceLoop(find_service(self.config, name), self.config, self._network.session())
                 opened.callback(loop.close)
                 self._loops.append(loop)
             try:
-                self._play()
-                self.comparison.forgive(self._last_tick)
+                self._replay_messages()
+                self.comparison.ignore_unanswered(self._last_tick)
             except SnakesimError as error:
                 if not self.lacks:
                     raise
-                self.stopped = str(error)  # it waits for what is lost
-                found, last = self.comparison, max(self.comparison.replayed, default=-1)
-                found.recorded = {tick: command for tick, command in found.recorded.items() if tick <= last}
+                self.stopped = str(error)  # a service waits for a message that is lost
+                self.comparison.ignore_after(max(self.comparison.replayed, default=-1))
         return self.comparison
 
-    def _play(self) -> None:
-        for turn, recorded in enumerate(in_robot_order(RecordingReader(self._path))):
-            self._take(recorded)
-            if self._recording is not None and turn % 1000 == 0:
+    def _publish_description(self) -> None:
+        """Publish configuration and description, as a host does."""
+        effective = Configuration(config_hash=self.robot.config_hash, content=written(self.config).decode())
+        self._session.latched_publisher(keys.CONFIG, Configuration).put(effective)
+        self._session.latched_publisher(keys.DESCRIPTION, Description).put(self.robot)
+
+    def _replay_messages(self) -> None:
+        for number, recorded in enumerate(in_robot_order(RecordingReader(self._path))):
+            self._replay_message(recorded)
+            if self._recording is not None and number % 1000 == 0:
                 self._recording.flush_when_due()
 
-    def _take(self, recorded: RecordedMessage) -> None:
-        message = keys.message_at(recorded.key)
-        if message is None or recorded.encoding != encoding_of(message):
-            return  # of a stranger
+    def _replay_message(self, recorded: RecordedMessage) -> None:
+        """Publish a recorded message, unless a replayed service publishes it; at a clock, let the services act."""
+        message_type = keys.message_at(recorded.key)
+        if message_type is None or recorded.encoding != encoding_of(message_type):
+            return  # from an unknown node
         self._now_ns = recorded.time_ns
         if recorded.key == keys.JOINT_COMMAND:
-            command = self._commands.decode(recorded.payload, recorded.encoding)
-            self._by_sequence[command.sequence] = self.comparison.recorded[command.tick] = command
-        if recorded.key == keys.SETTINGS_IN_FORCE and recorded.key in self._made:
-            self._change_settings(self._settings.decode(recorded.payload, recorded.encoding))
-        if recorded.key in self._made or recorded.key in (keys.CONFIG, keys.DESCRIPTION):
+            command = self._command_decoder.decode(recorded.payload, recorded.encoding)
+            self.comparison.recorded[command.tick] = command
+            self._recorded_by_sequence[command.sequence] = command
+        if recorded.key == keys.SETTINGS_IN_FORCE and recorded.key in self._output_keys:
+            self._change_settings(self._settings_decoder.decode(recorded.payload, recorded.encoding))
+        if recorded.key in self._output_keys or recorded.key in (keys.CONFIG, keys.DESCRIPTION):
             return
         payload = recorded.payload
-        if recorded.key == keys.APPLIED and "control" in self._names:
-            payload = self._as_applied(recorded)
+        if recorded.key == keys.APPLIED and "control" in self._services:
+            payload = self._applied_payload(recorded)
         publisher = self._publishers.get(recorded.key)
         if publisher is None:
-            publisher = self._publishers[recorded.key] = self._session.publisher(recorded.key, message)
+            publisher = self._session.publisher(recorded.key, message_type)
+            self._publishers[recorded.key] = publisher
         publisher.send(payload)
         if recorded.key == keys.CLOCK:
             self._act()
 
     def _act(self) -> None:
+        """Let every service act on the newest clock, and check the answers to changes of parameters."""
         if not self._joined:
             for loop in self._loops:
                 loop.join()
             self._joined = True
         for loop in self._loops:
             loop.act()
-        for changed, query in [*self._asked]:
-            if (answer := query.answered()) is None:
+        for change, query in [*self._pending_changes]:
+            answer = query.answered()
+            if answer is None:
                 continue
-            self._asked.remove((changed, query))
+            self._pending_changes.remove((change, query))
             if not answer.ok:
-                raise ConfigError(f"{self._path}: what {changed.who} set at tick {changed.tick}: {answer.reason}")
+                raise ConfigError(f"{self._path}: what {change.who} set at tick {change.tick}: {answer.reason}")
 
     def _change_settings(self, recorded: ControlSettings) -> None:
-        """As in the recording; it comes before its tick's clock. What is set for the replay stays."""
+        """Change the parameters of the controller as in the recording, where they come before their tick's clock.
+
+        Parameters that the command line sets stay.
+        """
         if recorded.who is None or recorded.controller != self.config.controller[-64:]:
             return
         values = msgspec.json.decode(recorded.settings, type=dict[str, Any])
+        values |= self._overridden_settings
         request = SettingsRequest(
             who=recorded.who,
             controller=recorded.controller,
-            settings=msgspec.json.encode({**values, **self._kept}).decode(),
+            settings=msgspec.json.encode(values).decode(),
         )
-        self._asked.append((recorded, self._session.put_question(keys.SETTINGS, request)))
+        self._pending_changes.append((recorded, self._session.put_question(keys.SETTINGS, request)))
 
-    def _as_applied(self, recorded: RecordedMessage) -> bytes:
-        """As in the recording where the command is the same; else the replayed command, without limits."""
-        applied = self._applied.decode(recorded.payload, recorded.encoding)
-        before = self._by_sequence.get(applied.sequence or -1)
-        now = self.comparison.replayed.get(before.tick) if before is not None else None
-        if before is None or now is None or same(before, now):
+    def _applied_payload(self, recorded: RecordedMessage) -> bytes:
+        """Return the setpoints that the host would have applied.
+
+        They are those of the recording where the command is the same; else the replayed command, without limits.
+        """
+        applied = self._applied_decoder.decode(recorded.payload, recorded.encoding)
+        recorded_command = self._recorded_by_sequence.get(applied.sequence or -1)
+        if recorded_command is None:
             return recorded.payload
-        limits = now.torque_limit_nm or [joint.torque_limit_nm for joint in self.robot.joints]
-        changed = msgspec.structs.replace(applied, mode=now.mode, target=now.target, torque_limit_nm=limits, limited={})
+        replayed_command = self.comparison.replayed.get(recorded_command.tick)
+        if replayed_command is None or same(recorded_command, replayed_command):
+            return recorded.payload
+        limits = replayed_command.torque_limit_nm or [joint.torque_limit_nm for joint in self.robot.joints]
+        changed = msgspec.structs.replace(
+            applied,
+            mode=replayed_command.mode,
+            target=replayed_command.target,
+            torque_limit_nm=limits,
+            limited={},
+        )
         return encode(changed)
 
-    def _keep(self, arrival: Arrival) -> None:
-        command = self._commands.decode(arrival.payload, arrival.encoding)
+    def _keep_command(self, arrival: Arrival) -> None:
+        command = self._command_decoder.decode(arrival.payload, arrival.encoding)
         self.comparison.replayed[command.tick] = command
 
-    def _lend(self, question: Question) -> None:
-        """The lease that the recording has next."""
-        now = self._now_ns // self.robot.period_ns
-        epoch = next((epoch for tick, epoch in self._epochs if tick >= now), 1)
+    def _grant_lease(self, question: Question) -> None:
+        """Grant the lease with the epoch that the recording has next."""
+        now_tick = self._now_ns // self.robot.period_ns
+        epoch = next((epoch for tick, epoch in self._epochs if tick >= now_tick), 1)
         question.reply(Answer(ok=True, reason="replayed", epoch=epoch, host=self.robot.host))
 
 
 def replay_control(
     path: Path, overrides: list[Override], out: Path | None, say: Say, *, run_recorded_code: bool = False
 ) -> int:
-    """`snakesim replay --control`. out: a folder for a run that `compare` reads. Exit code 1: the commands differ.
+    """Replay a recording, and print how the commands differ: `snakesim replay --control`.
 
-    That is no failure where a setting was changed. 3: the recording lacks something.
+    Args:
+        path: The recording.
+        overrides: Changes of its configuration.
+        out: A folder for a run that `compare` reads; None: the replay is not recorded.
+        say: Prints a line.
+        run_recorded_code: Allow Python files that only the recording names.
+
+    Returns:
+        The exit code. 0: the commands are the same, or a setting was changed; 1: they differ; 3: the recording lacks
+        something.
+
+    Raises:
+        ConfigError: The recording cannot be replayed, or `out` holds a recording already.
     """
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -276,22 +359,32 @@ def replay_control(
         replay = Replay(path, overrides, recording, run_recorded_code=run_recorded_code)
     except FileExistsError:
         raise ConfigError(f"--out {out}: holds a recording already; choose another folder") from None
-    found = replay.run()
+    comparison = replay.run()
     if out is not None:
         write(replay.config, out / CONFIG)
         say(f"replayed: {out}; `snakesim compare {path} {out}` shows the difference")
     if replay.stopped:
-        say(f"replayed up to tick {max(found.replayed, default=0)} only: {replay.stopped}")
-    elif not found.recorded:
+        say(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
+    elif not comparison.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}")
-    different, count = found.different, len(found.recorded.keys() | found.replayed.keys())
+    are_same = _print_comparison(comparison, replay, say)
+    if are_same or replay.changed or replay.lacks:
+        return exit_code(path, replay.lacks)
+    return exit_code(path, replay.lacks, 1)
+
+
+def _print_comparison(comparison: Comparison, replay: Replay, say: Say) -> bool:
+    """Print how the commands differ, and return whether they are the same."""
+    different = comparison.different
+    count = len(comparison.recorded.keys() | comparison.replayed.keys())
     if not different:
         say(f"{count} commands, the same to the bit")
-        return exit_code(path, replay.lacks)
+        return True
     say(f"{len(different)} of {count} commands differ, the first answers tick {different[0]}")
-    if (largest := found.largest()) is not None:
+    largest = comparison.largest()
+    if largest is not None:
         tick, joint, size = largest
         say(f"largest difference of a target: {size:.4g} at {replay.robot.joints[joint].name}, tick {tick}")
     if replay.clock_mode != "lockstep":
         say(f"the run was {replay.clock_mode}: there a service acts on what has arrived, which only lockstep repeats")
-    return exit_code(path, replay.lacks, 0 if replay.changed or replay.lacks else 1)
+    return False

@@ -1,8 +1,8 @@
-"""`snakesim record --episodes DIR`: demonstrations, one after the other, each with what the operator says of it.
+"""`snakesim record --episodes DIR`: records demonstrations one after the other, with the operator's judgment of each.
 
-Somebody drives the robot, by `snakesim teleop`, the console or from ROS; this listens. Enter begins an episode and ends
-it; then s, f or d say that it succeeded, failed, or is to be dropped; q ends. Each is a recording of its own, and a
-line of EPISODES, from which `snakesim export --format lerobot` makes a data set.
+The operator drives the robot by `snakesim teleop`, the console or from ROS, while this command records. Enter begins an
+episode and ends it; then s, f or d mark it as succeeded, failed, or to be dropped; q ends the command. Each episode is
+a recording of its own, and a line of EPISODES, from which `snakesim export --format lerobot` makes a data set.
 """
 
 import signal
@@ -24,7 +24,7 @@ from snakesim_operator.base.targets import RobotSelection, only_robot
 from snakesim_operator.recording.process import record
 
 EPISODES = "episodes.jsonl"
-WORDS = {"s": True, "f": False, "d": None}
+SUCCESS_BY_KEY = {"s": True, "f": False, "d": None}  # None: the episode is dropped
 HELP = "Enter begins an episode and ends it; then s: it succeeded, f: it failed, d: drop it. q ends"
 
 
@@ -38,12 +38,12 @@ class EpisodeLabel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     began: str  # UTC
 
 
-class _Ended(Exception):  # noqa: N818 - no error
-    """The operator has left."""
+class _InputEnded(Exception):  # noqa: N818 - no error
+    """The operator has ended the command."""
 
 
 class _Keyboard:
-    """Lines of the terminal, while something else goes on."""
+    """Reads lines of the terminal in a thread, while the main thread records."""
 
     def __init__(self, lines: Iterator[str]) -> None:
         self._queue: Queue[str | None] = Queue()
@@ -53,27 +53,43 @@ class _Keyboard:
         try:
             for line in lines:
                 self._queue.put(line.strip().lower())
-        finally:  # also after bytes that are no text: whoever waits for a line must not wait for ever
+        finally:  # also after bytes that are no text: the main thread must not wait for ever
             self._queue.put(None)
 
     def interrupt(self) -> None:
-        """As the end of the input."""
+        """Act as if the input had ended."""
         self._queue.put(None)
 
-    def line(self) -> str:
-        """The next one. Raises _Ended."""
-        found = self._queue.get()
-        if found is None or found == "q":
-            raise _Ended
-        return found
+    def next_line(self) -> str:
+        """Wait for the next line. Raises _InputEnded."""
+        line = self._queue.get()
+        if line is None or line == "q":
+            raise _InputEnded
+        return line
 
-    def pressed(self) -> bool:
-        """Whether there is a line since the last one. Raises _Ended."""
-        return not self._queue.empty() and self.line() is not None
+    def take_line(self) -> bool:
+        """Remove a line if one has come, and return whether one had. Raises _InputEnded."""
+        if self._queue.empty():
+            return False
+        self.next_line()
+        return True
 
 
 def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
-    """Until q, or the end of the input. Exit code 1 when the disk took no more. Raises SnakesimError."""
+    """Record episodes until q, or the end of the input.
+
+    Args:
+        where: The robot.
+        folder: Where the recordings go.
+        task: The task that the operator demonstrates, in words.
+        lines: Lines that the operator types.
+
+    Returns:
+        The exit code: 1 if the disk was full.
+
+    Raises:
+        SnakesimError: The robot cannot be recorded.
+    """
     link = replace(only_robot(where, "record"), max_bytes=MAX_IMAGE_BYTES)
     folder.mkdir(parents=True, exist_ok=True)
     keyboard = _Keyboard(lines)
@@ -82,37 +98,40 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     say(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {HELP}")
     try:
         while not demonstrations.failure:
-            keyboard.line()
-            demonstrations.record_one()
-    except _Ended:
+            keyboard.next_line()
+            demonstrations.record_episode()
+    except _InputEnded:
         pass
     finally:
-        for which in stop_signals():
-            signal.signal(which, signal.SIG_DFL)
+        for number in stop_signals():
+            signal.signal(number, signal.SIG_DFL)
     say(f"{demonstrations.kept} episodes; `snakesim export {folder} --format lerobot` makes a data set of {folder}")
     return 1 if demonstrations.failure else 0
 
 
 class _Demonstrations:
-    """The episodes of one sitting."""
+    """Records the episodes of one call of the command."""
 
     def __init__(self, link: Link, folder: Path, task: str, keyboard: _Keyboard) -> None:
-        self._link, self._folder, self._task, self._keyboard = link, folder, task, keyboard
+        self._link = link
+        self._folder = folder
+        self._task = task
+        self._keyboard = keyboard
         self.kept = 0
         self.failure = ""
 
-    def record_one(self) -> None:
-        """From now to Enter, and what became of it. Raises _Ended."""
-        path = next(p for i in count() if not (p := self._folder / f"episode-{i:03d}.mcap").exists())
+    def record_episode(self) -> None:
+        """Record from now to Enter, and keep the episode unless the operator drops it. Raises _InputEnded."""
+        path = self._free_path()
         began = datetime.now(UTC).isoformat(timespec="seconds")
         say(f"{path.name}: recording; Enter ends it")
         success = None
         try:
-            recorder = record(self._link, path, lambda: not self._keyboard.pressed())
+            recorder = record(self._link, path, lambda: not self._keyboard.take_line())
             self.failure = recorder.recording.failure
             if not self.failure:
                 say(f"{path.name}: {recorder.recording.counts.total()} messages. s, f or d?")
-                success = self._judgement()
+                success = self._read_judgment()
         finally:
             if success is None:
                 path.unlink(missing_ok=True)
@@ -120,13 +139,25 @@ class _Demonstrations:
         if success is not None:
             self._keep(EpisodeLabel(file=path.name, task=self._task, success=success, who=user_name(), began=began))
 
-    def _judgement(self) -> bool | None:
-        while (word := self._keyboard.line()) not in WORDS:
-            say(f"{word!r}: s if it succeeded, f if it failed, d to drop it")
-        return WORDS[word]
+    def _free_path(self) -> Path:
+        """Return the first numbered path at which no recording is yet."""
+        for number in count():
+            path = self._folder / f"episode-{number:03d}.mcap"
+            if not path.exists():
+                return path
+        raise AssertionError("count() does not end")
+
+    def _read_judgment(self) -> bool | None:
+        """Wait until the operator marks the episode. Returns whether it succeeded; None: it is dropped."""
+        while True:
+            key = self._keyboard.next_line()
+            if key in SUCCESS_BY_KEY:
+                return SUCCESS_BY_KEY[key]
+            say(f"{key!r}: s if it succeeded, f if it failed, d to drop it")
 
     def _keep(self, label: EpisodeLabel) -> None:
         with (self._folder / EPISODES).open("ab") as file:
             file.write(msgspec.json.encode(label) + b"\n")
         self.kept += 1
-        say(f"{label.file}: {'succeeded' if label.success else 'failed'}. Enter begins the next one")
+        result = "succeeded" if label.success else "failed"
+        say(f"{label.file}: {result}. Enter begins the next one")

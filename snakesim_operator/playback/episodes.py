@@ -21,7 +21,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.playback.demonstrations import EPISODES, EpisodeLabel
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.pictures import Pictures, read_pictures
-from snakesim_operator.results.advance import Advance
+from snakesim_operator.results.metrics.advance import Advance
 from snakesim_operator.results.record import RunRecord
 
 

@@ -23,7 +23,7 @@ from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 
 LACKS = b"snakesim.lacks"  # metadata of a Parquet file: JSON
@@ -46,49 +46,75 @@ UNITS = {
 
 
 def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
-    """Write a run in a format. Raises ConfigError."""
+    """Write a run in a format.
+
+    Args:
+        runs: The run, as the only item.
+        form: "csv", "parquet", "npz" or "mcap".
+        out: The file; None: beside the recording.
+        say: Prints a line.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: There are several runs, the run cannot be read, or the file cannot be written.
+    """
     if len(runs) > 1:
         raise ConfigError(f"--format {form}: one run at a time; several make a dataset, with --format lerobot")
-    path = _free(out or _beside(runs[0], form))
+    run = runs[0]
+    path = _reserve(out or _default_path(run, form))
     if form == "mcap":
         with exported(path) as partial:
-            count, lacks = recover(recording_of(runs[0]), partial)
+            count, lacks = recover(recording_of(run), partial)
         say(f"{count} messages: {path}")
-        return exit_code(runs[0], lacks)
-    record = RunRecord.load(runs[0])
-    if form == "npz":
-        names: dict[str, Any] = {"joints": np.array([joint.name for joint in record.description.joints])}
-        lacks_of_npz = np.array(record.lacks, dtype=str)
-        with exported(path) as partial, partial.open("xb") as file:
-            np.savez_compressed(file, **arrays(record), **names, lacks=lacks_of_npz)
-    elif form == "csv":
-        with exported(path) as partial:
-            _write_csv(table(record), partial, record.lacks)
-    else:
-        columns = {name: values.tolist() for name, values in table(record).items()}
-        metadata = {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None
-        with exported(path) as partial:
-            write_parquet(columns, partial, metadata)
+        return exit_code(run, lacks)
+    record = RunRecord.load(run)
+    with exported(path) as partial:
+        match form:
+            case "npz":
+                _write_npz(record, partial)
+            case "csv":
+                _write_csv(table(record), partial, record.lacks)
+            case _:
+                columns = {name: values.tolist() for name, values in table(record).items()}
+                metadata = {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None
+                write_parquet(columns, partial, metadata)
     say(f"{len(record.time_s)} ticks: {path}")
-    return exit_code(runs[0], record.lacks)
+    return exit_code(run, record.lacks)
 
 
 def export_dataset(
     runs: Sequence[Path], out: Path | None, say: Say, *, images: bool, task: str | None, fps: float | None
 ) -> int:
-    """Writes a LeRobot dataset, an episode a run or demonstration, and one more for each gap. Raises ConfigError."""
-    path = _free(out or _beside(runs[0], "lerobot"))
+    """Write a LeRobot dataset: an episode for each run or demonstration, and one more for each gap.
+
+    Args:
+        runs: Folders of runs or demonstrations, or recordings.
+        out: Folder of the dataset; None: beside the first run.
+        say: Prints a line.
+        images: Whether the pictures of the cameras are included.
+        task: The task of all episodes; None: the one of each run.
+        fps: Frames a second; None: the robot's rate.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: A run cannot be read, the runs do not fit together, or the folder cannot be written.
+    """
+    path = _reserve(out or _default_path(runs[0], "lerobot"))
     episodes = read_episodes(runs, task, images=images)
     with exported(path) as partial:
         size = write_lerobot(episodes, partial, write_parquet, fps)
     for sentence in gaps_in_words(episodes):
         say(sentence)
     say(f"{size.episodes} episodes, {size.frames} frames: {path}")
-    return max(exit_code(one.record.folder, one.record.lacks) for one in episodes)
+    return max(exit_code(episode.record.folder, episode.record.lacks) for episode in episodes)
 
 
-def _free(path: Path) -> Path:
-    """A path that can be written, where nothing is yet. Raises ConfigError."""
+def _reserve(path: Path) -> Path:
+    """Return a path after checking that it can be written, and that there is no such file. Raises ConfigError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch(exist_ok=False)  # before the work of minutes; not through a link, wherever it leads
@@ -101,40 +127,61 @@ def _free(path: Path) -> Path:
     return path
 
 
-def _beside(run: Path, form: str) -> Path:
-    name = run / "export" if run.is_dir() else run.with_suffix("")
-    return name.with_name(f"{name.name}-lerobot") if form == "lerobot" else name.with_suffix(f".{form}")
+def _default_path(run: Path, form: str) -> Path:
+    """Return where an export goes by default: into the run's folder, or beside a recording."""
+    base = run / "export" if run.is_dir() else run.with_suffix("")
+    if form == "lerobot":
+        return base.with_name(f"{base.name}-lerobot")
+    return base.with_suffix(f".{form}")
 
 
 def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
-    """Every column as an array, (n,) or (n, width)."""
-    found: dict[str, NDArray[Any]] = {}
-    for column in fields(record):  # not `vars`: that has what the record has worked out, too
+    """Return every signal as an array, (n,) or (n, width)."""
+    signals: dict[str, NDArray[Any]] = {}
+    for column in fields(record):  # `vars` would include what the record has computed and cached
         value = getattr(record, column.name)
         if isinstance(value, np.ndarray):
-            found[column.name] = value
-    return found | record.own
+            signals[column.name] = value
+    return signals | record.own
 
 
 def unit_of(name: str, record: RunRecord) -> str:
-    """Of a column, or of all of a signal."""
-    what = name.partition(".")[0]
-    own = {field: unit for kind in own_kinds(record.description).values() for field, unit in kind.units.items()}
-    return {**own, **UNITS}[what]
+    """Return the unit of a column, or of a whole signal."""
+    signal = name.partition(".")[0]
+    units: dict[str, str] = {}
+    for kind in own_kinds(record.description).values():
+        units |= kind.units
+    units |= UNITS  # the robot's own signals win
+    return units[signal]
 
 
 def table(record: RunRecord) -> dict[str, NDArray[Any]]:
-    """Every column as numbers, (n,)."""
+    """Return every column as numbers, (n,)."""
     joints = [joint.name for joint in record.description.joints]
-    found: dict[str, NDArray[Any]] = {}
+    columns: dict[str, NDArray[Any]] = {}
     for name, values in arrays(record).items():
         if values.ndim == 1:
-            found[name] = values
+            columns[name] = values
             continue
-        unit = "_m" if name == "position_w" else ""
-        parts = joints if name in OF_JOINTS else "xyz" if name == "position_w" else "wxyz"
-        found |= {f"{name}{unit}.{part}": values[:, i] for i, part in enumerate(parts)}
-    return found
+        column_name = name
+        if name in OF_JOINTS:
+            parts: Sequence[str] = joints
+        elif name == "position_w":
+            column_name = "position_w_m"
+            parts = "xyz"
+        else:
+            parts = "wxyz"
+        for i, part in enumerate(parts):
+            columns[f"{column_name}.{part}"] = values[:, i]
+    return columns
+
+
+def _write_npz(record: RunRecord, path: Path) -> None:
+    joints = np.array([joint.name for joint in record.description.joints])
+    lacks = np.array(record.lacks, dtype=str)
+    names: dict[str, Any] = {"joints": joints, "lacks": lacks}
+    with path.open("xb") as file:
+        np.savez_compressed(file, **arrays(record), **names)
 
 
 def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str]) -> None:
@@ -144,11 +191,17 @@ def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-            writer.writerow(["" if value != value else value for value in row])
+            writer.writerow(["" if value != value else value for value in row])  # NaN is not equal to itself
 
 
 def write_parquet(columns: dict[str, Any], path: Path, metadata: dict[bytes, bytes] | None = None) -> None:
-    """Columns as a Parquet file. metadata: of the schema. Needs the extra `export`."""
+    """Write columns as a Parquet file. Needs the extra `export`.
+
+    Args:
+        columns: Values by column.
+        path: The file.
+        metadata: Metadata of the schema.
+    """
     import pyarrow
     import pyarrow.parquet
 

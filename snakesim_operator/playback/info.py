@@ -22,10 +22,9 @@ from snakesim_hal.wire.messages import ControlSettings, Status
 from snakesim_operator.recording.losses import Gap
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.gaps import unread
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import describe_undecodable, exit_code
 from snakesim_operator.results.record import GIVE
-from snakesim_operator.results.recorded import ALL, Contents
+from snakesim_operator.results.recording_contents import ALL, Contents
 from snakesim_operator.robot_commands.parameters import PREFIX, differing
 
 # Published on a change too, so that nothing is missing there.
@@ -41,7 +40,7 @@ class KeyInfo:
 
     @property
     def gaps(self) -> int:
-        """How many messages are missing between the first and the last, by the usual step between them."""
+        """The number of messages that are missing between the first and the last, by the usual step between them."""
         steps = np.diff(np.unique(np.array(self.time_ns)))
         if len(steps) < 2:
             return 0
@@ -49,7 +48,7 @@ class KeyInfo:
 
 
 class SettingsChange(msgspec.Struct, kw_only=True):
-    """What somebody has set while the controller ran."""
+    """Parameters that an operator changed while the controller ran."""
 
     time_s: float
     who: str
@@ -57,7 +56,7 @@ class SettingsChange(msgspec.Struct, kw_only=True):
 
 
 class RecordingInfo(msgspec.Struct, kw_only=True):
-    """What `--json` prints."""
+    """The content of a recording, as `--json` prints it."""
 
     file: str
     size_bytes: int
@@ -81,7 +80,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
 
 
 def recording_of(given: Path) -> Path:
-    """The recording of a run's folder, or the file itself. Raises ConfigError."""
+    """Return the recording of a run's folder, or the file itself. Raises ConfigError if there is none."""
     path = given / RECORDING if given.is_dir() else given
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such recording; {GIVE}")
@@ -89,32 +88,45 @@ def recording_of(given: Path) -> Path:
 
 
 def inspect_recording(path: Path) -> RecordingInfo:
-    """Read a recording once. Raises ConfigError for a file that is none."""
-    reader, found, contents = RecordingReader(path), dict[str, KeyInfo](), Contents(path)
-    decoder, in_force = Decoder(ControlSettings), list[ControlSettings]()
+    """Read a recording once, and describe it. Raises ConfigError for a file that is no recording."""
+    reader = RecordingReader(path)
+    contents = Contents(path)
+    by_key: dict[str, KeyInfo] = {}
+    settings_in_force: list[ControlSettings] = []
+    settings_decoder = Decoder(ControlSettings)
     for recorded in reader.messages():
-        one = found.setdefault(recorded.key, KeyInfo())
-        one.time_ns.append(recorded.time_ns)
-        one.bytes += len(recorded.payload)
+        key_info = by_key.setdefault(recorded.key, KeyInfo())
+        key_info.time_ns.append(recorded.time_ns)
+        key_info.bytes += len(recorded.payload)
         if recorded.key in ALL:
-            contents.take(recorded)
+            contents.add(recorded)
         if recorded.key == keys.SETTINGS_IN_FORCE:
             with contextlib.suppress(WireError):
-                in_force.append(decoder.decode(recorded.payload, recorded.encoding))
-    robot, status = contents.description, contents.status
+                settings_in_force.append(settings_decoder.decode(recorded.payload, recorded.encoding))
+
+    robot = contents.description
+    status = contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
-    # Not since the oldest message: latched values, such as the description, are older than a recording that began late.
-    dated = [found[keys.CLOCK]] if keys.CLOCK in found else found.values()
-    began_ns = min((min(one.time_ns) for one in dated), default=0)
-    duration_s = (max((max(one.time_ns) for one in found.values()), default=began_ns) - began_ns) * 1e-9
-    in_turns = robot is not None and robot.backend == "can"  # the IMUs of modules on a bus: at some ticks none
-    irregular = (*IRREGULAR, keys.IMU) if in_turns else IRREGULAR
-    host = contents.host(contents.columns(robot)) if robot is not None and status is not None else None
+    duration_s = _duration_s(by_key)
+    irregular: list[str] = [*IRREGULAR]
+    if robot is not None and robot.backend == "can":  # joint modules on a bus send their IMUs by turns
+        irregular.append(keys.IMU)
+    host = None
+    if robot is not None and status is not None:
+        host = contents.host(contents.columns(robot))
+    lacks = [
+        *reader.lacks,
+        *_describe_skipped(by_key, reader.losses.lost, irregular),
+        *describe_undecodable(contents.refused),
+    ]
+    numbers_by_key: dict[str, dict[str, float]] = {}
+    for key, key_info in sorted(by_key.items()):
+        numbers_by_key[key] = _key_numbers(key_info, is_regular=key not in irregular)
     return RecordingInfo(
         file=str(path),
         size_bytes=path.stat().st_size,
         finished=reader.finished,
-        lacks=[*reader.lacks, *_skipped(found, reader.losses.lost, irregular), *unread(contents.refused)],
+        lacks=lacks,
         gaps=[gap for gap in reader.losses.gaps if gap.lost],
         robot=None if robot is None else robot.robot,
         backend=None if robot is None else robot.backend,
@@ -126,43 +138,59 @@ def inspect_recording(path: Path) -> RecordingInfo:
         ticks=0 if host is None else host.ticks,
         command_digest=None if host is None or not host.ticks else host.command_digest,
         own_arithmetic=[] if robot is None else foreign(robot.arithmetic),
-        lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
-        settings=_changes(in_force),
+        lifecycle=None if status is None else f"{status.lifecycle}: {_lifecycle_reason(status)}",
+        settings=_settings_changes(settings_in_force),
         dropped=reader.losses.dropped,
-        keys={key: _numbers(one, duration_s, regular=key not in irregular) for key, one in sorted(found.items())},
+        keys=numbers_by_key,
     )
 
 
-def _changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
-    return [
-        SettingsChange(
-            time_s=now.timestamp_ns * 1e-9,
-            who=now.who,
-            changed={PREFIX + one.name: (was.value, one.value) for was, one in differing(before, now)},
-        )
-        for before, now in pairwise(in_force)
-        if now.who is not None and now.changes != before.changes
-    ]
+def _duration_s(by_key: dict[str, KeyInfo]) -> float:
+    """Return the robot time from the first clock message to the newest message.
+
+    Latched values, such as the description, may be older than a recording that began late, so they do not count as
+    its beginning.
+    """
+    dated = [by_key[keys.CLOCK]] if keys.CLOCK in by_key else list(by_key.values())
+    began_ns = min((min(key_info.time_ns) for key_info in dated), default=0)
+    ended_ns = max((max(key_info.time_ns) for key_info in by_key.values()), default=began_ns)
+    return (ended_ns - began_ns) * 1e-9
 
 
-def _why(status: Status) -> str:
-    """Why it was in its state; without what a status says behind that, while disarmed: what prevents arming."""
-    return status.why.partition("; ")[0] if status.lifecycle == "disarmed" else status.why
+def _settings_changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
+    """Return the changes that an operator made, in order of time."""
+    changes: list[SettingsChange] = []
+    for before, now in pairwise(in_force):
+        if now.who is None or now.changes == before.changes:
+            continue
+        changed = {PREFIX + new.name: (old.value, new.value) for old, new in differing(before, now)}
+        changes.append(SettingsChange(time_s=now.timestamp_ns * 1e-9, who=now.who, changed=changed))
+    return changes
 
 
-def _numbers(one: KeyInfo, duration_s: float, *, regular: bool) -> dict[str, float]:
-    count = len(one.time_ns)
-    lasted_s = (max(one.time_ns) - min(one.time_ns)) * 1e-9
+def _lifecycle_reason(status: Status) -> str:
+    """Return the reason of the last lifecycle state.
+
+    While disarmed, the status appends what prevents arming; that part is left out.
+    """
+    if status.lifecycle == "disarmed":
+        return status.why.partition("; ")[0]
+    return status.why
+
+
+def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
+    spanned_s = (max(key_info.time_ns) - min(key_info.time_ns)) * 1e-9
+    distinct_times = len(set(key_info.time_ns))
     return {
-        "count": count,
-        "rate_hz": (len(set(one.time_ns)) - 1) / lasted_s if lasted_s > 0 else 0.0,
-        "bytes": one.bytes,
-        "gaps": one.gaps if regular else 0,
+        "count": len(key_info.time_ns),
+        "rate_hz": (distinct_times - 1) / spanned_s if spanned_s > 0 else 0.0,
+        "bytes": key_info.bytes,
+        "gaps": key_info.gaps if is_regular else 0,
     }
 
 
 def show(given: Path, say: Say, *, as_json: bool = False) -> int:
-    """Print what a recording holds. Exit code 3 when it lacks something."""
+    """Print what a recording holds, and return the exit code: 3 if it is incomplete."""
     info = inspect_recording(recording_of(given))
     if as_json:
         say(msgspec.json.encode(info).decode())
@@ -186,7 +214,13 @@ def show(given: Path, say: Say, *, as_json: bool = False) -> int:
     return exit_code(given, info.lacks)
 
 
-def _skipped(found: dict[str, KeyInfo], lost: Counter[str], irregular: Sequence[str]) -> list[str]:
-    """Messages that the recorder never got, as text."""
-    gaps = {key: one.gaps - lost[key] for key, one in sorted(found.items()) if key not in irregular}
-    return [f"{gap} messages on {key}, between the first and the last" for key, gap in gaps.items() if gap > 0]
+def _describe_skipped(by_key: dict[str, KeyInfo], lost: Counter[str], irregular: Sequence[str]) -> list[str]:
+    """Describe the messages that did not reach the recorder."""
+    sentences: list[str] = []
+    for key, key_info in sorted(by_key.items()):
+        if key in irregular:
+            continue
+        missing = key_info.gaps - lost[key]
+        if missing > 0:
+            sentences.append(f"{missing} messages on {key}, between the first and the last")
+    return sentences

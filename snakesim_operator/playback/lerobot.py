@@ -37,7 +37,8 @@ VERSION = "v3.0"
 LACKS = "meta/lacks.json"  # of each episode that lacks something; not a file of LeRobot's
 FILES_A_CHUNK = 1000
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-DATA, EPISODES = f"data/{FILE}", f"meta/episodes/{FILE}".format(chunk_index=0, file_index=0)
+DATA = f"data/{FILE}"
+EPISODES = f"meta/episodes/{FILE}".format(chunk_index=0, file_index=0)
 INDEX = "__index_level_0__"  # pandas' name for an index without one
 COUNTED = ("frame_index", "episode_index", "index", "task_index")
 
@@ -108,7 +109,8 @@ class _Dataset:
             rows: Rows of its record that become frames.
             shown: By camera, which picture each of the frames shows.
         """
-        number, count = len(self.rows), len(rows)
+        number = len(self.rows)
+        count = len(rows)
         if episode.task not in self._tasks:
             self._tasks.append(episode.task)
         frames = _frames(episode, self._content, rows)
@@ -191,17 +193,29 @@ class _Content:
 
     @staticmethod
     def of(episodes: Sequence[Episode]) -> "_Content":
-        sizes = [{name: (p.width, p.height) for name, p in one.pictures.items() if p.ticks} for one in episodes]
+        """Return what is known of every one of some episodes."""
+        cameras = _camera_sizes(episodes[0])
+        for episode in episodes[1:]:
+            cameras &= _camera_sizes(episode)
         return _Content(
-            posed=all(bool(one.record.posed.all()) for one in episodes),
-            rewarded=all(one.reward_m is not None for one in episodes),
-            judged=all(one.success is not None for one in episodes),
-            cameras=dict(sorted(set(sizes[0].items()).intersection(*(set(one.items()) for one in sizes)))),
+            posed=all(bool(episode.record.posed.all()) for episode in episodes),
+            rewarded=all(episode.reward_m is not None for episode in episodes),
+            judged=all(episode.success is not None for episode in episodes),
+            cameras=dict(sorted(cameras)),
         )
 
 
+def _camera_sizes(episode: Episode) -> set[tuple[str, tuple[int, int]]]:
+    """Return name, width and height of each camera that has pictures."""
+    sizes: set[tuple[str, tuple[int, int]]] = set()
+    for name, pictures in episode.pictures.items():
+        if pictures.ticks:
+            sizes.add((name, (pictures.width, pictures.height)))
+    return sizes
+
+
 def _step(robot_hz: int, fps: float | None) -> int:
-    """Ticks from frame to frame."""
+    """Return the number of ticks from frame to frame."""
     if fps is None:
         return 1
     step = max(round(robot_hz / fps), 1)
@@ -251,10 +265,13 @@ def _info(episode: Episode, content: _Content, fps: int) -> dict[str, Any]:
     for camera, (width, height) in content.cameras.items():
         shape = {"shape": [height, width, 3], "names": ["height", "width", "channels"]}
         features[IMAGES + camera] = {"dtype": "image", **shape}
-    kinds = {"timestamp": "float32", **dict.fromkeys(COUNTED, "int64"), "next.done": "bool"}
-    kinds |= {"next.reward": "float32"} if content.rewarded else {}
-    kinds |= {"next.success": "bool"} if content.judged else {}
-    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in kinds.items()}
+    scalar_types = {"timestamp": "float32", **dict.fromkeys(COUNTED, "int64"), "next.done": "bool"}
+    if content.rewarded:
+        scalar_types["next.reward"] = "float32"
+    if content.judged:
+        scalar_types["next.success"] = "bool"
+    for name, dtype in scalar_types.items():
+        features[name] = {"dtype": dtype, "shape": [1], "names": None}
     return {
         "codebase_version": VERSION,
         "robot_type": episode.record.description.robot,
@@ -279,7 +296,7 @@ def _names(record: RunRecord, *, posed: bool) -> dict[str, list[str]]:
 
 
 def _frames(episode: Episode, content: _Content, rows: NDArray[np.int64]) -> Frames:
-    """(n, width) or (n,) of each feature of its own, without pictures."""
+    """Return the values of the features that an episode has by itself, (n, width) or (n,), without pictures."""
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]
     state += [record.position_w, record.orientation_wxyz] if content.posed else []

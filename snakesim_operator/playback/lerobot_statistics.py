@@ -30,7 +30,7 @@ def picture_statistics(pictures: Pictures, shown: NDArray[np.int64]) -> Statisti
     """Returns those of each channel, 0 to 1, over the shown pictures; quantiles are not made of pictures."""
     mean = np.array(pictures.channel_means)[shown].mean(axis=0)
     mean_of_squares = np.array(pictures.channel_squares)[shown].mean(axis=0)
-    return _channel_statistics(pictures.least, pictures.most, mean, mean_of_squares, len(shown))
+    return _channel_statistics(pictures.channel_min, pictures.channel_max, mean, mean_of_squares, len(shown))
 
 
 def join_picture_statistics(parts: Sequence[Statistics]) -> Statistics:

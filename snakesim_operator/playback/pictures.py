@@ -1,4 +1,4 @@
-"""What a recording's cameras saw, as pictures for a data set: color as it is, depth as grey."""
+"""Reads the pictures of a recording's cameras for a data set: color as it is, depth as gray."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,55 +13,75 @@ from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_operator.base.png import png
 from snakesim_operator.recording.reader import RecordingReader
 
-_KINDS = {"depth": Decoder(DepthImage), "color": Decoder(ColorImage)}
+_DECODERS = {"depth": Decoder(DepthImage), "color": Decoder(ColorImage)}
 Rgb = NDArray[np.uint8]
 
 
 @dataclass
 class Pictures:
-    """Of one camera, in the order of their ticks."""
+    """The pictures of one camera, in the order of their ticks. All numbers are 0 to 1."""
 
     width: int
     height: int
     ticks: list[int] = field(default_factory=list[int])
     png: list[bytes] = field(default_factory=list[bytes])
-    channel_means: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])  # of each, 0 to 1
-    channel_squares: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
-    least: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
-    most: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
-    def take(self, tick: int, rgb: Rgb) -> None:
-        """One picture, (height, width, 3)."""
-        share = rgb.reshape(-1, 3) / 255.0
+    # Mean and mean of squares of each picture, (3,).
+    channel_means: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
+    channel_squares: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
+
+    # Extremes over all pictures, (3,).
+    channel_min: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
+    channel_max: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def add(self, tick: int, rgb: Rgb) -> None:
+        """Add a picture, (height * width * 3,) or (height, width, 3)."""
+        pixels = rgb.reshape(-1, 3) / 255.0
         self.ticks.append(tick)
         self.png.append(png(self.width, self.height, rgb.tobytes(), bits=8, color=True))
-        self.channel_means.append(share.mean(axis=0))
-        self.channel_squares.append(np.square(share).mean(axis=0))
-        self.least, self.most = np.minimum(self.least, share.min(axis=0)), np.maximum(self.most, share.max(axis=0))
+        self.channel_means.append(pixels.mean(axis=0))
+        self.channel_squares.append(np.square(pixels).mean(axis=0))
+        self.channel_min = np.minimum(self.channel_min, pixels.min(axis=0))
+        self.channel_max = np.maximum(self.channel_max, pixels.max(axis=0))
 
 
 def read_pictures(path: Path) -> dict[str, Pictures]:
-    """By camera, `head` or `head_depth`; those of another size than a camera's first are left out."""
-    found: dict[str, Pictures] = {}
+    """Read the pictures of a recording by camera: `head` or `head_depth`.
+
+    Pictures are left out if they are damaged, older than the one before, or of another size than the camera's first.
+    """
+    by_camera: dict[str, Pictures] = {}
     for recorded in RecordingReader(path).messages((keys.COLOUR_ALL, keys.DEPTH_ALL)):
         _, kind, name = recorded.key.split("/")
         try:
-            seen = _KINDS[kind].decode(recorded.payload, recorded.encoding)
+            image = _DECODERS[kind].decode(recorded.payload, recorded.encoding)
         except WireError:
             continue
         camera = name if kind == "color" else f"{name}_depth"
-        pictures = found.setdefault(camera, Pictures(seen.width, seen.height))
-        data, pixel_bytes = (seen.depth, 2) if isinstance(seen, DepthImage) else (seen.rgb, 3)
-        alike = (seen.width, seen.height) == (pictures.width, pictures.height)
-        whole = len(data) == pixel_bytes * seen.width * seen.height
-        if alike and whole and (not pictures.ticks or seen.tick > pictures.ticks[-1]):
-            rgb = _grey(seen) if isinstance(seen, DepthImage) else np.frombuffer(data, np.uint8)
-            pictures.take(seen.tick, rgb)
-    return found
+        pictures = by_camera.setdefault(camera, Pictures(image.width, image.height))
+        if (image.width, image.height) != (pictures.width, pictures.height) or not _is_complete(image):
+            continue
+        if not pictures.ticks or image.tick > pictures.ticks[-1]:
+            pictures.add(image.tick, _rgb_of(image))
+    return by_camera
 
 
-def _grey(seen: DepthImage) -> Rgb:
-    """255 at the camera's longest range, 0 where nothing was measured; three channels alike, as policies want them."""
-    depth_m = np.frombuffer(seen.depth, "<u2") * seen.scale_m
-    share = np.clip(depth_m / seen.range_max_m, 0.0, 1.0)
-    return np.repeat(np.rint(255 * share).astype(np.uint8), 3)
+def _is_complete(image: ColorImage | DepthImage) -> bool:
+    """Return whether an image has as many bytes as its size needs."""
+    pixel_count = image.width * image.height
+    if isinstance(image, DepthImage):
+        return len(image.depth) == 2 * pixel_count
+    return len(image.rgb) == 3 * pixel_count
+
+
+def _rgb_of(image: ColorImage | DepthImage) -> Rgb:
+    """Return the pixels of an image.
+
+    Depth is gray in three equal channels, as policies want it: 255 at the camera's maximum range, 0 where nothing was
+    measured.
+    """
+    if not isinstance(image, DepthImage):
+        return np.frombuffer(image.rgb, np.uint8)
+    depth_m = np.frombuffer(image.depth, "<u2") * image.scale_m
+    fraction = np.clip(depth_m / image.range_max_m, 0.0, 1.0)
+    return np.repeat(np.rint(255 * fraction).astype(np.uint8), 3)

@@ -1,11 +1,12 @@
 """Plays a recording on a Zenoh network of its own, with its timing: for programs that read the robot's keys.
 
-It is no robot: no host answers, nothing can be armed. So it listens on an endpoint where nobody else is.
+The player is no robot: no host answers, and nothing can be armed. So it listens on an endpoint that no robot uses.
 """
 
+import heapq
 import time
 from collections.abc import Iterator
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +14,59 @@ from snakesim_hal.base.terminal import Say
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Publisher, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
-from snakesim_operator.playback.order import in_robot_order
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.incomplete import exit_code
-from snakesim_operator.results.recorded import read_recording
+from snakesim_operator.results.missing_data import exit_code
+from snakesim_operator.results.recording_contents import read_recording
 
-LONGEST_PAUSE_S = 10.0  # between two messages, whatever their times are
+MAX_PAUSE_S = 10.0  # between two messages, whatever their times are
+REORDER_WINDOW_NS = 1_000_000_000  # an image may arrive this long after the clock message that names it
+ORDER_WITHIN_TICK = {keys.CLOCK: 1, keys.APPLIED: 2}  # samples come first
+
+
+def in_robot_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
+    """Yield all messages in the order of robot time: the samples of a tick, its clock, what was applied in it.
+
+    The file has them in the order of their arrival, in which the messages of one tick may be mixed.
+    """
+    waiting: list[tuple[int, int, int, RecordedMessage]] = []
+    arrival_number = count()
+    clock_ns = 0
+    for recorded in reader.messages():
+        rank = ORDER_WITHIN_TICK.get(recorded.key, 0)
+        heapq.heappush(waiting, (recorded.time_ns, rank, next(arrival_number), recorded))
+        if recorded.key == keys.CLOCK:
+            clock_ns = recorded.time_ns
+        while waiting[0][0] < clock_ns - REORDER_WINDOW_NS:
+            yield heapq.heappop(waiting)[-1]
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
 
 
 def play(
     path: Path, lines: Iterator[str], say: Say, *, endpoint: str | None, namespace: str | None, rate: float, step: bool
 ) -> int:
-    """Play it once. Raises ConfigError, NotConnectedError.
+    """Play a recording once.
 
-    lines: what the user types. rate: of robot time to wall time; step: one tick at each line of input.
+    Args:
+        path: The recording.
+        lines: Lines that the user types.
+        say: Prints a line.
+        endpoint: Zenoh endpoint to listen on; None: the default one.
+        namespace: Namespace to publish in; None: the robot's name.
+        rate: Robot time over wall time.
+        step: Play one tick at each line of input, instead of with the recorded timing.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: The file is no recording.
+        NotConnectedError: The endpoint cannot be used.
     """
     robot = read_recording(path, (keys.DESCRIPTION,)).description
-    namespace = namespace or (robot.robot if robot is not None else "recording")
+    default_namespace = robot.robot if robot is not None else "recording"
+    namespace = namespace or default_namespace
     link = Link(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES)
     reader = RecordingReader(path)
     messages = in_robot_order(reader)
@@ -38,42 +74,55 @@ def play(
         how = "Enter plays a tick" if step else f"{rate:g} x real time"
         say(f"playing {path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
         player = _Player(session)
-        began: tuple[float, int] | None = None
-        for time_ns, together in groupby(messages, lambda recorded: recorded.time_ns):
+        timing = _Timing(rate)
+        for time_ns, simultaneous in groupby(messages, lambda recorded: recorded.time_ns):
             if step:
                 say(f"{time_ns * 1e-9:.3f} s")
                 if next(lines, None) is None:
                     break
             else:
-                began = began or (time.monotonic(), time_ns)
-                began = _waited(began, time_ns, rate)
-            for recorded in together:
-                player.put(recorded)
+                timing.wait_until(time_ns)
+            for recorded in simultaneous:
+                player.publish(recorded)
         say(f"{player.count} messages played")
     return exit_code(path, reader.lacks)
 
 
-def _waited(began: tuple[float, int], time_ns: int, rate: float) -> tuple[float, int]:
-    """Wait until a robot time is due. Returns when it began; a longer pause, as of lost messages, makes that later."""
-    wait_s = began[0] + (time_ns - began[1]) * 1e-9 / rate - time.monotonic()
-    time.sleep(min(max(wait_s, 0.0), LONGEST_PAUSE_S))
-    return began if wait_s <= LONGEST_PAUSE_S else (time.monotonic(), time_ns)
+class _Timing:
+    """Maps robot time to wall time. After a long pause, as of lost messages, the mapping begins anew."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate  # robot time over wall time
+        self._origin: tuple[float, int] | None = None  # wall time in s and robot time in ns
+
+    def wait_until(self, time_ns: int) -> None:
+        """Wait until this robot time is due, but at most MAX_PAUSE_S."""
+        if self._origin is None:
+            self._origin = (time.monotonic(), time_ns)
+        wall_s, robot_ns = self._origin
+        wait_s = wall_s + (time_ns - robot_ns) * 1e-9 / self._rate - time.monotonic()
+        time.sleep(min(max(wait_s, 0.0), MAX_PAUSE_S))
+        if wait_s > MAX_PAUSE_S:
+            self._origin = (time.monotonic(), time_ns)
 
 
 class _Player:
+    """Publishes recorded messages, with one publisher for each key."""
+
     def __init__(self, session: Session) -> None:
         self._session = session
         self._publishers: dict[str, Publisher[Any]] = {}
         self.count = 0
 
-    def put(self, recorded: RecordedMessage) -> None:
-        """Publish it as it was."""
+    def publish(self, recorded: RecordedMessage) -> None:
+        """Publish a message as it was. Ignores messages of keys that are not SnakeSIM's."""
         row = keys.row_at(recorded.key)
         if row is None or row.message is None or recorded.encoding != encoding_of(row.message):
             return
         publisher = self._publishers.get(recorded.key)
         if publisher is None:
             declare = self._session.latched_publisher if row.kind == "latched" else self._session.publisher
-            publisher = self._publishers[recorded.key] = declare(recorded.key, row.message)
+            publisher = declare(recorded.key, row.message)
+            self._publishers[recorded.key] = publisher
         publisher.send(recorded.payload)
         self.count += 1

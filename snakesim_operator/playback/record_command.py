@@ -25,10 +25,18 @@ def record_robot(
     *,
     raw_only: bool = False,
 ) -> int:
-    """Record until Ctrl-C, or for a time by the wall clock. Exit code 1 when the disk took no more.
+    """Record a robot until Ctrl-C, or for a time.
 
-    foxglove_port: serve viewers there meanwhile; foxglove_origins: of web pages that may be such viewers;
-    raw_only: the file is without topics for viewers.
+    Args:
+        where: The robot.
+        out: The file; None: named after the robot and the time, in the working folder.
+        duration_s: Wall time; None: until Ctrl-C.
+        foxglove_port: Serve viewers on this port meanwhile; None: serve none.
+        foxglove_origins: Origins of web pages that may be such viewers.
+        raw_only: Write a file without topics for viewers.
+
+    Returns:
+        The exit code: 1 if the disk was full.
     """
     link = replace(only_robot(where, "record"), max_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
@@ -36,6 +44,10 @@ def record_robot(
     stopped: list[bool] = []
     on_stop_signal(lambda: stopped.append(True))
     began = time.monotonic()
+
+    def goes_on() -> bool:
+        return not stopped and (duration_s is None or time.monotonic() < began + duration_s)
+
     try:
         with (
             nullcontext()
@@ -44,18 +56,15 @@ def record_robot(
         ):
             end = "" if duration_s else "; Ctrl-C ends it"
             say(f"recording {link.namespace} on {link.endpoint} into {path}{end}")
+            show = None
             if live is not None:
                 say(f"Foxglove: open connection {live.address}")
-            recorder = record(
-                link,
-                path,
-                lambda: not stopped and (duration_s is None or time.monotonic() < began + duration_s),
-                live.show if live is not None else None,
-                raw_only=raw_only,
-            )
+                show = live.show
+            recorder = record(link, path, goes_on, show, raw_only=raw_only)
     finally:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
-    messages, size = recorder.recording.counts.total(), path.stat().st_size
-    say(f"{messages} messages in {time.monotonic() - began:.1f} s, {size / 1e6:.1f} MB: {path}")
+    messages = recorder.recording.counts.total()
+    size_bytes = path.stat().st_size
+    say(f"{messages} messages in {time.monotonic() - began:.1f} s, {size_bytes / 1e6:.1f} MB: {path}")
     return 1 if recorder.recording.failure else 0

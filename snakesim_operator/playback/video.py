@@ -15,27 +15,28 @@ from snakesim_hal.base.terminal import Say, say
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.textfiles import exported
 from snakesim_operator.base import extras
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 
 Picture = NDArray[np.uint8]
 Write = Callable[[Picture], None]
 
-FOLLOW_S = 0.8  # how slowly the view follows the snake
-M_PER_N, MIN_FORCE_N = 0.008, 0.3
-WORLD_LIMIT_S = 0.3  # older contacts are not drawn
-COLOURS = 48  # of a GIF
-TOLD_SHARE = 0.25
-LONGEST_COMMENT = 250  # bytes, in a GIF
+FOLLOW_S = 0.8  # time constant with which the view follows the snake
+M_PER_N = 0.008  # length of an arrow
+MIN_FORCE_N = 0.3  # a smaller force is not drawn
+MAX_WORLD_AGE_S = 0.3  # older contacts are not drawn
+GIF_COLORS = 48
+PROGRESS_STEP = 0.25  # progress is printed after each such fraction of the pictures
+MAX_COMMENT_BYTES = 250  # of a GIF
 
 
 class Film(Protocol):
-    """What a plugin in the group `snakesim.films` makes."""
+    """A camera that a plugin in the group `snakesim.films` provides."""
 
     def picture(
         self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: list[Floats]
     ) -> Picture:
-        """The snake at a pose, (height, width, 3)."""
+        """Render the snake at a pose, (height, width, 3)."""
         ...
 
     def close(self) -> None:
@@ -47,7 +48,7 @@ Span = tuple[float, float]  # from and to in seconds, since the first tick
 
 
 def video(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span) -> int:
-    """Film a run. Raises ConfigError for one without poses, and when something that it needs is not installed."""
+    """Film a run from its folder or recording, and return the exit code. Takes and raises what `film` does."""
     record = RunRecord.load(run)
     film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=say)
     return exit_code(run, record.lacks)
@@ -56,23 +57,49 @@ def video(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: flo
 def film(
     record: RunRecord, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: Say
 ) -> None:
-    """Film a record. Raises ConfigError, as `video` does."""
+    """Film a record.
+
+    Args:
+        record: The run.
+        out: The film, an .mp4 or .gif file.
+        size: Width and height in pixels.
+        fps: Pictures a second.
+        speed: Robot time over the film's time.
+        span_s: The part of the run that is filmed, from and to, since the first tick.
+        say: Prints a line.
+
+    Raises:
+        ConfigError: The record has no pose, `out` is no film, or something that a film needs is not installed.
+    """
     if out.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
     extras.check("video", "a film")
     times = times_of_pictures(record, fps, speed, span_s)
-    for sentence in standstills_in_words(times, speed / fps, record.config.period_ns * 1e-9):
+    picture_s = speed / fps
+    for sentence in standstills_in_words(times, picture_s, record.config.period_ns * 1e-9):
         say(sentence)
     camera: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
-    with contextlib.closing(camera), exported(out) as partial, _written(partial, size, fps, record.lacks) as write:
-        middle = _center(record, record.row_at(times[0]))
+    progress_step = max(round(PROGRESS_STEP * len(times)), 1)
+    with (
+        contextlib.closing(camera),
+        exported(out) as partial,
+        _open_writer(partial, size, fps, record.lacks) as write,
+    ):
+        look_at = _center(record, record.row_at(times[0]))
         for i, time_s in enumerate(times):
             row = record.row_at(time_s)
-            pose = record.position_w[row], record.orientation_wxyz[row], record.angle_rad[row]
-            middle = middle + (_center(record, row) - middle) * min(speed / fps / FOLLOW_S, 1.0)
-            write(camera.picture(*pose, middle, _forces(record, time_s)))
-            if (i + 1) % max(round(TOLD_SHARE * len(times)), 1) == 0:
-                say(f"{100 * (i + 1) // len(times)} %: {i + 1} of {len(times)} pictures")
+            look_at = look_at + (_center(record, row) - look_at) * min(picture_s / FOLLOW_S, 1.0)
+            picture = camera.picture(
+                record.position_w[row],
+                record.orientation_wxyz[row],
+                record.angle_rad[row],
+                look_at,
+                _force_arrows(record, time_s),
+            )
+            write(picture)
+            count = i + 1
+            if count % progress_step == 0:
+                say(f"{100 * count // len(times)} %: {count} of {len(times)} pictures")
     say(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
 
 
@@ -83,7 +110,7 @@ def _center(record: RunRecord, row: int) -> Floats:
 
 
 def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span) -> Floats:
-    """Robot time of the pose in each picture. In a gap the last pose before it stays: the next one came only later."""
+    """Return the robot time of the pose in each picture. In a gap the last pose before it stays."""
     known = record.time_s[record.posed]
     if not len(known):
         raise ConfigError(f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film")
@@ -99,9 +126,12 @@ def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span)
 
 
 def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> list[str]:
-    """Returns a sentence for each time in which the film stands still because no pose is recorded.
+    """Return a sentence for each time in which the film stands still because no pose is recorded.
 
-    times_s: of the pose in each picture; picture_s: robot time from picture to picture.
+    Args:
+        times_s: Robot time of the pose in each picture.
+        picture_s: Robot time from picture to picture.
+        period_s: Robot time from tick to tick.
     """
     sentences: list[str] = []
     for before_s, after_s in pairwise(np.unique(times_s).tolist()):
@@ -112,17 +142,18 @@ def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> 
     return sentences
 
 
-def _forces(record: RunRecord, time_s: float) -> list[Floats]:
-    """Arrows of the contact forces then."""
-    recent = [world for world in record.worlds if 0 <= time_s - world.timestamp_ns * 1e-9 < WORLD_LIMIT_S]
+def _force_arrows(record: RunRecord, time_s: float) -> list[Floats]:
+    """Return an arrow for each contact force at a time, (2, 3): from where to where in the world."""
+    recent = [world for world in record.worlds if 0 <= time_s - world.timestamp_ns * 1e-9 < MAX_WORLD_AGE_S]
     if not recent:
         return []
-    found: list[Floats] = []
+    arrows: list[Floats] = []
     for contact in recent[-1].contacts:
-        at, force = np.array(contact.position_w), np.array(contact.force_w)
+        foot = np.array(contact.position_w)
+        force = np.array(contact.force_w)
         if np.linalg.norm(force) > MIN_FORCE_N:
-            found.append(np.stack([at, at + M_PER_N * force]))
-    return found
+            arrows.append(np.stack([foot, foot + M_PER_N * force]))
+    return arrows
 
 
 def _check_film(path: Path, pictures: int) -> None:
@@ -130,46 +161,60 @@ def _check_film(path: Path, pictures: int) -> None:
     import imageio_ffmpeg
 
     try:
-        found, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
     except RuntimeError:
-        found = 0
-    if found != pictures:
-        raise OSError(f"the encoder has failed, after {found} of {pictures} pictures; the disk may be full")
+        written = 0
+    if written != pictures:
+        raise OSError(f"the encoder has failed, after {written} of {pictures} pictures; the disk may be full")
 
 
 @contextlib.contextmanager
-def _written(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str]) -> Iterator[Write]:
-    import imageio_ffmpeg
-    from PIL import Image
-
+def _open_writer(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str]) -> Iterator[Write]:
+    """Yield a function that appends a picture to a film. The film's comment names what the record does not hold."""
     comment = f"incomplete: {'; '.join(lacks)}" if lacks else ""
     if out.suffix == ".mp4":
-        rate: Any = fps  # annotated as int, but any number will do
-        said = ["-metadata", f"comment={comment}"] if comment else None
-        writer: Any = imageio_ffmpeg.write_frames(
-            str(out), size, fps=rate, macro_block_size=2, quality=7, output_params=said
-        )
-        writer.send(None)
-        sent = 0
+        with _open_mp4(out, size, fps, comment) as write:
+            yield write
+    else:
+        with _open_gif(out, fps, comment) as write:
+            yield write
 
-        def send(picture: Picture) -> None:
-            nonlocal sent
-            writer.send(np.ascontiguousarray(picture))
-            sent += 1
 
-        try:
-            yield send
-        finally:
-            writer.close()
-        _check_film(out, sent)
-        return
+@contextlib.contextmanager
+def _open_mp4(out: Path, size: tuple[int, int], fps: float, comment: str) -> Iterator[Write]:
+    import imageio_ffmpeg
+
+    rate: Any = fps  # annotated as int, but any number will do
+    metadata = ["-metadata", f"comment={comment}"] if comment else None
+    encoder: Any = imageio_ffmpeg.write_frames(
+        str(out), size, fps=rate, macro_block_size=2, quality=7, output_params=metadata
+    )
+    encoder.send(None)
+    picture_count = 0
+
+    def send(picture: Picture) -> None:
+        nonlocal picture_count
+        encoder.send(np.ascontiguousarray(picture))
+        picture_count += 1
+
+    try:
+        yield send
+    finally:
+        encoder.close()
+    _check_film(out, picture_count)
+
+
+@contextlib.contextmanager
+def _open_gif(out: Path, fps: float, comment: str) -> Iterator[Write]:
+    from PIL import Image
+
     pictures: list[Image.Image] = []
-    palette: list[Image.Image] = []  # of the first picture, for all: less to store, and no flicker
+    palette: list[Image.Image] = []  # of the first picture, for all: smaller, and without flicker
 
     def keep(picture: Picture) -> None:
         image = Image.fromarray(picture)
         if not palette:
-            palette.append(image.quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
+            palette.append(image.quantize(GIF_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
         pictures.append(image.quantize(palette=palette[0], dither=Image.Dither.NONE))
 
     yield keep
@@ -180,5 +225,5 @@ def _written(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str])
         duration=1000 / fps,
         loop=0,
         optimize=True,
-        comment=comment.encode()[:LONGEST_COMMENT],
+        comment=comment.encode()[:MAX_COMMENT_BYTES],
     )

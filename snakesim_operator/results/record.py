@@ -22,8 +22,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
-from snakesim_operator.results.gaps import cleaned, unread, unwritten
-from snakesim_operator.results.recorded import OUTPUTS, Contents, read_recording
+from snakesim_operator.results.missing_data import describe_undecodable, describe_unwritten, replace_invalid_numbers
+from snakesim_operator.results.recording_contents import OUTPUTS, Contents, read_recording
 
 CONFIG = "config.json"
 SUMMARY = "summary.json"
@@ -67,20 +67,30 @@ class RunRecord:
 
     @staticmethod
     def load(folder: Path, host: HostRecord | None = None, hear: Hear | None = None) -> "RunRecord":
-        """Read a run's folder, also of a run that was killed, or a recording. Raises ConfigError for anything else.
+        """Read a run's folder, also of a run that was killed, or a recording.
 
-        host: the host's statistics, if known from elsewhere; None: from the folder.
-        hear: given every message of the recording.
+        Args:
+            folder: The folder or the recording.
+            host: The host's statistics, if known from elsewhere; None: from the folder.
+            hear: Called with every message of the recording.
+
+        Raises:
+            ConfigError: It is neither of both, or damaged.
         """
-        if folder.is_file() or (not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file()):
-            return RunRecord._alone(folder if folder.is_file() else folder / RECORDING, host, hear)
+        if folder.is_file():
+            return RunRecord._load_recording_alone(folder, host, hear)
+        if not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file():
+            return RunRecord._load_recording_alone(folder / RECORDING, host, hear)
         if not folder.exists():
             raise ConfigError(f"{folder}: no such folder; {GIVE}")
-        for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
+        needed = [CONFIG, BLACK_BOX, DESCRIPTION]
+        if host is None:
+            needed.append(HOST_RECORD)
+        for name in needed:
             if not (folder / name).is_file():
                 raise ConfigError(f"{folder} is not the folder of a run: {name} is missing; {GIVE}")
         try:
-            return RunRecord._read(folder, host, hear)
+            return RunRecord._load_folder(folder, host, hear)
         except ConfigError:
             raise
         except DAMAGED as error:
@@ -88,7 +98,7 @@ class RunRecord:
             raise ConfigError(f"{folder}: the record of this run is damaged ({why}); run it again") from None
 
     @staticmethod
-    def _read(folder: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
+    def _load_folder(folder: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
         config = read(folder / CONFIG)
         description = msgspec.json.decode((folder / DESCRIPTION).read_bytes(), type=Description)
         layout, columns = read_black_box(folder / BLACK_BOX)
@@ -99,15 +109,16 @@ class RunRecord:
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
         path = folder / RECORDING
-        contents = Contents(path, lacks=[UNRECORDED])
         if path.is_file():
             contents = read_recording(path, OUTPUTS, hear)
             contents.unreached = contents.missing(len(columns["tick"]))
-        return RunRecord._of(folder, config, description, host, contents, columns)
+        else:
+            contents = Contents(path, lacks=[UNRECORDED])
+        return RunRecord._assemble(folder, config, description, host, contents, columns)
 
     @staticmethod
-    def _alone(path: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
-        """Of a recording without the run's other files: a full disk may have had no room for them."""
+    def _load_recording_alone(path: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
+        """Load a recording without the run's other files: a full disk may have had no room for them."""
         contents = read_recording(path, hear=hear)
         description = contents.description
         if description is None or contents.config is None:
@@ -118,11 +129,12 @@ class RunRecord:
         except UNDECODABLE as error:
             raise ConfigError(f"{path}: its hal/config cannot be read: {str(error)[:200]}") from None
         columns = contents.columns(description)
-        host = contents.host(columns) if host is None else host
-        return RunRecord._of(path, config, description, host, contents, columns)
+        if host is None:
+            host = contents.host(columns)
+        return RunRecord._assemble(path, config, description, host, contents, columns)
 
     @staticmethod
-    def _of(
+    def _assemble(
         folder: Path,
         config: RunConfig,
         description: Description,
@@ -130,26 +142,30 @@ class RunRecord:
         contents: Contents,
         columns: dict[str, NDArray[Any]],
     ) -> "RunRecord":
-        host = msgspec.structs.replace(host, lost_ticks=max(host.lost_ticks, host.ticks - len(columns["tick"])))
-        cleaned_columns, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
+        """Make a record of its parts: remove invalid numbers, and collect what is missing."""
+        lost_ticks = max(host.lost_ticks, host.ticks - len(columns["tick"]))
+        host = msgspec.structs.replace(host, lost_ticks=lost_ticks)
+        has_pose = config.robot.sensors.pose is not None
+        cleaned_columns, lacks = replace_invalid_numbers(columns, description, has_pose=has_pose)
         control = contents.streams[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
-        refused = contents.refused.copy()
+        refused_before = contents.refused.copy()
         own = contents.own_columns(description, cleaned_columns["time_s"])
-        lacks += unread(contents.refused - refused)
-        known = {name: column for name, column in cleaned_columns.items() if name != "tick"}
-        streams = (control, contents.streams[keys.WORLD], contents.streams[keys.TRAJECTORY])
+        lacks += describe_undecodable(contents.refused - refused_before)
+        del cleaned_columns["tick"]
         return RunRecord(
-            folder,
-            config,
-            description,
-            host,
-            *streams,
-            **known,
+            folder=folder,
+            config=config,
+            description=description,
+            host=host,
+            control=control,
+            worlds=contents.streams[keys.WORLD],
+            trajectories=contents.streams[keys.TRAJECTORY],
+            **cleaned_columns,
             own=own,
             searched_nodes=contents.searched_nodes,
-            lacks=lacks + unwritten(host) + contents.unreached + contents.lacks,
+            lacks=lacks + describe_unwritten(host) + contents.unreached + contents.lacks,
             unreached=contents.unreached,
             replay_of=contents.replay_of,
             alone=folder == contents.path,
@@ -158,12 +174,12 @@ class RunRecord:
 
     @cached_property
     def route(self) -> Route | None:
-        """The route through the scene."""
+        """The route through the scene; None if it has none."""
         return route_of(self.config.scene)
 
     @cached_property
     def placed(self) -> list[Placed]:
-        """The obstacles where they stand."""
+        """The obstacles, each at its place in the scene."""
         return place_all(self.config)
 
     @cached_property
@@ -173,12 +189,12 @@ class RunRecord:
 
     @cached_property
     def ticks(self) -> NDArray[np.int64]:
-        """Tick of each row, (n,)."""
+        """The tick of each row, (n,)."""
         return np.rint(self.time_s * 1e9 / self.description.period_ns).astype(np.int64)
 
     @cached_property
     def stretches(self) -> list[NDArray[np.int64]]:
-        """Row numbers between the record's gaps: within a stretch every tick follows the one before."""
+        """The row numbers between the record's gaps: within a stretch every tick follows the one before."""
         rows = np.arange(len(self.ticks))
         if not len(rows):
             return []
@@ -186,17 +202,17 @@ class RunRecord:
         return np.split(rows, after_a_gap)
 
     def row_at(self, time_s: float) -> int:
-        """The row whose time is nearest."""
+        """Return the row whose time is nearest."""
         return int(np.argmin(np.abs(self.time_s - time_s)))
 
     @cached_property
     def posed(self) -> NDArray[np.bool_]:
-        """Rows in which the pose and all angles are known, (n,)."""
+        """A mask of the rows in which the pose and all angles are known, (n,)."""
         signals = (self.position_w, self.orientation_wxyz, self.angle_rad)
         return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in signals])
 
     def nodes_w(self, row: int) -> Floats | None:
-        """Tail end, joints and head end in the world, (joints + 2, 3); None when the pose is unknown."""
+        """Return tail end, joints and head end in the world, (joints + 2, 3), or None if the pose is unknown."""
         if len(self.time_s) == 0 or not self.posed[row]:
             return None
         return nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])

@@ -10,12 +10,12 @@ from msgspec import Meta
 from snakesim_hal.base.arithmetic import foreign
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, Mode, Timing
-from snakesim_operator.results.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
-from snakesim_operator.results.effort import Directions, Effort
-from snakesim_operator.results.estimates import Estimates
-from snakesim_operator.results.force_tracking import force_tracking
-from snakesim_operator.results.motion import Motion, motion_of
-from snakesim_operator.results.propulsion import count_hand_overs, propulsion_periods
+from snakesim_operator.results.metrics.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
+from snakesim_operator.results.metrics.effort import Directions, Effort
+from snakesim_operator.results.metrics.estimates import Estimates
+from snakesim_operator.results.metrics.force_tracking import force_tracking
+from snakesim_operator.results.metrics.motion import Motion, motion_of
+from snakesim_operator.results.metrics.propulsion import count_hand_overs, propulsion_periods
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -183,32 +183,40 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def distance_m(summary: RunSummary) -> float | None:
-    """Along the path, else as the crow flies."""
-    return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
+    """Return the distance along the path, or without a path the net displacement."""
+    if summary.path_distance_m is not None:
+        return summary.path_distance_m
+    return summary.net_displacement_m
 
 
 def estimates_of(summary: RunSummary) -> Estimates:
-    """What was estimated in the run."""
+    """Return what guidance estimated in the run."""
     return Estimates(summary.pose_from, summary.contacts_from, summary.reckoned_distance_m, summary.reckoned_off_m)
 
 
 def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:
-    """Work out the numbers of a run."""
-    config, host = record.config, record.host
-    count = len(record.time_s)
+    """Compute the numbers of a run.
+
+    Args:
+        record: The run.
+        ended: How it ended: complete, interrupted, or what failed.
+        restarts: The processes that ended and were restarted.
+        hosts: How many HAL hosts the run had.
+    """
+    config = record.config
+    host = record.host
     duration_s = host.ticks * config.period_ns * 1e-9
     path_m, net_m, known_s = _distances(record)
     moved_m = path_m if path_m is not None else net_m
-    has_contacts = record.feels_contacts and count > 0
-    last = record.control[-1] if record.control else None
     motion = motion_of(record)
-    last_state, last_reason = last_state_of(motion, last)
-    propelled = propulsion_periods(record) if record.control else None
-    joints = record.description.joints
-    limits = np.array([joint.torque_limit_nm for joint in joints])
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
-    advance, forces = Advance.of(record), force_tracking(record.control)
+    advance = Advance.of(record)
+    last_report = record.control[-1] if record.control else None
+    too_slow: list[str] = []
+    if last_report and last_report.too_slow:
+        too_slow.append(f"control: {last_report.too_slow}")
     return RunSummary(
+        # What was run.
         scenario=config.name,
         robot=config.robot.name,
         scene=config.scene.name,
@@ -218,6 +226,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         seed=config.seed,
         clock_mode=config.clock_mode,
         rate_hz=config.rate_hz,
+        # Time.
         duration_s=duration_s,
         wall_s=host.wall_s,
         real_time_factor=duration_s / host.wall_s if host.wall_s > 0 else None,
@@ -225,41 +234,22 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         overruns=host.overruns,
         answered_fraction=host.answered_ticks / host.armed_ticks if host.armed_ticks else None,
         command_digest=host.command_digest,
+        # Motion.
         path_distance_m=path_m,
         net_displacement_m=net_m,
         **vars(Estimates.of(record)),
         mean_speed_m_s=moved_m / known_s if moved_m is not None else None,
         locomoting_fraction=motion.moving_fraction if motion else None,
-        propulsion_joints=None if propelled is None else [joints[one.joint].name for one in propelled],
-        hand_overs=None if propelled is None else count_hand_overs(propelled),
-        jammed=any(state.jammed for state in record.control),
-        last_state=last_state,
-        last_reason=last_reason,
-        reported_state=last.state if last else None,
-        reported_reason=last.reason if last else None,
-        peak_joint_torque_nm=largest(np.abs(record.torque_nm)),
-        torque_saturated_fraction=float((np.abs(record.torque_nm) >= SATURATED_FROM * limits).any(axis=1).mean())
-        if count
-        else None,
-        peak_contact_force_n=largest(record.contact_peak_n) if has_contacts else None,
-        desired_force_correlation=forces.correlation if forces else None,
-        desired_force_error=forces.median_error if forces else None,
-        empty_push_points=forces.empty if forces else None,
-        energy_j=energy_j(record) if has_power else None,
-        torque_joints_j=work_j(record, Mode.TORQUE) if has_power else None,
-        position_joints_j=work_j(record, Mode.POSITION) if has_power else None,
-        goal_m=advance.goal_m if advance else None,
-        crossed=advance.crossed_s is not None if advance and advance.goal_m is not None else None,
-        crossed_s=advance.crossed_s if advance else None,
-        advance_m=advance.reached_m if advance else None,
-        advance_m_s=advance.reached_m / advance.until_s if advance and advance.until_s > 0 else None,
-        energy_j_per_m=energy_j_per_m(record, advance) if advance and has_power else None,
-        stalled_s=advance.stalled_s if advance else None,
+        **_reported_numbers(record, motion, last_report),
+        # Forces and effort.
+        **_load_numbers(record, has_power=has_power),
+        **_advance_numbers(record, advance, has_power=has_power),
         **vars(Effort.of(record, advance, has_power=has_power)),
         **vars(Directions.of(record, advance, net_m, known_s, has_power=has_power)),
+        # The host and its processes.
         state_to_command_us=host.state_to_command_us,
         tick_times=host.tick_times,
-        too_slow=[f"control: {last.too_slow}"] if last and last.too_slow else [],
+        too_slow=too_slow,
         rejected_commands=host.rejected_commands,
         limited_commands=host.limited_commands,
         faults=host.faults,
@@ -274,20 +264,81 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     )
 
 
-def last_state_of(motion: Motion | None, reported: ControlState | None) -> tuple[str | None, str | None]:
-    """State and reason at the end, by the measured motion. What control reported counts where the two agree."""
+def _reported_numbers(record: RunRecord, motion: Motion | None, last_report: ControlState | None) -> dict[str, Any]:
+    """Return the fields of a summary that are about the states which control reported."""
+    propulsion_joints = None
+    hand_overs = None
+    if record.control:
+        periods = propulsion_periods(record)
+        propulsion_joints = [record.description.joints[period.joint].name for period in periods]
+        hand_overs = count_hand_overs(periods)
+    last_state, last_reason = last_state_of(motion, last_report)
+    return {
+        "propulsion_joints": propulsion_joints,
+        "hand_overs": hand_overs,
+        "jammed": any(state.jammed for state in record.control),
+        "last_state": last_state,
+        "last_reason": last_reason,
+        "reported_state": last_report.state if last_report else None,
+        "reported_reason": last_report.reason if last_report else None,
+    }
+
+
+def _load_numbers(record: RunRecord, *, has_power: bool) -> dict[str, Any]:
+    """Return the fields of a summary that are about torques, contact forces and energy."""
+    has_ticks = len(record.time_s) > 0
+    saturated_fraction = None
+    if has_ticks:
+        limits_nm = np.array([joint.torque_limit_nm for joint in record.description.joints])
+        is_saturated = (np.abs(record.torque_nm) >= SATURATED_FROM * limits_nm).any(axis=1)
+        saturated_fraction = float(is_saturated.mean())
+    tracking = force_tracking(record.control)
+    return {
+        "peak_joint_torque_nm": largest(np.abs(record.torque_nm)),
+        "torque_saturated_fraction": saturated_fraction,
+        "peak_contact_force_n": largest(record.contact_peak_n) if record.feels_contacts and has_ticks else None,
+        "desired_force_correlation": tracking.correlation if tracking else None,
+        "desired_force_error": tracking.median_error if tracking else None,
+        "empty_push_points": tracking.empty if tracking else None,
+        "energy_j": energy_j(record) if has_power else None,
+        "torque_joints_j": work_j(record, Mode.TORQUE) if has_power else None,
+        "position_joints_j": work_j(record, Mode.POSITION) if has_power else None,
+    }
+
+
+def _advance_numbers(record: RunRecord, advance: Advance | None, *, has_power: bool) -> dict[str, Any]:
+    """Return the fields of a summary that are about the advance; none of a run whose pose is unknown."""
+    if advance is None:
+        return dict.fromkeys(("goal_m", "crossed", "crossed_s", "advance_m", "advance_m_s"))
+    return {
+        "goal_m": advance.goal_m,
+        "crossed": advance.crossed_s is not None if advance.goal_m is not None else None,
+        "crossed_s": advance.crossed_s,
+        "advance_m": advance.reached_m,
+        "advance_m_s": advance.reached_m / advance.until_s if advance.until_s > 0 else None,
+        "energy_j_per_m": energy_j_per_m(record, advance) if has_power else None,
+        "stalled_s": advance.stalled_s,
+    }
+
+
+def last_state_of(motion: Motion | None, last_report: ControlState | None) -> tuple[str | None, str | None]:
+    """Return state and reason at the end, by the measured motion.
+
+    What control reported is used if it agrees with the motion. Both are None if the pose is unknown.
+    """
     if motion is None:
         return None, None
+    reports_motion = last_report is not None and last_report.state == "Locomoting"
     if motion.final_stop is None:
-        agrees = reported is not None and reported.state == "Locomoting"
-        return "Locomoting", reported.reason if reported and agrees else "moving"
-    if reported is not None and reported.state != "Locomoting":
-        return reported.state, reported.reason
+        reason = last_report.reason if last_report is not None and reports_motion else "moving"
+        return "Locomoting", reason
+    if last_report is not None and not reports_motion:
+        return last_report.state, last_report.reason
     return "NotLocomoting", STANDING_STILL
 
 
 def arc_position_m(record: RunRecord, row: int) -> float | None:
-    """Mean arc length along the route of the tail end, the joints and the head end."""
+    """Return the mean arc length along the route of the tail end, the joints and the head end."""
     nodes = record.nodes_w(row)
     if nodes is None or record.route is None:
         return None
@@ -295,22 +346,27 @@ def arc_position_m(record: RunRecord, row: int) -> float | None:
 
 
 def largest(values: np.ndarray) -> float | None:
-    """The largest known value; None when there is none."""
+    """Return the largest known value, or None if all are unknown."""
     known = values[np.isfinite(values)]
     return float(known.max()) if len(known) else None
 
 
 def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
-    """Along the route, and straight; from the first known pose to the last, and the time between them."""
+    """Return the distances from the first known pose to the last: along the route, and straight; and the time."""
     posed = np.flatnonzero(record.posed)
     if len(posed) < 2:
         return None, None, 0.0
-    row, last_row = int(posed[0]), int(posed[-1])
-    first, last = record.nodes_w(row), record.nodes_w(last_row)
-    if first is None or last is None:
+    first_row = int(posed[0])
+    last_row = int(posed[-1])
+    first_nodes = record.nodes_w(first_row)
+    last_nodes = record.nodes_w(last_row)
+    if first_nodes is None or last_nodes is None:
         return None, None, 0.0
-    net = float(np.linalg.norm(body_center_w(record.description, last) - body_center_w(record.description, first)))
-    start, end = arc_position_m(record, row), arc_position_m(record, last_row)
-    ticks = int(record.ticks[last_row] - record.ticks[row]) + 1  # those in a gap count too: the body moved in it
+    robot = record.description
+    net_m = float(np.linalg.norm(body_center_w(robot, last_nodes) - body_center_w(robot, first_nodes)))
+    start_m = arc_position_m(record, first_row)
+    end_m = arc_position_m(record, last_row)
+    path_m = None if start_m is None or end_m is None else end_m - start_m
+    ticks = int(record.ticks[last_row] - record.ticks[first_row]) + 1  # those in a gap count: the body moved in it
     known_s = ticks * record.config.period_ns * 1e-9
-    return (None if start is None or end is None else end - start), net, known_s
+    return path_m, net_m, known_s

@@ -17,32 +17,42 @@ class Interval:
 
 
 def zero_s(record: RunRecord) -> float:
-    """The robot's time at the first tick: where every time axis begins."""
+    """Return the robot's time at the first tick, where every time axis begins."""
     if len(record.time_s):
         return float(record.time_s[0])
-    return record.control[0].timestamp_ns * 1e-9 if record.control else 0.0
+    if record.control:
+        return record.control[0].timestamp_ns * 1e-9
+    return 0.0
 
 
 def end_s(record: RunRecord) -> float:
-    """The end of the last tick, on the time axis."""
+    """Return the end of the last tick, on the time axis."""
     if len(record.time_s):
         return float(record.time_s[-1]) - zero_s(record) + record.config.period_ns * 1e-9
-    return record.control[-1].timestamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
+    if record.control:
+        return record.control[-1].timestamp_ns * 1e-9 - zero_s(record)
+    return 0.0
 
 
 def reported_at_s(record: RunRecord, state: ControlState) -> float:
-    """When a state was reported, on the time axis and within the run."""
+    """Return the time at which a state was reported, on the time axis and within the run."""
     return min(max(state.timestamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
 
 
 def reported_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
-    """(since, until, state) on the time axis: each state holds until the next is reported."""
+    """Return (since, until, state) on the time axis: each state holds until the next is reported."""
     starts = [reported_at_s(record, state) for state in record.control]
-    return list(zip(starts, [*starts, end_s(record)][1:], record.control, strict=True))
+    ends = [*starts, end_s(record)][1:]
+    return list(zip(starts, ends, record.control, strict=True))
 
 
 def merge_reports(record: RunRecord, values: Sequence[str | None]) -> list[Interval]:
-    """Bands of equal values, one value for each state that control reported; None is left out."""
+    """Merge adjacent equal values into intervals.
+
+    Args:
+        record: The run.
+        values: One value for each state that control reported; None: no interval.
+    """
     bands: list[Interval] = []
     for (since, until, _), what in zip(reported_spans(record), values, strict=True):
         if what is None or until <= since:

@@ -18,10 +18,9 @@ from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.base import extras
 from snakesim_operator.results import last_run
-from snakesim_operator.results.ended import COMPLETE, ended_early
-from snakesim_operator.results.gaps import unwritten
-from snakesim_operator.results.incomplete import INCOMPLETE
+from snakesim_operator.results.missing_data import INCOMPLETE, describe_unwritten
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
+from snakesim_operator.results.run_ending import COMPLETE, ended_early
 from snakesim_operator.results.summary import Restart, RunSummary, distance_m, estimates_of, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
@@ -89,8 +88,8 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
         print_summary(summary)
     except ConfigError as error:
         _print_host(host)
-        return [*unwritten(host), str(error)], ""
-    lacks = [*unwritten(record.host), *record.unreached]
+        return [*describe_unwritten(host), str(error)], ""
+    lacks = [*describe_unwritten(record.host), *record.unreached]
     if not extras.has("report"):
         return lacks, ""
     from snakesim_operator.results.report.verdict import verdict

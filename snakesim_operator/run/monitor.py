@@ -12,7 +12,7 @@ from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory, request_to_arm
 from snakesim_hal.wire.roles import RECORDER
-from snakesim_operator.results.ended import AT_GOAL
+from snakesim_operator.results.run_ending import AT_GOAL
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.patience import StartupTimeout
 from snakesim_operator.run.process_faults import ProcessFaults

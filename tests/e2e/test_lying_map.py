@@ -13,7 +13,7 @@ from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.model.scene import Cylinder
 from snakesim_hal.network.client import Client
 from snakesim_hal.wire.messages import World
-from snakesim_operator.results.map_score import score
+from snakesim_operator.results.metrics.map_score import score
 from snakesim_operator.run.in_process import simulate
 
 pytestmark = pytest.mark.e2e

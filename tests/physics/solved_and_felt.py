@@ -16,7 +16,7 @@ import snakesim
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.measured_force import FELT_OVER_S
 from snakesim_hal.wire.messages import ControlState
-from snakesim_operator.results.force_tracking import ASKED_N, EMPTY_N
+from snakesim_operator.results.metrics.force_tracking import ASKED_N, EMPTY_N
 from snakesim_sim_backend.sensors.contacts import ContactReader
 
 SCENARIOS = ("triplet", "peg_row")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_operator.results.advance import Advance
+from snakesim_operator.results.metrics.advance import Advance
 from snakesim_operator.run.in_process import Result, simulate
 from tests.whole_run import configure
 

@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.compare.command import compare
-from snakesim_operator.results.incomplete import INCOMPLETE
+from snakesim_operator.results.missing_data import INCOMPLETE
 from snakesim_operator.results.page.html import LIBRARY
 from tests.whole.command import run_to_summary, snakesim
 

@@ -194,7 +194,7 @@ def test_an_episode_after_a_gap_begins_with_a_picture_of_its_own(whole: bytes, t
     first_tick, first_tick_after = int(record.ticks[0]), int(record.ticks[after.rows[0]])
     pictures = Pictures(2, 1)
     for shade, tick in enumerate((first_tick, first_tick_after + 3)):
-        pictures.take(tick, np.full((1, 2, 3), shade, np.uint8))
+        pictures.add(tick, np.full((1, 2, 3), shade, np.uint8))
     parts = [dataclasses.replace(part, pictures={"head": pictures}) for part in (before, after)]
     write_lerobot(parts, tmp_path / "set", write_parquet)
     lengths = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pydict()["length"]

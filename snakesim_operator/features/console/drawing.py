@@ -13,7 +13,7 @@ from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.physics.hills import hills
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.features.console.snapshot import RobotSnapshot
-from snakesim_operator.results.force_tracking import is_measured
+from snakesim_operator.results.metrics.force_tracking import is_measured
 
 M_PER_N, LONGEST_M = 0.02, 0.5  # of a force arrow
 ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts

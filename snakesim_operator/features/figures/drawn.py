@@ -17,7 +17,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.features.figures.lines import STYLE, Floats, over_time
 from snakesim_operator.features.figures.paper import figures
 from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
-from snakesim_operator.results.incomplete import exit_code
+from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.time_axis import zero_s
 

@@ -18,7 +18,7 @@ from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.lines import Floats, over_time
-from snakesim_operator.results.propulsion import Propulsion, propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
 from snakesim_operator.results.report.timeline import commanded_torque_nm, most_used_joints, reference_rad

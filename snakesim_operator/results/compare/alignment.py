@@ -34,31 +34,48 @@ class Aligned:
 
 
 def align(a: RunRecord, b: RunRecord) -> Aligned:
-    """Tick by tick where the ticks coincide; else both at the ticks of the one that has fewer.
+    """Put two runs on one time axis.
 
-    What is measured is interpolated between ticks; a setpoint holds until the next one.
+    They are compared tick by tick where the ticks coincide, else both at the ticks of the one that has fewer. Measured
+    values are interpolated between ticks; a setpoint holds until the next one.
     """
-    time_a, time_b = a.time_s - zero_s(a), b.time_s - zero_s(b)
+    time_a = a.time_s - zero_s(a)
+    time_b = b.time_s - zero_s(b)
     until_s = min(float(time_a[-1]), float(time_b[-1])) + SAME_INSTANT_S
-    within_a, within_b = time_a[time_a <= until_s], time_b[time_b <= until_s]
+    within_a = time_a[time_a <= until_s]
+    within_b = time_b[time_b <= until_s]
     if len(within_a) == len(within_b) and np.allclose(within_a, within_b, rtol=0, atol=SAME_INSTANT_S):
-        grid, how = within_a, "tick by tick"
+        grid = within_a
+        how = "tick by tick"
+    elif len(within_a) <= len(within_b):
+        grid = within_a
+        how = f"{_describe_rates(a, b)}: B is interpolated at the ticks of A"
     else:
-        grid, coarser, finer = (within_a, "A", "B") if len(within_a) <= len(within_b) else (within_b, "B", "A")
-        rates = f"A at {a.config.rate_hz:g} Hz, B at {b.config.rate_hz:g} Hz"
-        if a.config.rate_hz == b.config.rate_hz:
-            rates = f"both at {a.config.rate_hz:g} Hz, but some ticks are missing"
-        how = f"{rates}: {finer} is interpolated at the ticks of {coarser}"
-    return Aligned(grid, _at(a, time_a, grid), _at(b, time_b, grid), how)
+        grid = within_b
+        how = f"{_describe_rates(a, b)}: A is interpolated at the ticks of B"
+    return Aligned(grid, _sample_joints(a, time_a, grid), _sample_joints(b, time_b, grid), how)
 
 
-def _at(record: RunRecord, time_s: Floats, grid: Floats) -> Joints:
+def _describe_rates(a: RunRecord, b: RunRecord) -> str:
+    if a.config.rate_hz == b.config.rate_hz:
+        return f"both at {a.config.rate_hz:g} Hz, but some ticks are missing"
+    return f"A at {a.config.rate_hz:g} Hz, B at {b.config.rate_hz:g} Hz"
+
+
+def _sample_joints(record: RunRecord, time_s: Floats, grid: Floats) -> Joints:
+    """Return what the joints of a run did at the instants of a grid, (n,)."""
     held = np.searchsorted(time_s, grid + SAME_INSTANT_S, side="right") - 1
-    if np.allclose(time_s[held], grid, rtol=0, atol=SAME_INSTANT_S):
-        measured = [series[held] for series in (record.angle_rad, record.velocity_rad_s, record.torque_nm)]
-    else:
-        measured = [
-            np.column_stack([np.interp(grid, time_s, column) for column in series.T])
-            for series in (record.angle_rad, record.velocity_rad_s, record.torque_nm)
-        ]
-    return Joints(measured[0], measured[1], measured[2], record.mode[held], record.target[held])
+    on_grid = np.allclose(time_s[held], grid, rtol=0, atol=SAME_INSTANT_S)
+
+    def sample(series: Floats) -> Floats:
+        if on_grid:
+            return series[held]
+        return np.column_stack([np.interp(grid, time_s, column) for column in series.T])
+
+    return Joints(
+        angle_rad=sample(record.angle_rad),
+        velocity_rad_s=sample(record.velocity_rad_s),
+        torque_nm=sample(record.torque_nm),
+        mode=record.mode[held],
+        target=record.target[held],
+    )

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +13,13 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
-from snakesim_operator.results.propulsion import Propulsion, propulsion_periods
+from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_periods
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
 
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
-NAMED = 12  # hand-overs, one after the other
-STOOD_M = 0.001  # who moved less did not move: no percentage is made of that
+MAX_HAND_OVERS_NAMED = 12
+STOOD_M = 0.001  # a run that moved less did not move: a percentage of that means nothing
 TARGETS = (
     (Mode.POSITION, "angle target", "rad"),
     (Mode.VELOCITY, "speed target", "rad/s"),
@@ -81,9 +80,10 @@ class Advance:
 
     @property
     def percent(self) -> float | None:
-        """B - A in per cent of A. Two that stood still are equal; None when only A stood still."""
+        """B - A in per cent of A. Two runs that stood still are equal; None if only A stood still."""
         if abs(self.a_m) < STOOD_M:
-            return 0.0 if abs(self.difference_m) < STOOD_M else None
+            both_stood = abs(self.difference_m) < STOOD_M
+            return 0.0 if both_stood else None
         return 100 * self.difference_m / abs(self.a_m)
 
 
@@ -105,14 +105,20 @@ class HandOvers:
 
     @property
     def agreed(self) -> int:
-        """So many of the first hand-overs went to the same joint."""
-        pairs = zip(self.a, self.b, strict=False)
-        return len(list(takewhile(lambda pair: pair[0].joint == pair[1].joint, pairs)))
+        """The number of hand-overs from the start that went to the same joint in both."""
+        count = 0
+        for in_a, in_b in zip(self.a, self.b, strict=False):
+            if in_a.joint != in_b.joint:
+                break
+            count += 1
+        return count
 
     @property
     def later_s(self) -> list[float]:
-        """By how much B was later, for each hand-over that agrees."""
-        return [b.start_s - a.start_s for a, b in list(zip(self.a, self.b, strict=False))[: self.agreed]]
+        """The time by which B was later, for each hand-over that agrees."""
+        agreed = self.agreed
+        pairs = zip(self.a[:agreed], self.b[:agreed], strict=True)
+        return [in_b.start_s - in_a.start_s for in_a, in_b in pairs]
 
     @property
     def same_order(self) -> bool:
@@ -145,55 +151,62 @@ class Difference:
     @property
     def identical(self) -> bool:
         """Whether all that was measured, commanded and reported is the same for all of the common time."""
-        both = self.hand_overs
-        if not both.unknown and (not both.same_order or any(abs(later) > SAME_INSTANT_S for later in both.later_s)):
-            return False
+        hand_overs = self.hand_overs
+        if not hand_overs.unknown:
+            at_other_times = any(abs(later) > SAME_INSTANT_S for later in hand_overs.later_s)
+            if not hand_overs.same_order or at_other_times:
+                return False
         if self.advance is not None and abs(self.advance.difference_m) >= STOOD_M:
             return False
         return self.other_mode == 0 and all(gap.same for gap in self.gaps)
 
     @property
     def gaps(self) -> list[Gap]:
-        """What is compared joint by joint."""
+        """The quantities that are compared joint by joint."""
         return [self.angle, self.speed, self.torque, *self.targets]
 
 
 def differ(a: RunRecord, b: RunRecord) -> Difference:
-    """Compare two runs of robots with the same joints. Raises ConfigError when they cannot be compared."""
-    _check(a, b)
+    """Compare two runs of robots with the same joints.
+
+    Raises:
+        ConfigError: They cannot be compared.
+    """
+    _check_comparable(a, b)
     aligned = align(a, b)
-    on_a, on_b, time_s = aligned.a, aligned.b, aligned.time_s
+    joints_a = aligned.a
+    joints_b = aligned.b
+    time_s = aligned.time_s
     until_s = float(time_s[-1])
-    same_mode = on_a.mode == on_b.mode
-    targets: list[Gap] = []
-    for mode, what, unit in TARGETS:
-        both = same_mode & (on_a.mode == mode)
-        if both.any():
-            a_target, b_target = (np.where(both, joints.target, np.nan) for joints in (on_a, on_b))
-            targets.append(_gap(what, unit, time_s, a_target, b_target, both))
-    angle = _gap("angle", "rad", time_s, on_a.angle_rad, on_b.angle_rad)
+    same_mode = joints_a.mode == joints_b.mode
+    angle = _compare_quantity("angle", "rad", time_s, joints_a.angle_rad, joints_b.angle_rad)
+    angle_pairs = zip(joints_a.angle_rad.T, joints_b.angle_rad.T, strict=True)
     return Difference(
         a=a,
         b=b,
         joints=[joint.name for joint in a.description.joints],
         aligned=aligned,
+        # What was requested.
         compared=identity(a, b),
         settings=differences(a, b),
         drives=drives_in_words(a, b),
-        advance=_advance(a, b, until_s),
-        following=[following(time_s, *pair) for pair in zip(on_a.angle_rad.T, on_b.angle_rad.T, strict=True)],
+        # What was measured.
+        advance=_compare_advance(a, b, until_s),
+        following=[following(time_s, in_a, in_b) for in_a, in_b in angle_pairs],
         angle=angle,
-        speed=_gap("speed", "rad/s", time_s, on_a.velocity_rad_s, on_b.velocity_rad_s),
-        torque=_gap("torque", "N·m", time_s, on_a.torque_nm, on_b.torque_nm),
-        targets=targets,
+        speed=_compare_quantity("speed", "rad/s", time_s, joints_a.velocity_rad_s, joints_b.velocity_rad_s),
+        torque=_compare_quantity("torque", "N·m", time_s, joints_a.torque_nm, joints_b.torque_nm),
+        # What was commanded and reported.
+        targets=_compare_targets(aligned, same_mode),
         other_mode=float(1 - same_mode.mean()),
-        tracking_rad=(_tracking_rad(on_a), _tracking_rad(on_b)),
-        hand_overs=HandOvers(_hand_overs(a, until_s), _hand_overs(b, until_s), _unreported(a, b)),
-        parted=_parted(time_s, angle.difference),
+        tracking_rad=(_tracking_error_rad(joints_a), _tracking_error_rad(joints_b)),
+        hand_overs=HandOvers(_hand_overs_until(a, until_s), _hand_overs_until(b, until_s), _describe_unreported(a, b)),
+        parted=_find_divergence(time_s, angle.difference),
     )
 
 
-def _check(a: RunRecord, b: RunRecord) -> None:
+def _check_comparable(a: RunRecord, b: RunRecord) -> None:
+    """Raise ConfigError if a run has no tick, if the joints differ, or if an array is damaged."""
     for record in (a, b):
         if not len(record.time_s):
             raise ConfigError(
@@ -211,8 +224,9 @@ def _check(a: RunRecord, b: RunRecord) -> None:
 
 
 def _check_shapes(record: RunRecord) -> None:
-    """A black box from anywhere may hold any arrays."""
-    ticks, joints = len(record.time_s), len(record.description.joints)
+    """Raise ConfigError for arrays of a wrong shape or type, which a damaged black box may hold."""
+    ticks = len(record.time_s)
+    joints = len(record.description.joints)
     shapes = {"time_s": (ticks,), "position_w": (ticks, 3), "orientation_wxyz": (ticks, 4)}
     for name in ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target"):
         shapes[name] = (ticks, joints)
@@ -227,68 +241,123 @@ def _check_shapes(record: RunRecord) -> None:
         raise ConfigError(f"{record.folder / BLACK_BOX}: `time_s` does not grow from tick to tick; repeat the run")
 
 
-def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: NDArray[np.bool_] | None = None) -> Gap:
+def _compare_targets(aligned: Aligned, same_mode: NDArray[np.bool_]) -> list[Gap]:
+    """Compare the targets of each mode that was used in both runs at the same time.
+
+    Args:
+        aligned: Both runs.
+        same_mode: (n, joints) whether the mode is the same in both.
+    """
+    gaps: list[Gap] = []
+    for mode, what, unit in TARGETS:
+        both_in_mode = same_mode & (aligned.a.mode == mode)
+        if both_in_mode.any():
+            target_a = np.where(both_in_mode, aligned.a.target, np.nan)
+            target_b = np.where(both_in_mode, aligned.b.target, np.nan)
+            gaps.append(_compare_quantity(what, unit, aligned.time_s, target_a, target_b, both_in_mode))
+    return gaps
+
+
+def _compare_quantity(
+    what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: NDArray[np.bool_] | None = None
+) -> Gap:
+    """Compare one quantity of every joint.
+
+    Args:
+        what: Name of the quantity.
+        unit: Its unit.
+        time_s: (n,) the common instants.
+        a: (n, joints) values in A.
+        b: (n, joints) values in B.
+        compared: (n, joints) where a comparison makes sense; None: everywhere.
+    """
     with np.errstate(invalid="ignore"):  # infinity less infinity is unknown too
         difference = b - a
     known = np.isfinite(difference)
-    wanted = known.size if compared is None else int(compared.sum())
-    unknown_fraction = 1 - known.sum() / wanted if wanted else 0.0
+    wanted_count = known.size if compared is None else int(compared.sum())
+    unknown_fraction = 1 - known.sum() / wanted_count if wanted_count else 0.0
     squares = np.where(known, difference, 0.0) ** 2
-    count = known.sum(axis=0)
-    joint_rms = np.sqrt(np.where(count > 0, squares.sum(axis=0) / np.maximum(count, 1), np.nan))
+    known_count = known.sum(axis=0)
+    joint_rms = np.sqrt(np.where(known_count > 0, squares.sum(axis=0) / np.maximum(known_count, 1), np.nan))
     joint_worst: list[MaxDifference | None] = []
     for joint in range(difference.shape[1]):
+        if not known_count[joint]:
+            joint_worst.append(None)
+            continue
         row = int(np.argmax(np.where(known[:, joint], squares[:, joint], -1.0)))
-        worst = MaxDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
-        joint_worst.append(worst if count[joint] else None)
-    worst = max((one for one in joint_worst if one is not None), key=lambda one: abs(one.difference), default=None)
-    rms = float(np.sqrt(squares.sum() / known.sum())) if known.any() else None
-    correlation = _correlation(a[known], b[known])
-    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, correlation, float(unknown_fraction))
+        joint_worst.append(MaxDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint])))
+    known_worst = [worst for worst in joint_worst if worst is not None]
+    return Gap(
+        what=what,
+        unit=unit,
+        difference=difference,
+        joint_rms=joint_rms,
+        joint_worst=joint_worst,
+        rms=float(np.sqrt(squares.sum() / known.sum())) if known.any() else None,
+        worst=max(known_worst, key=lambda worst: abs(worst.difference), default=None),
+        correlation=_correlation(a[known], b[known]),
+        unknown_fraction=float(unknown_fraction),
+    )
 
 
 def _correlation(a: Floats, b: Floats) -> float | None:
+    """Return Pearson's correlation, or None if one of both never changes."""
     if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return None
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def _tracking_rad(joints: Joints) -> float | None:
+def _tracking_error_rad(joints: Joints) -> float | None:
+    """Return the RMS of angle - target over all joints in position mode."""
     errors = (joints.angle_rad - joints.target)[joints.mode == Mode.POSITION]
     errors = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else None
 
 
-def _advance(a: RunRecord, b: RunRecord, at_s: float) -> Advance | None:
-    """By the same measure in both, or not at all: along the route, else as both controllers knew it."""
+def _compare_advance(a: RunRecord, b: RunRecord, at_s: float) -> Advance | None:
+    """Compare the advance by a measure that both runs have, or return None.
+
+    The measure is the distance along the route, else the one that both controllers reported.
+    """
     for measure in (distance, reported_distance):
-        of_a, of_b = measure(a), measure(b)
-        if of_a is not None and of_b is not None and of_a.what == of_b.what:
-            ends = (float(np.interp(at_s, series.time_s, series.value)) for series in (of_a, of_b))
-            return Advance(of_a.what, of_a, of_b, at_s, *ends)
+        series_a = measure(a)
+        series_b = measure(b)
+        if series_a is None or series_b is None or series_a.what != series_b.what:
+            continue
+        a_m = float(np.interp(at_s, series_a.time_s, series_a.value))
+        b_m = float(np.interp(at_s, series_b.time_s, series_b.value))
+        return Advance(series_a.what, series_a, series_b, at_s, a_m, b_m)
     return None
 
 
-def _unreported(a: RunRecord, b: RunRecord) -> str:
+def _describe_unreported(a: RunRecord, b: RunRecord) -> str:
+    """Return why the hand-overs cannot be compared; empty if they can."""
     silent = [run for run, record in (("A", a), ("B", b)) if not record.control]
-    return f"unknown, because nothing that control reported in {' and '.join(silent)} was recorded" if silent else ""
+    if not silent:
+        return ""
+    return f"unknown, because nothing that control reported in {' and '.join(silent)} was recorded"
 
 
-def _hand_overs(record: RunRecord, until_s: float) -> list[Propulsion]:
-    """Within the common time."""
-    return [one for one in propulsion_periods(record) if one.start_s <= until_s + SAME_INSTANT_S]
+def _hand_overs_until(record: RunRecord, until_s: float) -> list[Propulsion]:
+    """Return the hand-overs within the common time."""
+    return [period for period in propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
 
 
-def _parted(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:
+def _find_divergence(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:
+    """Return the first tick at which a joint's angles are more than APART_RAD apart."""
     sizes = np.abs(np.nan_to_num(difference_rad))
-    beyond = np.flatnonzero((sizes > APART_RAD).any(axis=1))
-    if not len(beyond):
+    rows_beyond = np.flatnonzero((sizes > APART_RAD).any(axis=1))
+    if not len(rows_beyond):
         return None
-    row = int(beyond[0])
+    row = int(rows_beyond[0])
     return FirstDivergence(float(time_s[row]), int(np.argmax(sizes[row])))
 
 
-def order(names: Sequence[str], turns: Sequence[Propulsion]) -> str:
-    """Hand-overs in words."""
-    shown = " → ".join(names[one.joint] for one in turns[:NAMED])
-    return (shown + (" → …" if len(turns) > NAMED else "")) or "none"
+def order_in_words(names: Sequence[str], periods: Sequence[Propulsion]) -> str:
+    """Return the joints that propelled, one after the other."""
+    if not periods:
+        return "none"
+    shown = " → ".join(names[period.joint] for period in periods[:MAX_HAND_OVERS_NAMED])
+    if len(periods) > MAX_HAND_OVERS_NAMED:
+        shown += " → …"
+    return shown

@@ -4,18 +4,19 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.compare.difference import Advance, Difference, Gap
+from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
-from snakesim_operator.results.propulsion import propulsion_intervals
 
 A, B = "--measured", "--reference"
 
 
 def advance(difference: Difference, moved: Advance) -> list[Figure]:
-    """How far both came, and by how much B was ahead."""
-    time_s, end_s = difference.aligned.time_s, max(float(moved.a.time_s[-1]), float(moved.b.time_s[-1]))
-    ahead_mm = 1000 * (
-        np.interp(time_s, moved.b.time_s, moved.b.value) - np.interp(time_s, moved.a.time_s, moved.a.value)
-    )
+    """Draw how far both runs moved, and by how much B was ahead."""
+    time_s = difference.aligned.time_s
+    end_s = max(float(moved.a.time_s[-1]), float(moved.b.time_s[-1]))
+    advance_a_m = np.interp(time_s, moved.a.time_s, moved.a.value)
+    advance_b_m = np.interp(time_s, moved.b.time_s, moved.b.value)
+    ahead_mm = 1000 * (advance_b_m - advance_a_m)
     drawn = [Line("A", moved.a.time_s, moved.a.value, A, width=3.5), Line("B", moved.b.time_s, moved.b.value, B)]
     gap = Line("B − A", time_s, ahead_mm)
     marks = parted(difference)
@@ -26,37 +27,45 @@ def advance(difference: Difference, moved: Advance) -> list[Figure]:
 
 
 def gap_map(difference: Difference, gap: Gap) -> Figure:
-    """The difference of every joint over time."""
-    full = max(abs(gap.worst.difference), 1e-9) if gap.worst is not None else 1.0
+    """Draw the difference of every joint over time."""
+    full = 1.0  # drawn in full color
+    if gap.worst is not None:
+        full = max(abs(gap.worst.difference), 1e-9)
     label = f"Difference of every joint's {gap.what} over time"
     until_s = float(difference.aligned.time_s[-1])
     return joint_map(label, difference.joints, gap.difference, gap.unit, full, until_s, marks=parted(difference))
 
 
 def overlay(difference: Difference, gap: Gap, a: Floats, b: Floats, joint: int) -> Figure:
-    """One joint in both runs; marked where it is worst."""
-    time_s, worst = difference.aligned.time_s, gap.joint_worst[joint]
+    """Draw one joint in both runs, with a mark where they differ most."""
+    time_s = difference.aligned.time_s
+    worst = gap.joint_worst[joint]
     drawn = [Line("A", time_s, a[:, joint], A, width=3.5), Line("B", time_s, b[:, joint], B)]
-    marks = [Mark(worst.time_s, "worst")] if worst is not None and worst.difference else []
+    marks: list[Mark] = []
+    if worst is not None and worst.difference:
+        marks.append(Mark(worst.time_s, "worst"))
     label = f"{gap.what.capitalize()} of {difference.joints[joint]} in both runs"
     return lines(label, f"{gap.what}, {gap.unit}", drawn, float(time_s[-1]), marks=marks)
 
 
 def hand_overs(difference: Difference) -> Figure:
-    """Which joint propelled when: for each joint a row of A and one of B."""
-    runs = {"A": (difference.a, A), "B": (difference.b, B)}
-    intervals = {run: propulsion_intervals(record) for run, (record, _) in runs.items()}
-    joints = sorted({one.joint for run in intervals.values() for one in run}, reverse=True)
-    drawn = [
-        Bar(f"{difference.joints[one.joint]} {run}", one.start_s, one.end_s, f"{run} {one.length_s:.1f} s", color)
-        for run, (_, color) in runs.items()
-        for one in intervals[run]
-    ]
-    rows = [f"{difference.joints[joint]} {run}" for joint in joints for run in runs]
+    """Draw which joint propelled when: for each joint a row of A and one of B."""
+    drawn: list[Bar] = []
+    propelled: set[int] = set()
+    for run, record, color in (("A", difference.a, A), ("B", difference.b, B)):
+        for interval in propulsion_intervals(record):
+            row = f"{difference.joints[interval.joint]} {run}"
+            drawn.append(Bar(row, interval.start_s, interval.end_s, f"{run} {interval.length_s:.1f} s", color))
+            propelled.add(interval.joint)
+    rows: list[str] = []
+    for joint in sorted(propelled, reverse=True):
+        rows += [f"{difference.joints[joint]} A", f"{difference.joints[joint]} B"]
     end_s = max([float(difference.aligned.time_s[-1]), *(bar.end_s for bar in drawn)])
     return bars("Propulsion joints of both runs over time", rows, drawn, end_s, parted(difference))
 
 
 def parted(difference: Difference) -> list[Mark]:
-    """Where the runs diverge."""
-    return [Mark(difference.parted.time_s, "diverge")] if difference.parted is not None else []
+    """Return a mark where the runs diverge."""
+    if difference.parted is None:
+        return []
+    return [Mark(difference.parted.time_s, "diverge")]

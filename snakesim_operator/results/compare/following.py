@@ -6,9 +6,10 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 
-MOST_S = 0.25  # of a lag that is looked for
-LEAST_MOTION = 1e-6  # standard deviation in A, of which less is none
-LEAST_INSTANTS = 20
+MAX_LAG_S = 0.25
+MIN_DEVIATION = 1e-6  # a joint of A with a smaller standard deviation did not move
+MIN_INSTANTS = 20
+LAG_RESOLUTION_S = 1e-5
 
 
 @dataclass(frozen=True)
@@ -21,16 +22,29 @@ class Following:
 
 
 def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
-    """Of one joint; None where it did not move, or is not known throughout. All are (n,)."""
-    if len(time_s) < LEAST_INSTANTS or not (np.isfinite(a).all() and np.isfinite(b).all()):
+    """Fit lag and gain of one joint by least squares: b(t) = gain * a(t - lag) + constant.
+
+    The lag is found by a grid search whose step is halved until it is below LAG_RESOLUTION_S.
+
+    Args:
+        time_s: (n,) the common instants.
+        a: (n,) values in A.
+        b: (n,) values in B.
+
+    Returns:
+        The fit, or None if the joint did not move, or some of its values are unknown.
+    """
+    if len(time_s) < MIN_INSTANTS or not (np.isfinite(a).all() and np.isfinite(b).all()):
         return None
-    max_s = min(MOST_S, float(time_s[-1] - time_s[0]) / 4)
-    within = (time_s >= time_s[0] + max_s) & (time_s <= time_s[-1] - max_s)
-    if within.sum() < LEAST_INSTANTS or np.std(a[within]) < LEAST_MOTION:
+    max_lag_s = min(MAX_LAG_S, float(time_s[-1] - time_s[0]) / 4)
+    within = (time_s >= time_s[0] + max_lag_s) & (time_s <= time_s[-1] - max_lag_s)
+    if within.sum() < MIN_INSTANTS or np.std(a[within]) < MIN_DEVIATION:
         return None
-    at_s, wanted = time_s[within], b[within] - b[within].mean()
+    at_s = time_s[within]
+    wanted = b[within] - b[within].mean()
 
     def fit(lag_s: float) -> tuple[float, float, float]:
+        """Return the RMS that is left, the lag and the best gain for it."""
         moved = np.interp(at_s - lag_s, time_s, a)
         moved -= moved.mean()
         power = float(moved @ moved)
@@ -39,9 +53,9 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
         return float(np.sqrt(left @ left / len(left))), lag_s, gain
 
     step_s = float(np.median(np.diff(time_s)))
-    count = max(int(max_s / step_s), 1)
+    count = max(int(max_lag_s / step_s), 1)
     left, lag_s, gain = min(fit(lag * step_s) for lag in range(-count, count + 1))
-    while step_s > 1e-5:
+    while step_s > LAG_RESOLUTION_S:
         step_s /= 2
         left, lag_s, gain = min((left, lag_s, gain), fit(lag_s - step_s), fit(lag_s + step_s))
     return Following(lag_s, gain, left)

@@ -15,8 +15,12 @@ HAND_OVERS_SHOWN = 40
 
 
 def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
-    """The whole page. asked: what `--within` asked for."""
-    said = [*sentences(difference), *([f"{asked.words[:1].upper()}{asked.words[1:]}."] if asked is not None else [])]
+    """Return the whole page as HTML. asked: the result of `--within`, if that was given."""
+    words = sentences(difference)
+    kind = ""
+    if asked is not None:
+        words = [*words, f"{asked.words[:1].upper()}{asked.words[1:]}."]
+        kind = "good" if asked.holds else "bad"
     turns = list(zip_longest(difference.hand_overs.a, difference.hand_overs.b))
     return render(
         Path(__file__).parent / "compare.html",
@@ -25,8 +29,8 @@ def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
         difference=difference,
         apart_rad=APART_RAD,
         records=(difference.a, difference.b),
-        kind="" if asked is None else "good" if asked.holds else "bad",
-        said=" ".join(said),
+        kind=kind,
+        said=" ".join(words),
         maps=[("Angles", difference.angle), ("Torques", difference.torque)],
         figures=figures,
         worst=_worst(difference),
@@ -38,7 +42,7 @@ def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
 
 
 def _worst(difference: Difference) -> list[tuple[int, str]]:
-    """The joints that differ most, and why they are shown."""
+    """Return the joints that differ most, and why they are shown."""
     chosen: dict[int, list[str]] = {}
     for gap in (difference.angle, difference.torque):
         if gap.worst is not None and gap.worst.difference:

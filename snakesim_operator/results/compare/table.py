@@ -4,17 +4,19 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_operator.results.compare.difference import Difference, Gap, order
+from snakesim_operator.results.compare.difference import Difference, Gap, order_in_words
 from snakesim_operator.results.compare.settings import Setting, drive_identities
 from snakesim_operator.results.compare.verdict import SAME, relation, sentences
+from snakesim_operator.results.metrics.propulsion import Propulsion
 
-NAME, VALUE = 24, 22
-SETTINGS_SHOWN = 16
-HAND_OVERS_SHOWN = 8
+NAME_WIDTH = 24
+VALUE_WIDTH = 22
+MAX_SETTINGS_SHOWN = 16
+MAX_HAND_OVERS_SHOWN = 8
 
 
 def table(difference: Difference) -> list[str]:
-    """Everything that the page shows in numbers, in lines."""
+    """Return the numbers of the page as lines of text."""
     lines = [
         _row("", "A", "B"),
         *_compared(difference),
@@ -26,9 +28,9 @@ def table(difference: Difference) -> list[str]:
         *_distance(difference),
         *_hand_overs(difference),
         "",
-        f"  {'B - A':<{NAME}}{'RMS':<{VALUE}}{'worst':<{VALUE}}where and when",
+        f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when",
         *(_gap(gap, difference.joints) for gap in difference.gaps),
-        *_beside(difference),
+        *_torques_and_tracking(difference),
         "",
         *_by_joint(difference),
         "",
@@ -38,69 +40,96 @@ def table(difference: Difference) -> list[str]:
 
 
 def for_scripts(difference: Difference) -> dict[str, Any]:
-    """The same numbers as plain values. Unknown is None."""
-    advance, names, parted = difference.advance, difference.joints, difference.parted
+    """Return the same numbers as plain values. Unknown is None."""
+    advance = difference.advance
+    parted = difference.parted
+    names = difference.joints
+    moved = None
+    if advance is not None:
+        moved = {"a": advance.a_m, "b": advance.b_m, "percent": advance.percent}
+    divergence = None
+    if parted is not None:
+        divergence = {"joint": names[parted.joint], "time_s": parted.time_s}
     return {
         "identical": difference.identical,
         "lacks": {"a": difference.a.lacks, "b": difference.b.lacks},
         "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
-        "settings": {one.key: {"a": one.a, "b": one.b} for one in difference.settings},
+        "settings": {setting.key: {"a": setting.a, "b": setting.b} for setting in difference.settings},
         "drives": drive_identities(difference.a, difference.b),
         "time_s": float(difference.aligned.time_s[-1]),
-        "moved_m": None if advance is None else {"a": advance.a_m, "b": advance.b_m, "percent": advance.percent},
-        "gaps": [
-            {
-                "what": gap.what,
-                "unit": gap.unit,
-                "rms": gap.rms,
-                "worst": None if gap.worst is None else gap.worst.difference,
-                "joint": None if gap.worst is None else names[gap.worst.joint],
-                "time_s": None if gap.worst is None else gap.worst.time_s,
-            }
-            for gap in difference.gaps
-        ],
-        "by_joint": {
-            name: {
-                "angle_rms_rad": None if np.isnan(rms) else float(rms),
-                "lag_s": None if fit is None else fit.lag_s,
-                "gain": None if fit is None else fit.gain,
-                "left_rad": None if fit is None else fit.left,
-            }
-            for name, rms, fit in zip(names, difference.angle.joint_rms, difference.following, strict=True)
-        },
-        "parted": None if parted is None else {"joint": names[parted.joint], "time_s": parted.time_s},
+        "moved_m": moved,
+        "gaps": [_gap_values(gap, names) for gap in difference.gaps],
+        "by_joint": _joint_values(difference),
+        "parted": divergence,
         "hand_overs": {
-            run: [{"joint": names[one.joint], "time_s": one.start_s} for one in order_of]
-            for run, order_of in (("a", difference.hand_overs.a), ("b", difference.hand_overs.b))
+            "a": _hand_over_values(difference.hand_overs.a, names),
+            "b": _hand_over_values(difference.hand_overs.b, names),
         },
     }
 
 
+def _gap_values(gap: Gap, joints: list[str]) -> dict[str, Any]:
+    worst = gap.worst
+    return {
+        "what": gap.what,
+        "unit": gap.unit,
+        "rms": gap.rms,
+        "worst": None if worst is None else worst.difference,
+        "joint": None if worst is None else joints[worst.joint],
+        "time_s": None if worst is None else worst.time_s,
+    }
+
+
+def _joint_values(difference: Difference) -> dict[str, dict[str, float | None]]:
+    """Return for each joint how B's angle follows A's."""
+    values: dict[str, dict[str, float | None]] = {}
+    for name, rms, fit in zip(difference.joints, difference.angle.joint_rms, difference.following, strict=True):
+        values[name] = {
+            "angle_rms_rad": None if np.isnan(rms) else float(rms),
+            "lag_s": None if fit is None else fit.lag_s,
+            "gain": None if fit is None else fit.gain,
+            "left_rad": None if fit is None else fit.left,
+        }
+    return values
+
+
+def _hand_over_values(periods: list[Propulsion], joints: list[str]) -> list[dict[str, Any]]:
+    return [{"joint": joints[period.joint], "time_s": period.start_s} for period in periods]
+
+
 def _row(name: str, a: str, b: str, note: str = "") -> str:
-    return f"  {name:<{NAME}}{a:<{VALUE}}{b:<{VALUE}}{note}"
+    return f"  {name:<{NAME_WIDTH}}{a:<{VALUE_WIDTH}}{b:<{VALUE_WIDTH}}{note}"
 
 
 def _compared(difference: Difference) -> list[str]:
-    lines = [
-        _row(one.key, _short(one.a), _short(one.b), "differs" if one.a != one.b else "") for one in difference.compared
-    ]
-    hosts = (difference.a.host, difference.b.host)
-    faults, digests = [str(len(host.faults)) for host in hosts], [host.command_digest[:16] for host in hosts]
-    lines.append(_row("faults", faults[0], faults[1]))
+    """Return the rows by which people tell the runs apart."""
+    lines: list[str] = []
+    for setting in difference.compared:
+        note = "differs" if setting.a != setting.b else ""
+        lines.append(_row(setting.key, _shorten(setting.a), _shorten(setting.b), note))
+    host_a = difference.a.host
+    host_b = difference.b.host
+    lines.append(_row("faults", str(len(host_a.faults)), str(len(host_b.faults))))
     for name, record in (("A", difference.a), ("B", difference.b)):
         lines += [f"  not known of {name}: {lack}" for lack in record.lacks]
-    lines.append(_row("command digest", digests[0], digests[1], "the same" if digests[0] == digests[1] else ""))
+    digest_a = host_a.command_digest[:16]
+    digest_b = host_b.command_digest[:16]
+    lines.append(_row("command digest", digest_a, digest_b, "the same" if digest_a == digest_b else ""))
     return lines
 
 
 def _settings(settings: list[Setting]) -> list[str]:
+    """Return the rows of the settings that differ."""
     if not settings:
         return ["no setting differs"]
-    lines = [f"{len(settings)} {'setting differs' if len(settings) == 1 else 'settings differ'}"]
-    width = max(len(one.key) for one in settings[:SETTINGS_SHOWN])
-    lines += [f"  {one.key:<{width}}  {_short(one.a)} -> {_short(one.b)}" for one in settings[:SETTINGS_SHOWN]]
-    if len(settings) > SETTINGS_SHOWN:
-        lines.append(f"  and {len(settings) - SETTINGS_SHOWN} more, which the page lists")
+    verb = "setting differs" if len(settings) == 1 else "settings differ"
+    lines = [f"{len(settings)} {verb}"]
+    shown = settings[:MAX_SETTINGS_SHOWN]
+    width = max(len(setting.key) for setting in shown)
+    for setting in shown:
+        lines.append(f"  {setting.key:<{width}}  {_shorten(setting.a)} -> {_shorten(setting.b)}")
+    if len(settings) > MAX_SETTINGS_SHOWN:
+        lines.append(f"  and {len(settings) - MAX_SETTINGS_SHOWN} more, which the page lists")
     return lines
 
 
@@ -115,49 +144,58 @@ def _distance(difference: Difference) -> list[str]:
 
 
 def _hand_overs(difference: Difference) -> list[str]:
-    both, names = difference.hand_overs, difference.joints
+    both = difference.hand_overs
+    names = difference.joints
     if both.unknown:
-        return [f"  {'propulsion joints':<{NAME}}{both.unknown}"]
+        return [f"  {'propulsion joints':<{NAME_WIDTH}}{both.unknown}"]
     if not both.a and not both.b:
         return ["  no joint propelled in either"]
     lines = [_row("propulsion joints", f"{len(both.a)} in a row", f"{len(both.b)} in a row")]
-    for i, later_s in enumerate(both.later_s[:HAND_OVERS_SHOWN]):
-        a, b = both.a[i], both.b[i]
+    for i, later_s in enumerate(both.later_s[:MAX_HAND_OVERS_SHOWN]):
+        a = both.a[i]
+        b = both.b[i]
         lines.append(_row(f"  {names[a.joint]}", f"{a.start_s:.2f} s", f"{b.start_s:.2f} s", f"{later_s:+.2f} s"))
-    if both.agreed > HAND_OVERS_SHOWN:
-        lines.append(f"    and {both.agreed - HAND_OVERS_SHOWN} more that agree; the last is {both.later_s[-1]:+.2f} s")
+    if both.agreed > MAX_HAND_OVERS_SHOWN:
+        lines.append(
+            f"    and {both.agreed - MAX_HAND_OVERS_SHOWN} more that agree; the last is {both.later_s[-1]:+.2f} s"
+        )
     if not both.same_order:
-        lines.append(f"    from there on A: {order(names, both.a[both.agreed :])}")
-        lines.append(f"    from there on B: {order(names, both.b[both.agreed :])}")
+        lines.append(f"    from there on A: {order_in_words(names, both.a[both.agreed :])}")
+        lines.append(f"    from there on B: {order_in_words(names, both.b[both.agreed :])}")
     return lines
 
 
 def _gap(gap: Gap, joints: list[str]) -> str:
     if gap.rms is None or gap.worst is None:
-        return f"  {gap.what:<{NAME}}unknown"
+        return f"  {gap.what:<{NAME_WIDTH}}unknown"
     worst = gap.worst
     if gap.same:
-        return f"  {gap.what:<{NAME}}the same for every joint at every instant"
+        return f"  {gap.what:<{NAME_WIDTH}}the same for every joint at every instant"
     if not worst.difference:
-        return f"  {gap.what:<{NAME}}the same where it is known"
+        return f"  {gap.what:<{NAME_WIDTH}}the same where it is known"
     where = f"{joints[worst.joint]} at {worst.time_s:.2f} s, A {worst.a:+.3f}, B {worst.b:+.3f}"
-    rms, most = f"{gap.rms:.4f} {gap.unit}", f"{worst.difference:+.4f} {gap.unit}"
-    return f"  {gap.what:<{NAME}}{rms:<{VALUE}}{most:<{VALUE}}{where}"
+    rms = f"{gap.rms:.4f} {gap.unit}"
+    most = f"{worst.difference:+.4f} {gap.unit}"
+    return f"  {gap.what:<{NAME_WIDTH}}{rms:<{VALUE_WIDTH}}{most:<{VALUE_WIDTH}}{where}"
 
 
 def _by_joint(difference: Difference) -> list[str]:
-    """How B's angle follows A's, joint by joint."""
-    lines = [f"  {'angle by joint':<{NAME}}{'RMS of B - A':<{VALUE}}{'B later by':<{VALUE}}{'gain, and RMS left'}"]
+    """Return the rows that show how B's angle follows A's, joint by joint."""
+    joint_head = f"{'angle by joint':<{NAME_WIDTH}}"
+    value_heads = f"{'RMS of B - A':<{VALUE_WIDTH}}{'B later by':<{VALUE_WIDTH}}"
+    lines = [f"  {joint_head}{value_heads}gain, and RMS left"]
     for name, rms, fit in zip(difference.joints, difference.angle.joint_rms, difference.following, strict=True):
         apart = "unknown" if np.isnan(rms) else f"{rms:.5f} rad"
-        lag, rest = (
-            ("unknown", "") if fit is None else (f"{1000 * fit.lag_s:+.2f} ms", f"{fit.gain:.4f}, {fit.left:.5f} rad")
-        )
-        lines.append(f"  {name:<{NAME}}{apart:<{VALUE}}{lag:<{VALUE}}{rest}")
+        lag = "unknown"
+        rest = ""
+        if fit is not None:
+            lag = f"{1000 * fit.lag_s:+.2f} ms"
+            rest = f"{fit.gain:.4f}, {fit.left:.5f} rad"
+        lines.append(f"  {name:<{NAME_WIDTH}}{apart:<{VALUE_WIDTH}}{lag:<{VALUE_WIDTH}}{rest}")
     return lines
 
 
-def _beside(difference: Difference) -> list[str]:
+def _torques_and_tracking(difference: Difference) -> list[str]:
     lines: list[str] = []
     if difference.torque.correlation is not None:
         lines.append(f"  torques correlate by {difference.torque.correlation:.3f}")
@@ -170,5 +208,5 @@ def _beside(difference: Difference) -> list[str]:
     return lines
 
 
-def _short(value: str) -> str:
-    return value if len(value) < VALUE else value[: VALUE - 4] + "..."
+def _shorten(value: str) -> str:
+    return value if len(value) < VALUE_WIDTH else value[: VALUE_WIDTH - 4] + "..."

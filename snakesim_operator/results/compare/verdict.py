@@ -17,53 +17,58 @@ class ToleranceCheck:
 
 
 def within(difference: Difference, percent: float) -> ToleranceCheck | None:
-    """Whether the distance differs by no more than so many per cent of A's; None when the distance is unknown."""
+    """Check whether the distance differs by no more than a percentage of A's; None if the distance is unknown."""
     advance = difference.advance
     if advance is None:
         return None
-    found = advance.percent
-    if found is None:
+    actual_percent = advance.percent
+    if actual_percent is None:
         words = f"A stood still and B moved {advance.b_m:.3f} m, which is more than any percentage"
         return ToleranceCheck(percent, False, f"not within {percent:g} %: {words}")
-    holds = abs(found) <= percent
-    return ToleranceCheck(percent, holds, f"{'within' if holds else 'not within'} {percent:g} %: {relation(advance)}")
+    holds = abs(actual_percent) <= percent
+    result = "within" if holds else "not within"
+    return ToleranceCheck(percent, holds, f"{result} {percent:g} %: {relation(advance)}")
 
 
 def sentences(difference: Difference) -> list[str]:
-    """How far, since when apart, and who propelled."""
-    partial = _partial(difference)
+    """Return how far the runs moved, when they diverged, and which joints propelled."""
+    partial = _describe_partial(difference)
     if difference.identical:
         how_long = "in what both records hold:" if partial else "for all of their"
         return [*partial, f"The runs are the same, joint by joint, {how_long} {_common(difference)}."]
-    advance = difference.advance
-    said = [*partial, *_unknown_fractions(difference)]
+    words = [*partial, *_describe_unknown(difference), *_describe_replays(difference)]
+    if difference.advance is None:
+        words.append("How far they moved cannot be compared: there is no measure of it that both runs have.")
+    else:
+        words.append(f"{_capitalize(how_far(difference.advance))}.")
+    words.append(_describe_divergence(difference))
+    hand_overs = difference.hand_overs
+    if hand_overs.a or hand_overs.b or hand_overs.unknown:
+        words.append(f"{_capitalize(who_propelled(difference))}.")
+    return words
+
+
+def _describe_replays(difference: Difference) -> list[str]:
+    words: list[str] = []
     for run, record in (("A", difference.a), ("B", difference.b)):
         if record.replay_of:
-            said.append(
+            words.append(
                 f"{run} is a replay: its robot moves as in {record.replay_of}, whatever its services command. Only the "
                 "commands can differ."
             )
-    said += [
-        "How far they moved cannot be compared: there is no measure of it that both runs have."
-        if advance is None
-        else f"{_capital(how_far(advance))}."
-    ]
+    return words
+
+
+def _describe_divergence(difference: Difference) -> str:
     parted = difference.parted
     if parted is None:
-        said.append(f"No joint's angles were ever more than {APART_RAD:g} rad apart.")
-    else:
-        joint = difference.joints[parted.joint]
-        said.append(
-            f"The runs diverge at {parted.time_s:.2f} s, when {joint} is first more than {APART_RAD:g} rad apart."
-        )
-    hand_overs = difference.hand_overs
-    if hand_overs.a or hand_overs.b or hand_overs.unknown:
-        said.append(f"{_capital(who_propelled(difference))}.")
-    return said
+        return f"No joint's angles were ever more than {APART_RAD:g} rad apart."
+    joint = difference.joints[parted.joint]
+    return f"The runs diverge at {parted.time_s:.2f} s, when {joint} is first more than {APART_RAD:g} rad apart."
 
 
-def _partial(difference: Difference) -> list[str]:
-    """That not all of the runs is compared, where a record lacks something."""
+def _describe_partial(difference: Difference) -> list[str]:
+    """Return a sentence if a record is incomplete, so that only a part of the runs is compared."""
     lacking = [run for run, record in (("A", difference.a), ("B", difference.b)) if record.lacks]
     if not lacking:
         return []
@@ -71,7 +76,7 @@ def _partial(difference: Difference) -> list[str]:
     return [f"Only a part of the runs is compared, because the record of {who} is incomplete."]
 
 
-def _unknown_fractions(difference: Difference) -> list[str]:
+def _describe_unknown(difference: Difference) -> list[str]:
     unknown = [f"{gap.what} {100 * gap.unknown_fraction:.2g} %" for gap in difference.gaps if gap.unknown_fraction]
     if not unknown:
         return []
@@ -79,7 +84,7 @@ def _unknown_fractions(difference: Difference) -> list[str]:
 
 
 def how_far(advance: Advance) -> str:
-    """Both distances, and B's relative to A's."""
+    """Return both distances, and B's relative to A's."""
     moved = f"A moved {advance.a_m:.3f} m, B {advance.b_m:.3f} m"
     if advance.percent is None:
         return f"{moved}; A stood still"
@@ -89,7 +94,7 @@ def how_far(advance: Advance) -> str:
 
 
 def relation(advance: Advance) -> str:
-    """B relative to A, such as `B 1.6 % less`."""
+    """Return B's distance relative to A's, such as `B 1.6 % less`."""
     if advance.percent is None:
         return "A stood still"
     size = f"{abs(advance.percent):.1f}"
@@ -99,19 +104,21 @@ def relation(advance: Advance) -> str:
 
 
 def who_propelled(difference: Difference) -> str:
-    """Whether propulsion was handed over in the same order, and if not, from where on."""
-    both, names = difference.hand_overs, difference.joints
-    if both.unknown:
-        return f"which joints propelled in both is {both.unknown}"
-    if both.same_order:
-        return f"propulsion is handed over in the same order, {len(both.a)} joints one after another"
-    next_ones = [
-        f"{run} goes on with {names[taken[both.agreed].joint]} at {taken[both.agreed].start_s:.2f} s"
-        if both.agreed < len(taken)
-        else f"{run} with none"
-        for run, taken in (("A", both.a), ("B", both.b))
-    ]
-    return f"the order of propulsion agrees for the first {both.agreed}; then {', '.join(next_ones)}"
+    """Return whether propulsion was handed over in the same order, and if not, where the order diverges."""
+    hand_overs = difference.hand_overs
+    if hand_overs.unknown:
+        return f"which joints propelled in both is {hand_overs.unknown}"
+    if hand_overs.same_order:
+        return f"propulsion is handed over in the same order, {len(hand_overs.a)} joints one after another"
+    agreed = hand_overs.agreed
+    next_joints: list[str] = []
+    for run, periods in (("A", hand_overs.a), ("B", hand_overs.b)):
+        if agreed < len(periods):
+            name = difference.joints[periods[agreed].joint]
+            next_joints.append(f"{run} goes on with {name} at {periods[agreed].start_s:.2f} s")
+        else:
+            next_joints.append(f"{run} with none")
+    return f"the order of propulsion agrees for the first {agreed}; then {', '.join(next_joints)}"
 
 
 def _common(difference: Difference) -> str:
@@ -119,5 +126,5 @@ def _common(difference: Difference) -> str:
     return f"{count} common ticks" if difference.aligned.how == "tick by tick" else f"{count} common instants"
 
 
-def _capital(words: str) -> str:
+def _capitalize(words: str) -> str:
     return words[:1].upper() + words[1:]

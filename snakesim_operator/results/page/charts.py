@@ -36,7 +36,7 @@ class Line:
     shape: str = "linear"  # hv: a value holds until the next one
 
     def trace(self) -> Figure:
-        """The line as Plotly has it."""
+        """Return the line as a trace of Plotly."""
         rows = thinned(self.values)
         return {
             "type": "scatter",
@@ -80,7 +80,19 @@ def lines(
     height: int = 220,
     from_zero: bool = False,
 ) -> Figure:
-    """Lines over time. levels: values with a name, dotted; shades: stretches of time in a color."""
+    """Draw lines over time.
+
+    Args:
+        label: Title of the chart.
+        axis: Title of the vertical axis.
+        drawn: The lines.
+        until_s: End of the time axis.
+        levels: Values with a name, as dotted lines.
+        shades: Spans of time with a color.
+        marks: Instants.
+        height: Height in pixels.
+        from_zero: The vertical axis begins at 0.
+    """
     shapes = [_box(bar.start_s, bar.end_s, 0, 1, "paper", fillcolor=bar.color, opacity=0.16) for bar in shades]
     shapes += [
         {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "line": _stroke("--soft", "dot")}
@@ -97,7 +109,7 @@ def lines(
 
 
 def bars(label: str, rows: Sequence[str], drawn: Sequence[Bar], until_s: float, marks: Sequence[Mark] = ()) -> Figure:
-    """What held when, a row each, the first on top. Of very many the longest are drawn."""
+    """Draw what held when, in rows, the first on top. Of more than MAX_BARS the longest are drawn."""
     drawn = sorted(drawn, key=lambda bar: bar.start_s - bar.end_s)[:MAX_BARS]
     trace = {
         "type": "bar",
@@ -159,7 +171,7 @@ def joint_map(
 
 
 def thinned(values: Floats, buckets: int = BUCKETS) -> NDArray[np.intp]:
-    """Rows to draw: of each stretch of time the smallest, the largest, and one that is unknown."""
+    """Return the rows to draw: for each bucket of time the minimum, the maximum, and one that is unknown."""
     if len(values) <= 2 * buckets:
         return np.arange(len(values))
     keep = {0, len(values) - 1}
@@ -172,7 +184,7 @@ def thinned(values: Floats, buckets: int = BUCKETS) -> NDArray[np.intp]:
 
 
 def strongest(values: Floats, columns: int) -> Floats:
-    """At most `columns` rows, each with the value of largest size in its stretch of time; NaN where none is known."""
+    """Return at most `columns` rows, each with the value of largest size in its bucket of time; NaN: none is known."""
     if len(values) <= columns:
         return values
     kept: list[Floats] = []
@@ -184,7 +196,7 @@ def strongest(values: Floats, columns: int) -> Floats:
 
 
 def rounded(values: Floats) -> list[float | None]:
-    """Four digits of each; None for what is unknown."""
+    """Return the values with four digits; None for unknown ones."""
     return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -198,13 +210,16 @@ def _figure(
     marks: Sequence[Mark],
     layout: Figure,
 ) -> Figure:
+    """Return a figure with its marks and its time axis."""
     for mark in marks:
-        at = {"x0": mark.time_s, "x1": mark.time_s, "yref": "paper", "y0": 0, "y1": 1}
-        shapes.append({"type": "line", "line": _stroke(mark.color, "dash"), **at})
+        place = {"x0": mark.time_s, "x1": mark.time_s, "yref": "paper", "y0": 0, "y1": 1}
+        shapes.append({"type": "line", "line": _stroke(mark.color, "dash"), **place})
         if mark.words:
             note = {"x": mark.time_s, "yref": "paper", "y": 1, "yanchor": "top", "showarrow": False, "text": mark.words}
-            right_of_it = mark.time_s < until_s / 2
-            notes.append({**note, "xanchor": "left" if right_of_it else "right", "xshift": 4 if right_of_it else -4})
+            has_room_right = mark.time_s < until_s / 2
+            anchor = "left" if has_room_right else "right"
+            shift = 4 if has_room_right else -4
+            notes.append({**note, "xanchor": anchor, "xshift": shift})
     time_axis = {"range": [0, round(until_s, 4)], "title": {"text": "time, s"}}
     layout = {**layout, "height": height, "xaxis": time_axis, "shapes": shapes, "annotations": notes}
     return {"label": label, "data": traces, "layout": layout}

@@ -28,7 +28,16 @@ def render(
     charts: bool = True,
     **values: Any,
 ) -> str:
-    """A whole page that needs no other file. colored_joints: how many need a color; charts: whether it has any."""
+    """Return a page that needs no other file.
+
+    Args:
+        template: The template.
+        colored_joints: How many joints need a color.
+        styles: More style sheets.
+        scripts: More scripts.
+        charts: Whether the page has charts, which need the plotting library.
+        values: Values for the template.
+    """
     return (
         _pages(template.parent)
         .get_template(template.name)
@@ -42,7 +51,7 @@ def render(
 
 
 def chart(figure: Figure) -> Markup:
-    """A figure, and its data beside it."""
+    """Return the markup of a figure, with its data beside it."""
     label = Markup.escape(printable(figure["label"]))
     return Markup(
         f'<figure class="chart" role="group" aria-label="{label}" style="min-height:{figure["layout"]["height"]}px">'
@@ -51,13 +60,18 @@ def chart(figure: Figure) -> Markup:
 
 
 def data(value: Any) -> Markup:
-    """JSON for a script of the page, with no text in it that the page or a figure would take for markup."""
+    """Return JSON for a script of the page, in which no text can be taken for markup."""
     encoded = msgspec.json.encode(_harmless(value)).decode().replace("<", "\\u003c")
     return Markup(f'<script type="application/json">{encoded}</script>')
 
 
 def shown(value: float, digits: int = 4) -> str:
-    """A number for people: so many significant digits, a real minus sign, and none before a zero."""
+    """Return a number for people, with a typographic minus sign, and none before a zero.
+
+    Args:
+        value: The number.
+        digits: How many significant digits.
+    """
     value += 0.0
     if value != 0 and (abs(value) >= 10**digits or abs(value) < 1e-4):
         whole = f"{value:,.0f}".replace(",", "\u202f")
@@ -67,7 +81,7 @@ def shown(value: float, digits: int = 4) -> str:
 
 @cache
 def _pages(folder: Path) -> jinja2.Environment:
-    """Templates of a folder, and those that all pages share."""
+    """Return the templates of a folder, and those that all pages share."""
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader([folder, HERE]),
         autoescape=True,
@@ -81,16 +95,21 @@ def _pages(folder: Path) -> jinja2.Environment:
 
 
 def _visible(value: Any) -> Any:
-    """What would turn the text around it, or end it, is shown as `\\u202e`."""
-    return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value, KEPT)
+    """Return a value whose control characters, which would hide or reverse the text around them, are visible."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return printable(value, KEPT)
+    return value
 
 
 def _harmless(value: Any) -> Any:
+    """Escape every text in a value."""
     if isinstance(value, str):
         return escape(printable(value), quote=False)
     if isinstance(value, dict):
         return {key: _harmless(item) for key, item in value.items()}
-    return [_harmless(item) for item in value] if isinstance(value, list) else value
+    if isinstance(value, list):
+        return [_harmless(item) for item in value]
+    return value
 
 
 def _text(*paths: Path) -> str:

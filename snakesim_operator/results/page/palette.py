@@ -65,18 +65,20 @@ GOLDEN = 0.381966  # of a turn of hue: neighbors are far apart, and no hue comes
 
 
 def joint_colors(count: int, *, dark: bool) -> dict[str, str]:
-    """A color for every joint, tail to head."""
-    found: dict[str, str] = {}
+    """Return a color for every joint, tail to head."""
+    lightness = (0.66, 0.76) if dark else (0.45, 0.34)  # of even and odd joints
+    colors: dict[str, str] = {}
     for joint in range(count):
-        light = (0.66, 0.76)[joint % 2] if dark else (0.45, 0.34)[joint % 2]
-        rgb = colorsys.hls_to_rgb((0.56 + GOLDEN * joint) % 1, light, 0.72)
-        found[f"joint-{joint}"] = "#" + "".join(f"{round(255 * part):02x}" for part in rgb)
-    return found
+        hue = (0.56 + GOLDEN * joint) % 1
+        rgb = colorsys.hls_to_rgb(hue, lightness[joint % 2], 0.72)
+        colors[f"joint-{joint}"] = "#" + "".join(f"{round(255 * part):02x}" for part in rgb)
+    return colors
 
 
 def themes(joints: int) -> str:
-    """The colors of both themes as CSS variables. Paper is always light."""
-    light, dark = LIGHT | joint_colors(joints, dark=False), DARK | joint_colors(joints, dark=True)
+    """Return the colors of both themes as CSS variables. Paper is always light."""
+    light = LIGHT | joint_colors(joints, dark=False)
+    dark = DARK | joint_colors(joints, dark=True)
     return (
         f":root{{{variables(light)}}}@media screen and (prefers-color-scheme:dark)"
         f"{{:root:not(.paper){{{variables(dark)}}}}}"
@@ -84,5 +86,5 @@ def themes(joints: int) -> str:
 
 
 def variables(colors: dict[str, str]) -> str:
-    """Colours as CSS has them."""
+    """Return colors as CSS variables."""
     return "".join(f"--{name}:{value};" for name, value in colors.items())

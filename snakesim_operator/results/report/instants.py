@@ -12,12 +12,13 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.force_tracking import is_measured
+from snakesim_operator.results.metrics.force_tracking import is_measured
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.time_axis import reported_at_s
 
-NEEDED = 3
-WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
+MIN_CONTACTS = 3  # fewer contact forces cannot balance
+MAX_GAP_FRACTION = 0.05  # of the commanded force; a polygon with a larger gap is not balanced
+SIMULTANEOUS_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Balance:
 
     @property
     def resultant_n(self) -> Floats:
-        """Sum of the contact forces, (2,): what drives the snake."""
+        """The sum of the contact forces, (2,): what drives the snake."""
         return self.contact_n.sum(axis=0)
 
     @property
@@ -41,24 +42,35 @@ class Balance:
 
     @property
     def gap_n(self) -> float:
-        """How far the polygon is from closing."""
+        """The gap that keeps the polygon from closing."""
         return float(np.hypot(*(self.resultant_n + self.tether_n)))
-
-    def measured_force_n(self, felt: list[WorldContact], index: int) -> float | None:
-        """The measured force at a push-point; None when none was felt there."""
-        there = [np.hypot(*one.force_w[:2]) for one in felt if is_measured(self.contacts[index], [one])]
-        return float(sum(there)) if there else None
-
-    def kinds(self, felt: list[WorldContact]) -> list[str]:
-        """How each contact force and last the resultant is drawn: as asked for unless felt, the sum if all are felt."""
-        there = [is_measured(contact, felt) for contact in self.contacts]
-        asked = ["" if one else " asked" for one in (*there, all(there))]
-        return [*(f"solved{one}" for one in asked[:-1]), f"resultant{asked[-1]}"]
 
     @property
     def corners_n(self) -> Floats:
-        """Corners of the polygon head to tail, (k + 2, 2): f_s from the origin, then the contact forces."""
-        return np.vstack([[0.0, 0.0], np.cumsum(np.vstack([self.tether_n, self.contact_n]), axis=0)])
+        """The corners of the polygon head to tail, (k + 2, 2): f_s from the origin, then the contact forces."""
+        forces = np.vstack([self.tether_n, self.contact_n])
+        return np.vstack([[0.0, 0.0], np.cumsum(forces, axis=0)])
+
+    def measured_force_n(self, measured: list[WorldContact], index: int) -> float | None:
+        """Return the measured force at a push-point, or None if no contact was measured there."""
+        push_point = self.contacts[index]
+        forces_n = [np.hypot(*contact.force_w[:2]) for contact in measured if is_measured(push_point, [contact])]
+        return float(sum(forces_n)) if forces_n else None
+
+    def force_classes(self, measured: list[WorldContact]) -> tuple[list[str], str]:
+        """Return the CSS classes of each contact force, and of the resultant.
+
+        A force is drawn as "asked" if no contact was measured there, the resultant if that holds for any of them.
+        """
+        contact_classes: list[str] = []
+        all_measured = True
+        for contact in self.contacts:
+            if is_measured(contact, measured):
+                contact_classes.append("solved")
+            else:
+                contact_classes.append("solved asked")
+                all_measured = False
+        return contact_classes, "resultant" if all_measured else "resultant asked"
 
 
 @dataclass(frozen=True)
@@ -69,80 +81,102 @@ class Instant:
     row: int  # of the record
     state: ControlState | None
     balance: Balance | None
-    felt: list[WorldContact]  # measured
+    felt: list[WorldContact]  # measured contacts
     propulsion_joint: int | None
 
 
 def balance_of(state: ControlState) -> Balance | None:
-    """The solved forces; None when the controller solved for none."""
+    """Return the forces that the controller solved for, or None if it solved for none."""
     pairs = list(zip(state.push_points, state.desired_force_n, strict=False))
-    if len(pairs) < NEEDED or not state.propulsion_n:
+    if len(pairs) < MIN_CONTACTS or not state.propulsion_n:
         return None
     pairs.sort(key=lambda pair: pair[0].body_s_m)
     contacts = [contact for contact, _ in pairs]
-    normals = np.array([contact.normal_w[:2] for contact in contacts])
     sizes = [size for _, size in pairs]
+    normals = np.array([contact.normal_w[:2] for contact in contacts])
     tangent = np.array(contacts[0].tangent_w[:2])
-    length = float(np.hypot(*tangent))
-    if length < 1e-6:
+    tangent_length = float(np.hypot(*tangent))
+    if tangent_length < 1e-6:
         return None
-    return Balance(contacts, sizes, normals * np.array(sizes)[:, None], -state.propulsion_n * tangent / length)
+    return Balance(
+        contacts=contacts,
+        size_n=sizes,
+        contact_n=normals * np.array(sizes)[:, None],
+        tether_n=-state.propulsion_n * tangent / tangent_length,
+    )
 
 
 def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Instant]:
-    """Every moment of locomotion, of those reported within a time, whose solved forces balance; in order of time."""
+    """Return the moments of locomotion whose solved forces balance, in order of time.
+
+    Args:
+        record: The run.
+        begin_s: Reports before this time are left out.
+        end_s: Reports after this time are left out.
+    """
     if not len(record.time_s):
         return []
-    found: list[Instant] = []
+    instants: list[Instant] = []
     for state in record.control:
-        balance = balance_of(state) if begin_s <= reported_at_s(record, state) <= end_s else None
-        if balance is None or state.propulsion_joint is None or state.state != "Locomoting":
+        at_s = reported_at_s(record, state)
+        if not begin_s <= at_s <= end_s or state.propulsion_joint is None or state.state != "Locomoting":
             continue
-        if balance.gap_n > 0.05 * balance.commanded_n or min(balance.size_n) <= 0:
+        balance = balance_of(state)
+        if balance is None or not _is_balanced(balance):
             continue
-        instant = _instant(record, reported_at_s(record, state), state, balance)
+        instant = _make_instant(record, at_s, state, balance)
         if record.nodes_w(instant.row) is not None:
-            found.append(instant)
-    return found
+            instants.append(instant)
+    return instants
+
+
+def _is_balanced(balance: Balance) -> bool:
+    """Return whether the polygon closes, and every contact is pushed and not pulled."""
+    return not (balance.gap_n > MAX_GAP_FRACTION * balance.commanded_n or min(balance.size_n) <= 0)
 
 
 def instant_at(record: RunRecord, time_s: float) -> Instant | None:
-    """A moment as it was, without solved forces; None when the pose is unknown then."""
+    """Return a moment without solved forces, or None if the pose is unknown then."""
     row = record.row_at(float(record.time_s[0]) + time_s)
     if record.nodes_w(row) is None:
         return None
     earlier = [state for state in record.control if reported_at_s(record, state) <= time_s]
-    return _instant(record, time_s, earlier[-1] if earlier else None, None)
+    last_state = earlier[-1] if earlier else None
+    return _make_instant(record, time_s, last_state, None)
 
 
 def measured_along_n(instant: Instant, direction_w: Floats) -> float:
-    """How much the measured contact forces push along a direction, (2,) of any length."""
+    """Return how much the measured contact forces push along a direction, (2,) of any length."""
     unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
     return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.felt)
 
 
-def _instant(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Instant:
-    at_s = float(record.time_s[0]) + time_s
-    names = [joint.name for joint in record.description.joints]
-    joint = state.propulsion_joint if state is not None else None
-    world = _world_near(record, at_s, WORLD_WITHIN_S if balance is not None else 3 * WORLD_WITHIN_S)
-    return Instant(
-        time_s=time_s,
-        row=record.row_at(at_s),
-        state=state,
-        balance=balance,
-        felt=world.contacts if world is not None else [],
-        propulsion_joint=names.index(joint) if joint in names else None,
-    )
-
-
-def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None:
-    near = min(record.worlds, key=lambda world: abs(world.timestamp_ns * 1e-9 - at_s), default=None)
-    return near if near is not None and abs(near.timestamp_ns * 1e-9 - at_s) <= within_s else None
-
-
-def unmeasured(instant: Instant) -> int:
-    """How many solved contacts no sensor felt."""
+def count_unmeasured(instant: Instant) -> int:
+    """Count the solved contacts at which no sensor measured a force."""
     if instant.balance is None:
         return 0
     return sum(not is_measured(contact, instant.felt) for contact in instant.balance.contacts)
+
+
+def _make_instant(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Instant:
+    robot_time_s = float(record.time_s[0]) + time_s
+    tolerance_s = SIMULTANEOUS_S if balance is not None else 3 * SIMULTANEOUS_S
+    world = _find_world_near(record, robot_time_s, tolerance_s)
+    names = [joint.name for joint in record.description.joints]
+    propelling = state.propulsion_joint if state is not None else None
+    return Instant(
+        time_s=time_s,
+        row=record.row_at(robot_time_s),
+        state=state,
+        balance=balance,
+        felt=world.contacts if world is not None else [],
+        propulsion_joint=names.index(propelling) if propelling in names else None,
+    )
+
+
+def _find_world_near(record: RunRecord, at_s: float, within_s: float) -> World | None:
+    """Return the world model whose timestamp is nearest, if that is within a tolerance."""
+    nearest = min(record.worlds, key=lambda world: abs(world.timestamp_ns * 1e-9 - at_s), default=None)
+    if nearest is None or abs(nearest.timestamp_ns * 1e-9 - at_s) > within_s:
+        return None
+    return nearest

@@ -8,14 +8,14 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
+from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_intervals
 from snakesim_operator.results.page.html import render
-from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
+from snakesim_operator.results.report.events import Event, drawn_instants, find_events, select_listed
 from snakesim_operator.results.report.instants import measured_along_n
 from snakesim_operator.results.report.playback import playback
-from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
+from snakesim_operator.results.report.polygon import common_scale, force_polygon, with_subscript
 from snakesim_operator.results.report.pushing import pushing
 from snakesim_operator.results.report.reasons import why_at_limit, why_empty, why_late, why_refused
 from snakesim_operator.results.report.timeline import distance, in_words, joined, most_used_joints
@@ -27,15 +27,20 @@ from snakesim_operator.results.time_axis import end_s, zero_s
 
 HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0
-TURNS_SHOWN = 100  # of one joint in a chart
-POLYGON = (236.0, 226.0)
+MAX_SPANS_SHOWN = 100  # of one joint in a chart
+POLYGON_SIZE = (236.0, 226.0)
 ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_times")
+"""Fields of the summary that are not in the table of numbers, because another section has them."""
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:
-    """The whole page."""
-    found, every = events(record, summary), propulsion_intervals(record)
-    intervals = joined(every, end_s(record) / TURNS_SHOWN)
+    """Return the whole page as HTML."""
+    events = find_events(record, summary)
+    all_intervals = propulsion_intervals(record)
+    intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
+    joints: list[tuple[int, list[Propulsion]]] = []
+    for joint in most_used_joints(intervals):
+        joints.append((joint, [interval for interval in all_intervals if interval.joint == joint]))
     return render(
         HERE / "report.html",
         len(record.description.joints),
@@ -45,12 +50,12 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         record=record,
         summary=summary,
         verdict=verdict(record, summary),
-        pretty=pretty,
+        pretty=with_subscript,
         in_words=in_words,
         film=playback(record),
         names=[joint.name for joint in record.description.joints],
-        events=listed(found),
-        instants=_instants(record, found),
+        events=select_listed(events),
+        instants=_instants(record, events),
         pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
@@ -61,8 +66,8 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         why_refused=why_refused(summary),
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
         intervals=intervals,
-        joints=[(joint, [one for one in every if one.joint == joint]) for joint in most_used_joints(intervals)],
-        propelled=len({one.joint for one in intervals}),
+        joints=joints,
+        propelled=len({interval.joint for interval in intervals}),
         figures=figures,
         begin_s=zero_s(record),
         first_kept=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
@@ -73,7 +78,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
 
 
 def playback_page(record: RunRecord, summary: RunSummary) -> str:
-    """Verdict and playback alone, without charts: small enough for a notebook."""
+    """Return a page with verdict and playback alone, without charts: small enough for a notebook."""
     return render(
         HERE / "playback.html",
         len(record.description.joints),
@@ -83,48 +88,71 @@ def playback_page(record: RunRecord, summary: RunSummary) -> str:
         title=record.config.title or summary.scenario,
         verdict=verdict(record, summary),
         film=playback(record),
-        events=listed(events(record, summary)),
+        events=select_listed(find_events(record, summary)),
         names=[joint.name for joint in record.description.joints],
     )
 
 
-def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
-    """The drawings of each event, and what stands beside them."""
-    chosen = drawn_instants(record, found)
-    balances = [instant.balance for _, instant in chosen if instant.balance is not None]
+def _instants(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
+    """Return the drawings of each event, and the numbers beside them."""
+    chosen = drawn_instants(record, events)
+    instants = [instant for _, instant in chosen]
+    balances = [instant.balance for instant in instants if instant.balance is not None]
     cards: list[dict[str, Any]] = []
-    windows = views(record, [instant for _, instant in chosen], VIEW_WIDTH)
-    for (event, instant), view in zip(chosen, windows, strict=True):
-        nodes, polygon = nodes_xy_w(record, instant.row), None
-        ahead = nodes[-1] - nodes[0]
-        if instant.balance is not None:
-            scale = units_per_n(balances, *POLYGON, upright=view.upright)
-            polygon = Markup(force_polygon(instant.balance, instant.felt, *POLYGON, scale, upright=view.upright))
-            ahead = instant.balance.resultant_n
-        pushed_n = measured_along_n(instant, ahead)
-        drawn = Markup(top_view(record, instant, view))
-        cards.append({"event": event, "instant": instant, "view": drawn, "polygon": polygon, "pushed_n": pushed_n})
+    for (event, instant), view in zip(chosen, views(record, instants, VIEW_WIDTH), strict=True):
+        polygon = None
+        if instant.balance is None:
+            nodes = nodes_xy_w(record, instant.row)
+            forward = nodes[-1] - nodes[0]
+        else:
+            forward = instant.balance.resultant_n
+            scale = common_scale(balances, *POLYGON_SIZE, upright=view.upright)
+            polygon = Markup(force_polygon(instant.balance, instant.felt, *POLYGON_SIZE, scale, upright=view.upright))
+        cards.append(
+            {
+                "event": event,
+                "instant": instant,
+                "view": Markup(top_view(record, instant, view)),
+                "polygon": polygon,
+                "pushed_n": measured_along_n(instant, forward),
+            }
+        )
     return cards
 
 
 def _numbers(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
-    """Every field with its unit and what it means, from the Struct itself."""
+    """Return name, value, unit and description of every field that the page shows in its table."""
     hints = get_type_hints(RunSummary, include_extras=True)
     rows: list[tuple[str, Any, str, str]] = []
     for field in msgspec.structs.fields(RunSummary):
         if field.name in ELSEWHERE:
             continue
-        notes = getattr(hints[field.name], "__metadata__", ())
-        meta: Meta | None = next((note for note in notes if isinstance(note, Meta)), None)
-        unit = ((meta.extra_json_schema or {}).get("unit", "") if meta else "").removeprefix("1")
-        rows.append((field.name, getattr(summary, field.name), unit, (meta.description or "") if meta else ""))
+        unit = ""
+        description = ""
+        meta = _find_meta(hints[field.name])
+        if meta is not None:
+            unit = (meta.extra_json_schema or {}).get("unit", "").removeprefix("1")
+            description = meta.description or ""
+        rows.append((field.name, getattr(summary, field.name), unit, description))
     return rows
 
 
+def _find_meta(hint: Any) -> Meta | None:
+    for note in getattr(hint, "__metadata__", ()):
+        if isinstance(note, Meta):
+            return note
+    return None
+
+
 def _config_file(record: RunRecord) -> Path:
-    """A recording alone has none beside it: its configuration stands on the page."""
+    """Return the path of the configuration, as the page names it.
+
+    A recording alone has no such file beside it: its configuration is on the page.
+    """
     if record.alone:
         return Path(CONFIG)
     here = Path.cwd()
-    folder = record.folder.relative_to(here) if record.folder.is_relative_to(here) else record.folder
+    folder = record.folder
+    if folder.is_relative_to(here):
+        folder = folder.relative_to(here)
     return folder / CONFIG

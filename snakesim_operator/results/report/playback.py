@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.motion import MOVING, STANDING, Motion, motion_of
+from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, motion_of
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
@@ -26,12 +26,13 @@ from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, Vie
 from snakesim_operator.results.time_axis import end_s, zero_s
 
 MessageT = TypeVar("MessageT", ControlState, World)
-FRAMES = 300
-MAPS, PATH_POINTS = 80, 60  # of a whole run; of a path
+MAX_FRAMES = 300
+MAX_MAPS = 80  # of a whole run
+MAX_PATH_POINTS = 60
 WIDTH = 1040.0
 SAME_TICK_S = 1e-6
-USUAL_SHARE = 0.9  # of all forces are drawn in full; the strongest are cut
-SHOWN_FOR_S = 0.3  # what is older is not shown: control and guidance publish their state many times a second
+FULL_SIZE_QUANTILE = 0.9  # of all forces are drawn in full; the strongest are cut
+SHOWN_FOR_S = 0.3  # older states are not shown: control and guidance publish many times a second
 
 
 @dataclass(frozen=True)
@@ -45,49 +46,73 @@ class Playback:
 
 
 def playback(record: RunRecord) -> Playback | None:
-    """None when the pose is never known."""
+    """Return the film of a run, or None if its pose is never known."""
     posed = np.flatnonzero(record.posed)
     if not len(posed):
         return None
-    rows = posed[np.unique(np.linspace(0, len(posed) - 1, min(len(posed), FRAMES)).astype(int))]
+    evenly = np.linspace(0, len(posed) - 1, min(len(posed), MAX_FRAMES)).astype(int)
+    rows = posed[np.unique(evenly)]
     nodes = [nodes_xy_w(record, int(row)) for row in rows]
+    states = _latest_messages(record, rows, record.control)
+    worlds = _latest_messages(record, rows, record.worlds)
+    units_per_n = _force_scale(states, worlds)
+    view = map_view(record, nodes, units_per_n, WIDTH)
+    maps, map_numbers = _perceived_maps(record, view, rows)
+    paths, path_numbers = _planned_paths(record, view, rows)
     names = [joint.name for joint in record.description.joints]
-    states = _latest(record, rows, record.control)
-    worlds = _latest(record, rows, record.worlds)
-    units = _units_per_n(states, worlds)
-    view = map_view(record, nodes, units, WIDTH)
     motion = motion_of(record)
-    said: list[str] = []
-    maps, map_of = _perceived(record, view, rows)
-    paths, path_of = _planned(record, view, rows)
+    captions: list[str] = []
     frames: list[list[Any]] = []
+    with_desired = False
+    with_measured = False
     for i, (row, body_w, state, world) in enumerate(zip(rows, nodes, states, worlds, strict=True)):
-        joint = state.propulsion_joint if state is not None else None
-        solved, kinds = _solved(view, state, world, units)
-        felt = _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in _contacts(world)], units)
-        words = _caption(motion, float(record.time_s[row]) - zero_s(record), state)
-        if words not in said:
-            said.append(words)
         time_s = float(record.time_s[row]) - zero_s(record)
-        propels = names.index(joint) if joint in names else -1
-        body_at, said_at = _flat(view, body_w), said.index(words)
-        frames.append([round(time_s, 3), body_at, propels, said_at, solved, felt, map_of[i], path_of[i], kinds])
+        propelling = state.propulsion_joint if state is not None else None
+        caption = _caption(motion, time_s, state)
+        if caption not in captions:
+            captions.append(caption)
+        desired_arrows, desired_classes = _desired_arrows(view, state, world, units_per_n)
+        measured_arrows = _measured_arrows(view, world, units_per_n)
+        with_desired = with_desired or bool(desired_arrows)
+        with_measured = with_measured or bool(measured_arrows)
+        frames.append(  # playback.js reads a frame by position
+            [
+                round(time_s, 3),
+                _flat_coordinates(view, body_w),
+                names.index(propelling) if propelling in names else -1,
+                captions.index(caption),
+                desired_arrows,
+                measured_arrows,
+                map_numbers[i],
+                path_numbers[i],
+                desired_classes,
+            ]
+        )
+    data = {
+        "frames": frames,
+        "said": captions,
+        "joints": names,
+        "end": round(end_s(record), 3),
+        "maps": maps,
+        "paths": paths,
+    }
+    return Playback(Markup(_draw_first_frame(record, view, nodes[0])), data, with_desired, with_measured)
+
+
+def _draw_first_frame(record: RunRecord, view: View, nodes: Floats) -> str:
+    """Draw the map and the snake, with empty groups for what playback.js adds."""
     labels = Labels(view.width, view.height)
-    snake = element("g", body(record, view, nodes[0], labels), class_="snake")
-    picture = figure(
+    snake = element("g", body(record, view, nodes, labels), class_="snake")
+    return figure(
         view.width,
         view.height,
         "The snake on the map, moved by the slider",
         ground(record, view, labels) + '<g class="perceived"></g>' + snake + '<g class="forces"></g>' + scales(view),
     )
-    data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
-    data |= {"maps": maps, "paths": paths}
-    with_desired, with_measured = (any(frame[k] for frame in frames) for k in (4, 5))
-    return Playback(Markup(picture), data, with_desired, with_measured)
 
 
 def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -> str:
-    """What the body did at a time, as measured, and what control reported then."""
+    """Return what the body did at a time, as measured, and what control reported then."""
     reported = "control reported nothing" if state is None else f"{in_words(state.state)}: {state.reason}"
     if motion is None:
         return reported
@@ -95,76 +120,111 @@ def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -
     measured = STANDING if stands else MOVING
     if state is None or state.reason == STANDING_STILL:  # control's own measure, which looks back for a window
         return measured
-    agrees = stands == (state.state != "Locomoting")
-    if agrees:
+    reports_standing = state.state != "Locomoting"
+    if stands == reports_standing:
         return reported
     return measured if stands else f"{measured}; control reported {reported}"
 
 
-def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:
-    """Some of the maps that guidance published, each obstacle as its outline; and for each row which one, or -1."""
+def _perceived_maps(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:
+    """Return the maps that are shown, and for each row the number of its map, or -1.
+
+    They are some of those that guidance published. A map is a list of outlines, one for each obstacle.
+    """
     if record.config.mission.map != "perceived" or not record.worlds:
         return [], [-1] * len(rows)
-    some = record.worlds[:: max(len(record.worlds) // MAPS, 1)]
-    outlines = [[_flat(view, outline_w(one)) for one in world.obstacles if view.shows(one)] for world in some]
-    return outlines, _last_before(record, rows, [world.timestamp_ns for world in some])
+    step = max(len(record.worlds) // MAX_MAPS, 1)
+    shown = record.worlds[::step]
+    maps: list[list[list[float]]] = []
+    for world in shown:
+        visible = [obstacle for obstacle in world.obstacles if view.shows(obstacle)]
+        maps.append([_flat_coordinates(view, outline_w(obstacle)) for obstacle in visible])
+    return maps, _latest_indices(record, rows, [world.timestamp_ns for world in shown])
 
 
-def _planned(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[float]], list[int]]:
-    """The paths that navigation planned, and for each row which one, or -1. Without them a scene's route is drawn."""
-    planned = [one for one in record.trajectories if one.timestamp_ns is not None]
-    if len({one.path_id for one in planned}) < 2:
+def _planned_paths(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[float]], list[int]]:
+    """Return the paths that navigation planned, and for each row the number of its path, or -1.
+
+    Without at least two of them the scene's route is drawn.
+    """
+    planned = [trajectory for trajectory in record.trajectories if trajectory.timestamp_ns is not None]
+    if len({trajectory.path_id for trajectory in planned}) < 2:
         return [], [-1] * len(rows)
-    paths = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
-    return paths, _last_before(record, rows, [one.timestamp_ns or 0 for one in planned])
+    paths: list[list[float]] = []
+    for trajectory in planned:
+        step = max(len(trajectory.path_w) // MAX_PATH_POINTS, 1)
+        paths.append(_flat_coordinates(view, np.array(trajectory.path_w)[::step]))
+    return paths, _latest_indices(record, rows, [trajectory.timestamp_ns or 0 for trajectory in planned])
 
 
-def _flat(view: View, points_w: Floats) -> list[float]:
+def _flat_coordinates(view: View, points_w: Floats) -> list[float]:
+    """Return x, y, x, y, ... of points in the drawing."""
     return [round(part, 1) for point in points_w for part in view.at(point)]
 
 
-def _last_before(record: RunRecord, rows: NDArray[np.intp], timestamps_ns: Sequence[int]) -> list[int]:
+def _latest_indices(record: RunRecord, rows: NDArray[np.intp], timestamps_ns: Sequence[int]) -> list[int]:
+    """Return for each row the index of the last timestamp before it, or -1."""
     timestamps_s = np.array(timestamps_ns) * 1e-9
-    return (np.searchsorted(timestamps_s, record.time_s[rows] + SAME_TICK_S, side="right") - 1).tolist()
+    after = np.searchsorted(timestamps_s, record.time_s[rows] + SAME_TICK_S, side="right")
+    return (after - 1).tolist()
 
 
-def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[MessageT]) -> list[MessageT | None]:
-    """What was said last before each row, unless that is long ago."""
-    before = _last_before(record, rows, [one.timestamp_ns for one in messages])
-    newest = [messages[i] if i >= 0 else None for i in before]
-    times_s = record.time_s[rows].tolist()
-    return [
-        one if one is not None and time_s - one.timestamp_ns * 1e-9 < SHOWN_FOR_S else None
-        for one, time_s in zip(newest, times_s, strict=True)
-    ]
+def _latest_messages(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[MessageT]) -> list[MessageT | None]:
+    """Return for each row the last message before it, or None if that is older than SHOWN_FOR_S."""
+    indices = _latest_indices(record, rows, [message.timestamp_ns for message in messages])
+    latest: list[MessageT | None] = []
+    for index, time_s in zip(indices, record.time_s[rows].tolist(), strict=True):
+        message = messages[index] if index >= 0 else None
+        if message is not None and time_s - message.timestamp_ns * 1e-9 < SHOWN_FOR_S:
+            latest.append(message)
+        else:
+            latest.append(None)
+    return latest
 
 
-def _units_per_n(states: Sequence[ControlState | None], worlds: Sequence[World | None]) -> float:
-    balances = [balance for state in states if state is not None and (balance := balance_of(state)) is not None]
-    sizes = [size for balance in balances for size in (*balance.size_n, float(np.hypot(*balance.resultant_n)))]
-    felt = [math.hypot(*contact.force_w[:2]) for world in worlds if world is not None for contact in world.contacts]
-    usual = float(np.quantile(sizes or felt or [0.0], USUAL_SHARE))
-    return LONGEST_ARROW / usual if usual > 0 else 0.0
+def _force_scale(states: Sequence[ControlState | None], worlds: Sequence[World | None]) -> float:
+    """Return units of the drawing per newton, at which most forces fit: solved ones, else measured ones."""
+    solved_n: list[float] = []
+    for state in states:
+        balance = balance_of(state) if state is not None else None
+        if balance is not None:
+            solved_n += [*balance.size_n, float(np.hypot(*balance.resultant_n))]
+    measured_n = [math.hypot(*contact.force_w[:2]) for world in worlds for contact in _contacts(world)]
+    usual_n = float(np.quantile(solved_n or measured_n or [0.0], FULL_SIZE_QUANTILE))
+    return LONGEST_ARROW / usual_n if usual_n > 0 else 0.0
 
 
-def _solved(view: View, state: ControlState | None, world: World | None, units: float) -> tuple[list[float], list[str]]:
-    """The solved forces, and last their resultant: four numbers each, from where to where; and how each is drawn."""
+def _desired_arrows(
+    view: View, state: ControlState | None, world: World | None, units_per_n: float
+) -> tuple[list[float], list[str]]:
+    """Return the arrows of the solved forces and last of their resultant, and the CSS classes of each."""
     balance = balance_of(state) if state is not None else None
     if balance is None:
         return [], []
     feet = [view.at(contact.position_w) for contact in balance.contacts]
-    pairs = list(zip([*feet, feet[0]], [*balance.contact_n, balance.resultant_n], strict=True))
-    return _arrows(view, pairs, units), balance.kinds(_contacts(world))
+    forces = list(zip(feet, balance.contact_n, strict=True))
+    forces.append((feet[0], balance.resultant_n))
+    contact_classes, resultant_class = balance.force_classes(_contacts(world))
+    return _arrows(view, forces, units_per_n), [*contact_classes, resultant_class]
+
+
+def _measured_arrows(view: View, world: World | None, units_per_n: float) -> list[float]:
+    forces = [(view.at(contact.position_w), np.array(contact.force_w[:2])) for contact in _contacts(world)]
+    return _arrows(view, forces, units_per_n)
 
 
 def _contacts(world: World | None) -> list[WorldContact]:
     return world.contacts if world is not None else []
 
 
-def _arrows(view: View, forces: list[tuple[Point, Floats]], units: float) -> list[float]:
-    """From where to where each arrow goes. Too long a one is cut, so that one impact does not dwarf the rest."""
-    found: list[float] = []
+def _arrows(view: View, forces: list[tuple[Point, Floats]], units_per_n: float) -> list[float]:
+    """Return four numbers for each arrow: from where to where.
+
+    An arrow that is too long is cut, so that one impact does not dwarf the other forces.
+    """
+    numbers: list[float] = []
     for foot, force in forces:
-        cut = min(1.0, FELT_SHARE * LONGEST_ARROW / max(units * math.hypot(*force), 1e-9))
-        found += [*foot, *view.along(foot, force, cut * units)]
-    return [round(part, 1) for part in found]
+        cut = min(1.0, FELT_SHARE * LONGEST_ARROW / max(units_per_n * math.hypot(*force), 1e-9))
+        tip = view.along(foot, force, cut * units_per_n)
+        numbers += [*foot, *tip]
+    return [round(number, 1) for number in numbers]

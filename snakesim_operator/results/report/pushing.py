@@ -8,23 +8,23 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
-from snakesim_operator.results.map_score import MapScore, score
-from snakesim_operator.results.motion import motion_of
+from snakesim_operator.results.metrics.map_score import MapScore, score
+from snakesim_operator.results.metrics.motion import motion_of
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import longest_reason, state_bands
 from snakesim_operator.results.time_axis import end_s, reported_at_s, reported_spans, zero_s
 
-MAX_OBSTACLES = 24  # that get a row of their own: those that gave most
-MIN_FORCE_N = 0.5  # a smaller wanted force is none
-STOOD_S = 0.5  # a shorter stop is not worth a line
+MAX_OBSTACLES = 24  # that get a row of their own: those with the largest impulse
+MIN_FORCE_N = 0.5  # a smaller desired force is none
+MIN_STOP_S = 0.5  # a shorter stop is not listed
 MAX_STOPS = 40
-MAPS_SCORED = 60
+MAX_MAPS_SCORED = 60
 
 
 @dataclass(frozen=True)
-class Stop:
-    """It stood still for a while; why: the reason that control reported for longest, or what was measured."""
+class StandingSpan:
+    """A span in which the body stood still. why: the reason that control reported for longest, or what was measured."""
 
     start_s: float
     end_s: float
@@ -32,129 +32,196 @@ class Stop:
 
 
 @dataclass(frozen=True)
+class ForceSample:
+    """The sum of some contact forces at one time."""
+
+    time_s: float  # on the time axis
+    timestamp_ns: int
+    force_w: Floats  # (2,)
+
+
+@dataclass(frozen=True)
+class ForceSpan:
+    """A span in which the controller wanted to push off one obstacle."""
+
+    start_s: float
+    end_s: float
+    force_n: float
+
+
+@dataclass(frozen=True)
 class Pushing:
-    """What stands in the section."""
+    """The content of the section."""
 
     forces: Figure
     obstacles: Figure
-    stops: list[Stop]  # the longest, in order of time
+    stops: list[StandingSpan]  # the longest, in order of time
     shorter: int  # stops that are left out
     score: MapScore | None  # of the map that guidance perceived; None when it was known
-    position_mm: tuple[float, float]  # of the perceived obstacles: median, and below which 90 % are
+    position_mm: tuple[float, float]  # errors of the perceived obstacles: median, and below which 90 % are
     map_errors: Figure | None
 
 
 def pushing(record: RunRecord) -> Pushing | None:
-    """None for a controller that reports no push-points, or one joint that pushes: that has sections of its own."""
+    """Return the section, or None if the controller reported no push-points, or one propulsion joint at a time.
+
+    A propulsion joint has sections of its own.
+    """
     states = [state for state in record.control if state.push_points]
-    if not states or any(state.propulsion_joint is not None for state in states) or not len(record.time_s):
+    has_propulsion_joint = any(state.propulsion_joint is not None for state in states)
+    if not states or has_propulsion_joint or not len(record.time_s):
         return None
-    stops = _stops(record)
-    longest = sorted(stops, key=lambda one: one.start_s - one.end_s)[:MAX_STOPS]
-    total, errors = _scored(record)
-    off_mm = [1e3 * off for off in total.position_m] if total is not None else []
+    stops = _find_stops(record)
+    longest = sorted(stops, key=lambda stop: stop.start_s - stop.end_s)[:MAX_STOPS]
+    score, map_errors = _score_maps(record)
     return Pushing(
-        _forces(record),
-        _obstacles(record),
-        sorted(longest, key=lambda one: one.start_s),
-        len(stops) - len(longest),
-        total,
-        (float(np.percentile(off_mm, 50)), float(np.percentile(off_mm, 90))) if off_mm else (math.nan, math.nan),
-        errors,
+        forces=_force_chart(record),
+        obstacles=_obstacle_chart(record),
+        stops=sorted(longest, key=lambda stop: stop.start_s),
+        shorter=len(stops) - len(longest),
+        score=score,
+        position_mm=_position_errors_mm(score),
+        map_errors=map_errors,
     )
 
 
-def _forces(record: RunRecord) -> Figure:
-    """Wanted and measured contact forces in the direction from tail to head, and the drag that they work against."""
-    wanted = [(reported_at_s(record, one), one.timestamp_ns, _sum_w(one.push_points)) for one in record.control]
-    felt = [(one.timestamp_ns * 1e-9 - zero_s(record), one.timestamp_ns, _sum_w(one.contacts)) for one in record.worlds]
+def _position_errors_mm(score: MapScore | None) -> tuple[float, float]:
+    """Return the median and the 90th percentile; NaN without any perceived obstacle."""
+    if score is None or not score.position_m:
+        return math.nan, math.nan
+    errors_mm = [1e3 * error_m for error_m in score.position_m]
+    return float(np.percentile(errors_mm, 50)), float(np.percentile(errors_mm, 90))
+
+
+def _force_chart(record: RunRecord) -> Figure:
+    """Draw desired and measured contact forces in the direction from tail to head, and the drag that they overcome."""
+    desired: list[ForceSample] = []
+    for state in record.control:
+        desired.append(ForceSample(reported_at_s(record, state), state.timestamp_ns, _sum_forces(state.push_points)))
+    measured: list[ForceSample] = []
+    for world in record.worlds:
+        time_s = world.timestamp_ns * 1e-9 - zero_s(record)
+        measured.append(ForceSample(time_s, world.timestamp_ns, _sum_forces(world.contacts)))
     drawn = [
-        Line("wanted of all push-points", np.array([t for t, _, _ in wanted]), _ahead_n(record, wanted), "--reference"),
-        Line("measured contacts", np.array([t for t, _, _ in felt]), _ahead_n(record, felt), "--measured"),
+        Line("wanted of all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
+        Line("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
     ]
     weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)
     drag_n = record.config.scene.ground.friction * weight_n
-    words = "Contact forces along the body over time"
-    return lines(words, "force, N", drawn, end_s(record), levels=[(drag_n, "friction of the ground")])
+    label = "Contact forces along the body over time"
+    return lines(label, "force, N", drawn, end_s(record), levels=[(drag_n, "friction of the ground")])
 
 
-def _ahead_n(record: RunRecord, forces: list[tuple[float, int, Floats]]) -> Floats:
-    """The part of each force in the direction from tail to head at its time; NaN when the pose is unknown."""
-    found = np.full(len(forces), np.nan)
-    for i, (_, timestamp_ns, force_w) in enumerate(forces):
-        nodes = record.nodes_w(record.row_at(timestamp_ns * 1e-9))
+def _times_s(samples: list[ForceSample]) -> Floats:
+    return np.array([sample.time_s for sample in samples])
+
+
+def _forward_forces_n(record: RunRecord, samples: list[ForceSample]) -> Floats:
+    """Return the part of each force in the direction from tail to head at its time; NaN if the pose is unknown."""
+    forward_n = np.full(len(samples), np.nan)
+    for i, sample in enumerate(samples):
+        nodes = record.nodes_w(record.row_at(sample.timestamp_ns * 1e-9))
         if nodes is not None:
-            ahead = nodes[-1, :2] - nodes[0, :2]
-            found[i] = float(force_w @ ahead) / max(float(np.hypot(*ahead)), 1e-9)
-    return found
+            tail_to_head = nodes[-1, :2] - nodes[0, :2]
+            forward_n[i] = float(sample.force_w @ tail_to_head) / max(float(np.hypot(*tail_to_head)), 1e-9)
+    return forward_n
 
 
-def _sum_w(contacts: list[WorldContact]) -> Floats:
-    return np.sum([one.force_w[:2] for one in contacts], axis=0) if contacts else np.zeros(2)
+def _sum_forces(contacts: list[WorldContact]) -> Floats:
+    if not contacts:
+        return np.zeros(2)
+    return np.sum([contact.force_w[:2] for contact in contacts], axis=0)
 
 
-def _obstacles(record: RunRecord) -> Figure:
-    """A row for each obstacle that was pushed off, in the order of their first use."""
-    spans: dict[str, list[tuple[float, float, float]]] = {}
-    for since, until, state in reported_spans(record):
-        for contact in state.push_points:
-            force_n = math.hypot(*contact.force_w[:2])
-            if force_n >= MIN_FORCE_N and until > since:
-                spans.setdefault(contact.obstacle or "unnamed", []).append((since, until, force_n))
-    impulse = {name: sum((b - a) * force for a, b, force in found) for name, found in spans.items()}
-    shown = sorted(sorted(spans, key=lambda name: -impulse[name])[:MAX_OBSTACLES], key=lambda name: spans[name][0])
+def _obstacle_chart(record: RunRecord) -> Figure:
+    """Draw a row for each obstacle that the controller pushed off, in the order of their first use."""
+    spans = _spans_by_obstacle(record)
+    impulse_n_s = {
+        name: sum((span.end_s - span.start_s) * span.force_n for span in of_obstacle)
+        for name, of_obstacle in spans.items()
+    }
+    strongest = sorted(spans, key=lambda name: -impulse_n_s[name])[:MAX_OBSTACLES]
+    shown = sorted(strongest, key=lambda name: _sort_key(spans[name][0]))
     drawn: list[Bar] = []
     for name in shown:
-        for since, until, most in _merged(spans[name]):
-            drawn.append(Bar(name, since, until, f"{most:.0f} N", "--reference"))
+        for span in _merge_adjacent(spans[name]):
+            drawn.append(Bar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference"))
     return bars("Obstacles pushed off over time", shown, drawn, end_s(record))
 
 
-def _merged(spans: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """Spans that touch become one, with the largest force."""
-    found: list[tuple[float, float, float]] = []
-    for since, until, force in spans:
-        if found and since <= found[-1][1] + 1e-6:
-            found[-1] = (found[-1][0], until, max(found[-1][2], force))
+def _spans_by_obstacle(record: RunRecord) -> dict[str, list[ForceSpan]]:
+    spans: dict[str, list[ForceSpan]] = {}
+    for start_s, until_s, state in reported_spans(record):
+        for contact in state.push_points:
+            force_n = math.hypot(*contact.force_w[:2])
+            if force_n >= MIN_FORCE_N and until_s > start_s:
+                name = contact.obstacle or "unnamed"
+                spans.setdefault(name, []).append(ForceSpan(start_s, until_s, force_n))
+    return spans
+
+
+def _sort_key(span: ForceSpan) -> tuple[float, float, float]:
+    return span.start_s, span.end_s, span.force_n
+
+
+def _merge_adjacent(spans: list[ForceSpan]) -> list[ForceSpan]:
+    """Merge spans that touch into one with the largest of their forces."""
+    merged: list[ForceSpan] = []
+    for span in spans:
+        if merged and span.start_s <= merged[-1].end_s + 1e-6:
+            last = merged[-1]
+            merged[-1] = ForceSpan(last.start_s, span.end_s, max(last.force_n, span.force_n))
         else:
-            found.append((since, until, force))
-    return found
+            merged.append(span)
+    return merged
 
 
-def _stops(record: RunRecord) -> list[Stop]:
-    """Every time that the body stood still for a while, by the measured motion; without a pose by what was reported."""
+def _find_stops(record: RunRecord) -> list[StandingSpan]:
+    """Return the spans in which the body stood still, as measured; without a pose, as control reported it."""
     motion = motion_of(record)
     if motion is None:
         standing = [band for band in state_bands(record) if band.what == "NotLocomoting"]
     else:
         standing = motion.standing
-    long = [one for one in standing if one.end_s - one.start_s >= STOOD_S]
-    return [Stop(one.start_s, one.end_s, longest_reason(record, one)) for one in long]
+    stops: list[StandingSpan] = []
+    for span in standing:
+        if span.end_s - span.start_s >= MIN_STOP_S:
+            stops.append(StandingSpan(span.start_s, span.end_s, longest_reason(record, span)))
+    return stops
 
 
-def _scored(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
-    """The perceived map within a metre of the head, held against the truth; as a whole and over time."""
+def _score_maps(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
+    """Compare the perceived maps, within a meter of the head, with the truth: in total, and over time."""
     truth = [placed.obstacle for placed in record.placed if not placed.walkable]
     if record.config.mission.map != "perceived" or not truth:
         return None, None
-    total, time_s = MapScore(), list[float]()
-    counts: list[tuple[float, int, int]] = []
-    for world in record.worlds[:: max(len(record.worlds) // MAPS_SCORED, 1)]:
+    total = MapScore()
+    times_s: list[float] = []
+    median_errors_mm: list[float] = []
+    misses: list[float] = []
+    ghosts: list[float] = []
+    step = max(len(record.worlds) // MAX_MAPS_SCORED, 1)
+    for world in record.worlds[::step]:
         nodes = record.nodes_w(record.row_at(world.timestamp_ns * 1e-9))
         if nodes is None:
             continue
         x, y = nodes[-1, :2] - nodes[-2, :2]
-        one = score(world.obstacles, truth, nodes[-1], math.atan2(y, x))
-        total.add(one)
-        time_s.append(world.timestamp_ns * 1e-9 - zero_s(record))
-        counts.append((1e3 * float(np.median(one.position_m)) if one.position_m else math.nan, one.misses, one.ghosts))
-    if not counts:
+        map_score = score(world.obstacles, truth, nodes[-1], math.atan2(y, x))
+        total.add(map_score)
+        times_s.append(world.timestamp_ns * 1e-9 - zero_s(record))
+        if map_score.position_m:
+            median_errors_mm.append(1e3 * float(np.median(map_score.position_m)))
+        else:
+            median_errors_mm.append(math.nan)
+        misses.append(map_score.misses)
+        ghosts.append(map_score.ghosts)
+    if not times_s:
         return None, None
-    off_mm, misses, ghosts = np.array(counts, dtype=np.float64).T
+    time_s = np.array(times_s)
     drawn = [
-        Line("position error, median, mm", np.array(time_s), off_mm, "--measured"),
-        Line("missed", np.array(time_s), misses, "--bad", shape="hv"),
-        Line("ghosts", np.array(time_s), ghosts, "--commanded", shape="hv"),
+        Line("position error, median, mm", time_s, np.array(median_errors_mm), "--measured"),
+        Line("missed", time_s, np.array(misses, dtype=np.float64), "--bad", shape="hv"),
+        Line("ghosts", time_s, np.array(ghosts, dtype=np.float64), "--commanded", shape="hv"),
     ]
     label = "Map against truth over time"
     return total, lines(label, "mm, or how many", drawn, end_s(record), height=190, from_zero=True)

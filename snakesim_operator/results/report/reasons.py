@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.results.force_tracking import EMPTY_N, Pair, pairs
+from snakesim_operator.results.metrics.force_tracking import EMPTY_N, Pair, pairs
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.summary import SATURATED_FROM, RunSummary
@@ -18,45 +18,57 @@ TOUCHING_M = 0.0005  # a smaller gap is a touch: the body's outline is that of i
 
 
 def why_empty(record: RunRecord) -> str:
-    """Push-points that carried nothing: whether an obstacle stands there, and the body was at it."""
+    """Return why push-points carried nothing: whether an obstacle stands there, and whether the body touched it."""
     empty = [pair for pair in pairs(record.control) if pair.measured_force_n < EMPTY_N]
-    at_w = {
-        (state.timestamp_ns, point.obstacle): np.array(point.position_w[:2])
-        for state in record.control
-        for point in state.push_points
-    }
-    outlines = [_outline(one.obstacle) for one in record.placed]
-    gaps = (
-        [_gap_m(record, pair, at_w[pair.timestamp_ns, pair.obstacle], outlines) for pair in empty] if outlines else []
-    )
-    known = [gap for gap in gaps if gap is not None]
-    if not known:
+    gaps_m = _gaps_at(record, empty)
+    if not gaps_m:
         return UNKNOWN
-    off = [gap for gap in known if TOUCHING_M < gap < np.inf]
-    nowhere, every = known.count(np.inf), len(known)
-    touched = every - nowhere - len(off)
-    said = [f"no obstacle stood within {NEAR_M:g} m of {_share(nowhere, every)} of them"] if nowhere else []
-    if off:
-        by_mm = 1e3 * float(np.median(off))
-        said.append(f"the body was off the obstacle in {_share(len(off), every)} of them, by {by_mm:.1f} mm (median)")
-    if touched:
-        said.append(f"it touched in {_share(touched, every)} of them")
+    total = len(gaps_m)
+    without_obstacle = gaps_m.count(np.inf)
+    apart_m = [gap_m for gap_m in gaps_m if TOUCHING_M < gap_m < np.inf]
+    touching = total - without_obstacle - len(apart_m)
+    words: list[str] = []
+    if without_obstacle:
+        words.append(f"no obstacle stood within {NEAR_M:g} m of {_percent(without_obstacle, total)} of them")
+    if apart_m:
+        median_mm = 1e3 * float(np.median(apart_m))
+        share = _percent(len(apart_m), total)
+        words.append(f"the body was off the obstacle in {share} of them, by {median_mm:.1f} mm (median)")
+    if touching:
+        words.append(f"it touched in {_percent(touching, total)} of them")
     name, count = Counter(pair.obstacle for pair in empty).most_common(1)[0]
-    return f"{'; '.join(said)}; most often {name}, {count} of {len(empty)}"
+    return f"{'; '.join(words)}; most often {name}, {count} of {len(empty)}"
+
+
+def _gaps_at(record: RunRecord, empty: Sequence[Pair]) -> list[float]:
+    """Return the known gaps between the body and the obstacle at some push-points; infinite: no obstacle is near."""
+    outlines = [_outline(item.obstacle) for item in record.placed]
+    if not outlines:
+        return []
+    places_w: dict[tuple[int, str | None], Floats] = {}
+    for state in record.control:
+        for point in state.push_points:
+            places_w[state.timestamp_ns, point.obstacle] = np.array(point.position_w[:2])
+    gaps_m: list[float] = []
+    for pair in empty:
+        gap_m = _gap_m(record, pair, places_w[pair.timestamp_ns, pair.obstacle], outlines)
+        if gap_m is not None:
+            gaps_m.append(gap_m)
+    return gaps_m
 
 
 def why_at_limit(record: RunRecord) -> str:
-    """Ticks with a joint at its torque limit: which joint."""
+    """Return which joint was at its torque limit most often."""
     limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
     ticks = (np.abs(record.torque_nm) >= SATURATED_FROM * limits).sum(axis=0)
     if not ticks.any():
         return UNKNOWN
     joint = int(ticks.argmax())
-    return f"most often {record.description.joints[joint].name}, in {_share(int(ticks[joint]), len(record.time_s))}"
+    return f"most often {record.description.joints[joint].name}, in {_percent(int(ticks[joint]), len(record.time_s))}"
 
 
 def why_late(summary: RunSummary) -> str:
-    """Ticks without a command in time: how long commands took, against a tick."""
+    """Return how long commands took, compared with a tick."""
     slow_us = summary.state_to_command_us.get("p99")
     if slow_us is None:
         return UNKNOWN
@@ -65,32 +77,44 @@ def why_late(summary: RunSummary) -> str:
 
 
 def why_refused(summary: RunSummary) -> str:
-    """Commands that were refused: the limiter's own words."""
+    """Return the reasons for which the limiter refused commands."""
     return ", ".join(f"{why} {count}" for why, count in sorted(summary.rejected_commands.items()) if count)
 
 
-def _gap_m(record: RunRecord, pair: Pair, at_w: Floats, outlines: Sequence[Floats]) -> float | None:
-    """From above, between the body and the obstacle at a push-point; infinite: none is near; None: no pose."""
+def _gap_m(record: RunRecord, pair: Pair, place_w: Floats, outlines: Sequence[Floats]) -> float | None:
+    """Return the gap between the body and the obstacle at a push-point, seen from above.
+
+    Args:
+        record: The run.
+        pair: The push-point at one moment.
+        place_w: (2,) its place.
+        outlines: The obstacles, each as points (n, 2).
+
+    Returns:
+        The gap in m; infinite: no obstacle is near; None: the pose is unknown.
+    """
     nodes_w = record.nodes_w(record.row_at(pair.timestamp_ns * 1e-9)) if len(record.time_s) else None
     if nodes_w is None:
         return None
-    near_m, outline = min(((float(np.hypot(*(one - at_w).T).min()), one) for one in outlines), key=lambda two: two[0])
-    if near_m > NEAR_M:
+    distances_m = [float(np.hypot(*(outline - place_w).T).min()) for outline in outlines]
+    nearest = int(np.argmin(distances_m))
+    if distances_m[nearest] > NEAR_M:
         return np.inf
     nodes = nodes_w[:, :2]
-    along = np.diff(nodes, axis=0)
-    to = outline[:, None] - nodes[:-1]
-    share = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    links = np.diff(nodes, axis=0)
+    from_nodes = outlines[nearest][:, None] - nodes[:-1]  # (points, links, 2)
+    fraction = np.clip((from_nodes * links).sum(axis=2) / (links**2).sum(axis=1), 0.0, 1.0)
     radii_m = np.array([link.radius_m for link in record.description.links])
-    return float((np.linalg.norm(to - share[..., None] * along, axis=2) - radii_m).min())
+    axis_distances_m = np.linalg.norm(from_nodes - fraction[..., None] * links, axis=2)
+    return float((axis_distances_m - radii_m).min())
 
 
 def _outline(obstacle: Obstacle) -> Floats:
-    """Points around it, a box's edges too, (n, 2)."""
+    """Return points around an obstacle, also on the edges of a box, (n, 2)."""
     corners = outline_w(obstacle)
-    after = np.roll(corners, -1, axis=0)
-    return np.concatenate([corners + part * (after - corners) for part in np.arange(0.0, 1.0, 0.1)])
+    next_corners = np.roll(corners, -1, axis=0)
+    return np.concatenate([corners + part * (next_corners - corners) for part in np.arange(0.0, 1.0, 0.1)])
 
 
-def _share(part: int, whole: int) -> str:
+def _percent(part: int, whole: int) -> str:
     return f"{100 * part / whole:.0f} %"

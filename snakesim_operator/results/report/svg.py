@@ -13,7 +13,11 @@ Attribute = str | float | int | None
 
 
 def number(value: float) -> str:
-    """A coordinate, to a tenth of a unit. Raises ValueError when it is not finite: a browser would draw nothing."""
+    """Return a coordinate as text, to a tenth of a unit.
+
+    Raises:
+        ValueError: It is not finite, so that a browser would draw nothing.
+    """
     if not math.isfinite(value):
         raise ValueError(f"a coordinate of a figure is {value}; leave the element out instead")
     text = f"{value:.1f}"
@@ -21,7 +25,10 @@ def number(value: float) -> str:
 
 
 def element(name: str, *children: str, **attributes: Attribute) -> str:
-    """An element around children that are markup already. `class_` is class, `stroke_width` is stroke-width."""
+    """Return an element around children that are markup already.
+
+    An attribute `class_` becomes class, `stroke_width` becomes stroke-width. None is left out.
+    """
     parts = [name]
     for key, value in attributes.items():
         if value is None:
@@ -33,7 +40,7 @@ def element(name: str, *children: str, **attributes: Attribute) -> str:
 
 
 def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start") -> str:
-    """A line of text. anchor: start, middle or end."""
+    """Return a line of text. anchor: start, middle or end."""
     return element(
         "text",
         escape(printable(words), quote=False),
@@ -45,34 +52,37 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
 
 
 def title(words: str) -> str:
-    """What a browser shows when the pointer rests on the element around it."""
+    """Return the tooltip of the element around it."""
     return element("title", escape(printable(words), quote=False))
 
 
 def line(a: Point, b: Point, class_: str) -> str:
-    """A straight line."""
+    """Return a straight line."""
     return element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_)
 
 
 def points_text(points: list[Point]) -> str:
-    """Points as the `points` attribute wants them."""
+    """Return points as the value of a `points` attribute."""
     return " ".join(f"{number(x)},{number(y)}" for x, y in points)
 
 
 def polyline(points: list[Point], class_: str) -> str:
-    """An open line through points."""
+    """Return an open line through points."""
     return element("polyline", points=points_text(points), class_=class_)
 
 
 def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0) -> str:
-    """A shaft and a filled head. Too short an arrow is a dot."""
-    dx, dy = tip[0] - tail[0], tip[1] - tail[1]
+    """Return an arrow of a shaft and a filled head; a dot if it is too short."""
+    dx = tip[0] - tail[0]
+    dy = tip[1] - tail[1]
     length = math.hypot(dx, dy)
     if length < 1.5:
         return element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head")
-    ux, uy = dx / length, dy / length
+    ux = dx / length
+    uy = dy / length
     size = min(head, length / 1.1)
-    back, wide = (tip[0] - ux * size, tip[1] - uy * size), 0.38 * size
+    back = (tip[0] - ux * size, tip[1] - uy * size)
+    wide = 0.38 * size  # half of the head's width
     corners = [tip, (back[0] - uy * wide, back[1] + ux * wide), (back[0] + uy * wide, back[1] - ux * wide)]
     neck = (tip[0] - ux * size * 0.8, tip[1] - uy * size * 0.8)
     return line(tail, neck, f"{class_} shaft") + element(
@@ -81,7 +91,7 @@ def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0) -> str:
 
 
 def figure(width: float, height: float, label: str, *children: str) -> str:
-    """A whole drawing. label: what it shows, for those who cannot see it."""
+    """Return a whole drawing. label: what it shows, for people who cannot see it."""
     return element(
         "svg",
         *children,
@@ -94,17 +104,17 @@ def figure(width: float, height: float, label: str, *children: str) -> str:
 
 
 def text_width(words: str, size: float = 13.0) -> float:
-    """About how wide a text is; generous, for placing labels."""
+    """Estimate the width of a text, rather too wide than too narrow, to place labels."""
     return 0.58 * size * len(words)
 
 
 def round_below(value: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above `value`."""
+    """Return the largest 1, 2 or 5 times a power of ten that is not above `value`."""
     power = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
     return max(factor * power for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
 
 
 def scale_bar(x: float, y: float, length: float, words: str, class_: str = "bar") -> str:
-    """A bar of known length, with its meaning beside it."""
+    """Return a bar of known length, with its meaning beside it."""
     ends = line((x, y - 4), (x, y + 4), class_) + line((x + length, y - 4), (x + length, y + 4), class_)
     return line((x, y), (x + length, y), class_) + ends + text(x + length + 7, y + 4.5, words, "small")

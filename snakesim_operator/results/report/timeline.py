@@ -8,8 +8,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.motion import Motion
-from snakesim_operator.results.propulsion import Propulsion
+from snakesim_operator.results.metrics.motion import Motion
+from snakesim_operator.results.metrics.propulsion import Propulsion
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.summary import arc_position_m
 from snakesim_operator.results.time_axis import Interval, merge_reports, reported_at_s, reported_spans, zero_s
@@ -29,12 +29,12 @@ class Series:
 
 
 def in_words(state: str) -> str:
-    """A state of locomotion, for people."""
+    """Return a state of locomotion in plain words."""
     return STATES.get(state, state)
 
 
 def state_bands(record: RunRecord) -> list[Interval]:
-    """Locomotion states as control reported them; each holds until the next is reported."""
+    """Return the locomotion states that control reported; each holds until the next is reported."""
     return merge_reports(record, [state.state for state in record.control])
 
 
@@ -48,7 +48,7 @@ class Mismatch:
 
 
 def reported_while_moving(record: RunRecord, motion: Motion) -> Mismatch | None:
-    """What control gave as a reason for no motion while the body moved; None when that was short."""
+    """Return what control reported as a reason for no motion while the body moved; None if that was short."""
     lasted_s: dict[str, float] = {}
     since_s: list[float] = []
     for since, until, state in reported_spans(record):
@@ -64,7 +64,7 @@ def reported_while_moving(record: RunRecord, motion: Motion) -> Mismatch | None:
 
 
 def longest_reason(record: RunRecord, span: Interval) -> str:
-    """The reason for standing that control reported for longest within a span; without one, what was measured."""
+    """Return the reason for standing that control reported for longest within a span; else what was measured."""
     lasted_s: dict[str, float] = {}
     for since, until, state in reported_spans(record):
         overlap_s = min(until, span.end_s) - max(since, span.start_s)
@@ -74,27 +74,27 @@ def longest_reason(record: RunRecord, span: Interval) -> str:
 
 
 def jam_bands(record: RunRecord) -> list[Interval]:
-    """When the controller said that the snake was jammed."""
+    """Return when the controller reported that the snake was jammed."""
     bands = merge_reports(record, ["jammed" if state.jammed else None for state in record.control])
     return [band for band in bands if band.what == "jammed"]
 
 
 def joined(intervals: list[Propulsion], gap_s: float) -> list[Propulsion]:
-    """Turns of one joint with less than a gap between them are one: no chart could show them apart."""
-    found: list[Propulsion] = []
-    newest: dict[int, int] = {}
-    for one in intervals:
-        i = newest.get(one.joint)
-        if i is not None and one.start_s - found[i].end_s < gap_s:
-            found[i] = Propulsion(found[i].start_s, one.end_s, one.joint)
+    """Join intervals of one joint with less than a gap between them: a chart could not show them apart."""
+    merged: list[Propulsion] = []
+    newest_index: dict[int, int] = {}  # by joint
+    for interval in intervals:
+        index = newest_index.get(interval.joint)
+        if index is not None and interval.start_s - merged[index].end_s < gap_s:
+            merged[index] = Propulsion(merged[index].start_s, interval.end_s, interval.joint)
         else:
-            newest[one.joint] = len(found)
-            found.append(one)
-    return found
+            newest_index[interval.joint] = len(merged)
+            merged.append(interval)
+    return merged
 
 
 def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
-    """The joints that propelled longest, head to tail as the hand-over goes."""
+    """Return the joints that propelled longest, from head to tail, in which order hand-overs happen."""
     spent: dict[int, float] = {}
     for interval in intervals:
         spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.length_s
@@ -103,7 +103,7 @@ def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
 
 
 def reference_rad(record: RunRecord, joint: int) -> Floats:
-    """Where a joint was meant to be, (n,): its target in position mode, else what the controller said; NaN unknown."""
+    """Return a joint's reference, (n,): its target in position mode, else as the controller reported it."""
     reference = np.full(len(record.time_s), np.nan)
     states = [state for state in record.control if len(state.reference_rad) > joint]
     if states:
@@ -115,15 +115,21 @@ def reference_rad(record: RunRecord, joint: int) -> Floats:
 
 
 def commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
-    """The torque that a joint was given in torque mode, (n,); NaN in every other mode."""
+    """Return the torque that was commanded in torque mode, (n,); NaN in every other mode."""
     return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
 
 
 @lru_cache(maxsize=2)  # the chart and the comparison ask for it
 def distance(record: RunRecord) -> Series | None:
-    """Advance since the first tick: along the route, else of the tail as the controller knew it, else as it flies."""
+    """Return the advance since the first tick.
+
+    It is measured along the route; without a route as the distance of the tail; without a pose as the controller
+    reported it.
+    """
     count = len(record.time_s)
-    rows = np.unique(np.linspace(0, count - 1, min(count, POSE_SAMPLES)).astype(int)) if count else np.array([], int)
+    if not count:
+        return reported_distance(record)
+    rows = np.unique(np.linspace(0, count - 1, min(count, POSE_SAMPLES)).astype(int))
     rows = rows[record.posed[rows]]
     if len(rows) > 1:
         time_s = record.time_s[rows] - zero_s(record)
@@ -137,7 +143,7 @@ def distance(record: RunRecord) -> Series | None:
 
 
 def reported_distance(record: RunRecord) -> Series | None:
-    """Advance of the tail since the controller first reported its place on the path."""
+    """Return the advance of the tail since the controller first reported its place on the path."""
     states = [state for state in record.control if state.path_s_m is not None]
     if len(states) < 2:
         return None

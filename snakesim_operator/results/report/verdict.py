@@ -1,22 +1,39 @@
-"""The result of a run, in one sentence."""
+"""The result of a run in one sentence, and whether it is good or bad news."""
 
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from snakesim_hal.model.checked import CHECK
 from snakesim_hal.model.locomotion import STANDING_STILL
-from snakesim_operator.results.ended import COMPLETE, UNKNOWN
-from snakesim_operator.results.motion import Motion, motion_of
+from snakesim_hal.wire.messages import Fault
+from snakesim_operator.results.metrics.motion import Motion, motion_of
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.purpose import purpose_of
-from snakesim_operator.results.report.timeline import longest_reason, reported_while_moving
+from snakesim_operator.results.report.phrases import (
+    MOVED_M,
+    as_sentence,
+    describe_contradiction,
+    describe_distance,
+    describe_ending,
+    describe_hand_overs,
+    describe_last_control_state,
+    describe_pushed_obstacles,
+    describe_refused_commands,
+    describe_trouble,
+)
+from snakesim_operator.results.report.timeline import longest_reason
+from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 from snakesim_operator.results.time_axis import end_s, reported_at_s
 
-MOVED_M = 0.02  # less than this is no locomotion
-MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
-MIN_PUSH_N = 0.5  # a smaller measured force is no push
-POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
-SHOWN_HANDOVERS = 8
+MIN_STOP_S = 0.5  # a shorter stop at the end is not mentioned
+MAX_STANDING_FRACTION = 0.5  # a run that stood still for more of its time, up to its end, is a poor one
+MOVED_RAD = 1e-3  # a joint whose target changed by less, as by rounding, was not moved
+JUDGING_COMMANDS = {  # controller that does not locomote -> command that judges its run
+    CHECK: "snakesim joints check",
+    "identify": "snakesim identify",
+}
 Kind = Literal["good", "poor", "bad"]
 
 
@@ -28,168 +45,138 @@ class Verdict:
     words: str
 
 
-def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
-    """The run in plain words, and what of it nobody measured."""
-    found = _verdict(record, summary)
-    estimates = "; ".join(estimates_of(summary).in_words())
-    return Verdict(found.kind, f"{found.words} {_sentence(estimates.capitalize())}") if estimates else found
-
-
-def _verdict(record: RunRecord, summary: RunSummary) -> Verdict:
-    if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
-        return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
-    moved = _moved(record, summary)
-    stopping = [fault for fault in summary.faults if fault.reach == "robot"]
-    if stopping:
-        fault = stopping[0]
-        at_s = fault.tick / summary.rate_hz - (float(record.time_s[0]) if len(record.time_s) else 0.0)
-        joint = f" at {fault.joint}" if fault.joint else ""
-        what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
-        said = _control_said(record, at_s)
-        before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
-        return Verdict("bad", f"{what}{said} Before that: {before}.")
-    purpose = purpose_of(record)
-    if purpose is not None:
-        served, words = purpose
-        said = f"{words} Ran for {summary.duration_s:.1f} s; {_trouble(summary)}.{_ending(summary.ended)}"
-        return Verdict("good" if served and summary.ended == COMPLETE else "poor", said)
-    motion = motion_of(record)
-    if motion is None:
-        rest = f"{_handed_over(record, summary)}{_trouble(summary)}.{_ending(summary.ended)}"
-        return Verdict("poor", f"{moved}; {rest}")
-    return _verdict_of_motion(record, summary, motion, moved)
-
-
-def _verdict_of_motion(record: RunRecord, summary: RunSummary, motion: Motion, moved: str) -> Verdict:
-    """Of a run without a fault, whose pose is known: by the measured motion, and beside it what control reported."""
-    trouble = _trouble(summary)
-    ending = _ending(summary.ended)
-    handed_over = _handed_over(record, summary) or _pushed_off(record)
-    if _did_not_locomote(summary):
-        kind = "Jammed" if summary.jammed else "Did not locomote"
-        came_back = summary.last_state == "Locomoting"
-        why = "it ended less than 2 cm from where it began" if came_back else summary.last_reason or STANDING_STILL
-        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {trouble}.{ending}")
-    stop = stop_of(record, motion)
-    stood = 1.0 - motion.moving_fraction
-    if stop is not None and not stop.on_purpose and (summary.jammed or stood > POOR_SHARE):
-        kind = "Jammed" if summary.jammed else "Stopped"
-        said = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why.removeprefix('jammed: ')}"
-        return Verdict("poor", f"{said} {moved}; {handed_over}{trouble}.{ending}")
-    jam = "it jammed on the way; " if summary.jammed else ""
-    until_end = ", and was still moving at the end" if stop is None and not ending else ""
-    stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
-    contradiction = _reported_while_moving(record, motion)
-    backward = (summary.path_distance_m or 0.0) < 0
-    is_poor = bool(ending) or backward or distance_m(summary) is None
-    good: Kind = "poor" if is_poor else "good"
-    return Verdict(good, f"{moved}{until_end}; {handed_over}{jam}{trouble}.{stopped}{contradiction}{ending}")
-
-
-def _did_not_locomote(summary: RunSummary) -> bool:
-    """Whether it never moved, or only to and fro by next to nothing."""
-    if summary.locomoting_fraction == 0:
-        return True
-    distances = [abs(one) for one in (summary.path_distance_m, summary.net_displacement_m) if one is not None]
-    return bool(distances) and max(distances) < MOVED_M
-
-
-def _reported_while_moving(record: RunRecord, motion: Motion) -> str:
-    """What control reported of standing while the body moved, as its report."""
-    found = reported_while_moving(record, motion)
-    if found is None:
-        return ""
-    reason = found.reason.strip().rstrip(".;")
-    return f' For {found.lasted_s:.1f} s of its motion control reported "{reason}".'
-
-
-def _pushed_off(record: RunRecord) -> str:
-    """How many obstacles it pushed off, of those that its controller chose and where a contact was measured."""
-    obstacles: set[str] = set()
-    for state in record.control:
-        for point, measured_n in zip(state.push_points, state.measured_force_n, strict=False):
-            if point.obstacle is not None and measured_n is not None and measured_n >= MIN_PUSH_N:
-                obstacles.add(point.obstacle)
-    if not obstacles:
-        return ""
-    return f"pushed off {len(obstacles)} {'obstacle' if len(obstacles) == 1 else 'obstacles'}; "
-
-
-def _ending(ended: str) -> str:
-    if ended == COMPLETE:
-        return ""
-    if ended.startswith(UNKNOWN):
-        return f" How the run ended is not known: {_sentence(ended.removeprefix(UNKNOWN))}"
-    return f" The run ended early: {_sentence(ended)}"
-
-
-def _trouble(summary: RunSummary) -> str:
-    """What went wrong, and stopped nothing: joints lost, other faults, commands refused."""
-    lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint and fault.reach == "joint"))
-    others = [fault for fault in summary.faults if fault.reach == "none"]
-    said = [f"went on without {', '.join(lost)}"] if lost else []
-    if others:
-        said.append(f"{'a fault' if len(others) == 1 else f'{len(others)} faults'} ({_sentence(others[0].cause)[:-1]})")
-    return ", ".join([*(said or ["no fault"]), *_refused(summary)])
-
-
-def _refused(summary: RunSummary) -> list[str]:
-    reasons = {reason: count for reason, count in summary.rejected_commands.items() if count}
-    count = sum(reasons.values())
-    return [f"{count} {'command' if count == 1 else 'commands'} refused ({', '.join(reasons)})"] if reasons else []
-
-
-def _moved(record: RunRecord, summary: RunSummary) -> str:
-    duration = f"in {summary.duration_s:.1f} s"
-    if summary.path_distance_m is not None:
-        back = " backward" if summary.path_distance_m <= -MOVED_M else ""
-        return f"Moved {abs(summary.path_distance_m):.2f} m{back} along the path {duration}"
-    if summary.net_displacement_m is not None:
-        return f"Moved {summary.net_displacement_m:.2f} m {duration}"
-    blind = ", because the robot has no pose sensor" if record.config.robot.sensors.pose is None else ""
-    return f"Ran for {summary.duration_s:.1f} s; the distance is unknown{blind}"
-
-
-def _handed_over(record: RunRecord, summary: RunSummary) -> str:
-    names = summary.propulsion_joints
-    if not names:
-        return ""
-    if len(names) == 1:
-        return f"{names[0]} propelled throughout; "
-    if len(names) <= SHOWN_HANDOVERS:
-        return f"propulsion handed over {' → '.join(names)}; "
-    shown = " → ".join([*names[:4], "…", names[-1]])
-    return f"propulsion handed over {summary.hand_overs} times among {len(set(names))} joints ({shown}); "
-
-
-def _control_said(record: RunRecord, at_s: float) -> str:
-    """What control lacked when the robot was stopped: a fault of the lease only shows that no command came."""
-    states = [state for state in record.control if reported_at_s(record, state) <= at_s]
-    return f" Control said: {_sentence(states[-1].reason)}" if states and states[-1].state == "NotLocomoting" else ""
-
-
 @dataclass(frozen=True)
 class Stop:
-    """The end of locomotion, before that of the run."""
+    """The end of locomotion, before the end of the run."""
 
     at_s: float
     why: str
     on_purpose: bool
 
 
-def stop_of(record: RunRecord, motion: Motion) -> Stop | None:
-    """When the body came to rest for the rest of the run, as measured, and why, as far as control reported it.
+def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
+    """Return the result of a run in plain words, and which of its numbers are estimates."""
+    measured = _judge_run(record, summary)
+    estimates = "; ".join(estimates_of(summary).in_words())
+    if not estimates:
+        return measured
+    return Verdict(measured.kind, f"{measured.words} {as_sentence(estimates.capitalize())}")
 
-    None when it moved to the end, or stood for so short a time that it is not worth a word.
+
+def _judge_run(record: RunRecord, summary: RunSummary) -> Verdict:
+    if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
+        return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
+    stopping_faults = [fault for fault in summary.faults if fault.reach == "robot"]
+    if stopping_faults:
+        return _judge_stopped_run(record, summary, stopping_faults[0])
+    command = JUDGING_COMMANDS.get(record.config.controller)
+    if command is not None:
+        return _judge_joint_test(record, summary, command)
+    motion = motion_of(record)
+    if motion is None:
+        moved = describe_distance(record, summary)
+        rest = f"{describe_hand_overs(summary)}{describe_trouble(summary)}.{describe_ending(summary.ended)}"
+        return Verdict("poor", f"{moved}; {rest}")
+    return _judge_motion(record, summary, motion)
+
+
+def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> Verdict:
+    """Judge a run that a fault stopped."""
+    begin_s = float(record.time_s[0]) if len(record.time_s) else 0.0
+    at_s = fault.tick / summary.rate_hz - begin_s
+    joint = f" at {fault.joint}" if fault.joint else ""
+    stopped = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {as_sentence(fault.cause)}"
+    moved = describe_distance(record, summary)
+    before = ", ".join([moved[0].lower() + moved[1:], *describe_refused_commands(summary)])
+    return Verdict("bad", f"{stopped}{describe_last_control_state(record, at_s)} Before that: {before}.")
+
+
+def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> Verdict:
+    """Judge a run that was not meant to locomote: it is good if it moved every joint.
+
+    Args:
+        record: The run.
+        summary: Its numbers.
+        command: The command that judges such a run in detail.
+    """
+    moved_all = False
+    joints = [joint.name for joint in record.description.joints]
+    if not len(record.target):
+        words = "No joint was moved: the robot was never armed."
+    else:
+        deviation_rad = np.abs(record.target - np.nanmedian(record.target, axis=0))
+        max_deviation_rad = np.nanmax(deviation_rad, axis=0)
+        moved = [name for name, way in zip(joints, max_deviation_rad, strict=True) if way > MOVED_RAD]
+        moved_all = len(moved) == len(joints)
+        if moved_all:
+            words = f"Every joint was moved. Judge the run with `{command} {record.folder}`."
+        else:
+            unmoved = ", ".join(name for name in joints if name not in moved)
+            words = f"Not moved: {unmoved}. Run it again with a longer --duration."
+    ending = describe_ending(summary.ended)
+    words = f"{words} Ran for {summary.duration_s:.1f} s; {describe_trouble(summary)}.{ending}"
+    is_good = moved_all and summary.ended == COMPLETE
+    return Verdict("good" if is_good else "poor", words)
+
+
+def _judge_motion(record: RunRecord, summary: RunSummary, motion: Motion) -> Verdict:
+    """Judge a run without a fault whose pose is known, by the measured motion.
+
+    What control reported is added to it.
+    """
+    moved = describe_distance(record, summary)
+    trouble = describe_trouble(summary)
+    ending = describe_ending(summary.ended)
+    if _did_not_locomote(summary):
+        kind = "Jammed" if summary.jammed else "Did not locomote"
+        why = _why_not_locomoted(summary)
+        return Verdict("poor", f"{kind}: {as_sentence(why)} {moved}; {trouble}.{ending}")
+
+    pushed = describe_hand_overs(summary) or describe_pushed_obstacles(record)
+    stop = stop_of(record, motion)
+    standing_fraction = 1.0 - motion.moving_fraction
+    stood_long = summary.jammed or standing_fraction > MAX_STANDING_FRACTION
+    if stop is not None and not stop.on_purpose and stood_long:
+        kind = "Jammed" if summary.jammed else "Stopped"
+        why = stop.why.removeprefix("jammed: ")
+        stopped = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {why}"
+        return Verdict("poor", f"{stopped} {moved}; {pushed}{trouble}.{ending}")
+
+    until_end = ", and was still moving at the end" if stop is None and not ending else ""
+    jam = "it jammed on the way; " if summary.jammed else ""
+    stopped = ""
+    if stop is not None:
+        stopped = f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
+    contradiction = describe_contradiction(record, motion)
+    went_backward = (summary.path_distance_m or 0.0) < 0
+    is_poor = bool(ending) or went_backward or distance_m(summary) is None
+    words = f"{moved}{until_end}; {pushed}{jam}{trouble}.{stopped}{contradiction}{ending}"
+    return Verdict("poor" if is_poor else "good", words)
+
+
+def _did_not_locomote(summary: RunSummary) -> bool:
+    """Return whether the body never moved, or only to and fro within MOVED_M."""
+    if summary.locomoting_fraction == 0:
+        return True
+    measured = (summary.path_distance_m, summary.net_displacement_m)
+    distances = [abs(distance) for distance in measured if distance is not None]
+    return bool(distances) and max(distances) < MOVED_M
+
+
+def _why_not_locomoted(summary: RunSummary) -> str:
+    if summary.last_state == "Locomoting":
+        return "it ended less than 2 cm from where it began"
+    return summary.last_reason or STANDING_STILL
+
+
+def stop_of(record: RunRecord, motion: Motion) -> Stop | None:
+    """Return when the body came to rest for the rest of the run, as measured, and why, as control reported it.
+
+    None if it moved to the end, or stood for less than MIN_STOP_S.
     """
     stop = motion.final_stop
     if stop is None or motion.end_s - stop.start_s < MIN_STOP_S:
         return None
     reported = [state for state in record.control if reported_at_s(record, state) >= stop.start_s]
     on_purpose = bool(reported) and reported[-1].state == "Idle"
-    return Stop(stop.start_s, _sentence(longest_reason(record, stop)), on_purpose)
-
-
-def _sentence(words: str) -> str:
-    words = words.strip().rstrip(".;")
-    return f"{words}." if words else ""
+    return Stop(stop.start_s, as_sentence(longest_reason(record, stop)), on_purpose)

@@ -7,7 +7,7 @@ import pytest
 from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_hal.wire.messages import Contacts, World
-from snakesim_operator.results.map_score import MapScore, moved, score
+from snakesim_operator.results.metrics.map_score import MapScore, moved, score
 from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, random_field
 from tests.unit.gnc.guidance.rendered import cylinder, hills, lidar
 from tests.unit.hal.rig import contact

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import ControlState, WorldContact
-from snakesim_operator.results.force_tracking import force_tracking
+from snakesim_operator.results.metrics.force_tracking import force_tracking
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.summary import summarise
 

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.results.form_closure import contacts_beside, form_closure_margin
+from snakesim_operator.results.metrics.form_closure import contacts_beside, form_closure_margin
 
 
 def margin(contacts: object, length_m: float) -> float:

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.results.map_score import MapScore, moved, score
+from snakesim_operator.results.metrics.map_score import MapScore, moved, score
 
 HEAD = (0.0, 0.0)
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_operator.results.motion import motion_of
+from snakesim_operator.results.metrics.motion import motion_of
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.verdict import verdict
 from snakesim_operator.results.summary import summarise

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.propulsion import propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report.events import drawn_instants, events
+from snakesim_operator.results.report.events import drawn_instants, find_events
 from snakesim_operator.results.report.instants import balanced_instants
 from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
@@ -100,7 +100,7 @@ def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
 
 
 def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page: Reader) -> None:
-    found = events(record, summarise(record, "complete"))
+    found = find_events(record, summarise(record, "complete"))
     assert [one.joint for one in found if one.joint is not None] == list(INTERVALS_S)
     assert found[0].words == "Start" and found[-1].words == "Stop"
     assert sum(one.words.startswith("Largest contact force") for one in found) == 1
@@ -127,7 +127,7 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     figure = r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>'
     polygons = re.findall(figure, page.html)
     lengths = [math.dist(*edge) for svg in polygons for edge in drawn_edges(svg, "commanded")]
-    drawn = drawn_instants(record, events(record, summarise(record, "complete")))
+    drawn = drawn_instants(record, find_events(record, summarise(record, "complete")))
     forces_n = [one.state.propulsion_n for _, one in drawn if one.balance is not None and one.state is not None]
     assert len(lengths) == len(polygons) == len(forces_n) > 2
     assert lengths == pytest.approx([lengths[0] / (forces_n[0] or 0) * (force_n or 0) for force_n in forces_n], abs=0.5)

@@ -14,7 +14,7 @@ from snakesim_hal.model.scenario import Start
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
-from snakesim_operator.results.propulsion import propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.verdict import Verdict, verdict

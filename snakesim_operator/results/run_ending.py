@@ -5,20 +5,24 @@ from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_operator.results.record import RunRecord
 
 COMPLETE = "complete"
-AT_GOAL = "snakesim run, at the goal"  # who asks the host to finish a run that lasts until its goal
-UNKNOWN = "unknown: "  # how a sentence begins that says why nobody knows
+AT_GOAL = "snakesim run, at the goal"  # the requester that finishes a run which lasts until its goal
+UNKNOWN = "unknown: "  # how a sentence begins that explains why the ending is not known
 
 
 def ended(record: RunRecord) -> str:
-    """As far as the record tells."""
-    host, config = record.host, record.config
+    """Return COMPLETE, or a sentence that describes how the run ended, as far as the record shows it."""
+    host = record.host
+    config = record.config
     if not record.alone:
         return ended_early(host, config) or COMPLETE
-    if any(fault.reach == "robot" for fault in host.faults):
-        return next(fault.cause for fault in host.faults if fault.reach == "robot")
-    span_s = float(record.time_s[-1] - record.time_s[0]) + 1 / config.rate_hz if len(record.time_s) else 0.0
-    done = f"after {span_s:.2f} of {config.duration_s:g} s"
-    if span_s > config.duration_s - 0.5 / config.rate_hz:
+    for fault in host.faults:
+        if fault.reach == "robot":
+            return fault.cause
+    recorded_s = 0.0
+    if len(record.time_s):
+        recorded_s = float(record.time_s[-1] - record.time_s[0]) + 1 / config.rate_hz
+    done = f"after {recorded_s:.2f} of {config.duration_s:g} s"
+    if recorded_s > config.duration_s - 0.5 / config.rate_hz:
         return COMPLETE
     if not record.whole:
         return f"{UNKNOWN}the recording breaks off {done}"
@@ -28,7 +32,7 @@ def ended(record: RunRecord) -> str:
 
 
 def ended_early(host: HostRecord, config: RunConfig) -> str:
-    """By what the host wrote; empty when it was complete."""
+    """Return how a run ended that was not complete, by the host's own record; empty if it was complete."""
     done = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
     match host.ended:
         case "complete":

@@ -1,0 +1,330 @@
+"""Reads what a recording holds of a run: a row for each tick, and the outputs of guidance, navigation and control.
+
+The rows have the columns of the black box, made of the messages: joints of `sensor/joints`, setpoints of
+`hal/applied`, pose and contacts as of their newest sample. They begin with the first arming that the recording saw.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.errors import ConfigError, WireError
+from snakesim_hal.run_log.black_box import digest_of, touching
+from snakesim_hal.run_log.host_record import HostRecord
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import (
+    AppliedCommand,
+    Clock,
+    Configuration,
+    ControlState,
+    Description,
+    JointState,
+    Status,
+    Trajectory,
+    World,
+)
+from snakesim_hal.wire.own_sample import OwnKind, own_kinds
+from snakesim_operator.recording.message import RecordedMessage
+from snakesim_operator.results.missing_data import describe_undecodable
+
+if TYPE_CHECKING:
+    from snakesim_operator.recording.reader import RecordingReader
+
+SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
+"""What guidance, navigation and control publish."""
+OUTPUTS = (*SERVICE_STREAMS, keys.OWN_ALL)
+"""What the host's black box does not have."""
+MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
+_TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
+_JOINT_COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm")  # of the messages at keys.JOINTS
+_SETPOINT_COLUMNS = ("target", "torque_limit_nm")  # of the messages at keys.APPLIED
+ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.OWN_ALL, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+
+
+_decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
+
+
+@dataclass
+class Contents:
+    """What was read of one recording."""
+
+    path: Path
+
+    # The last message of each kind.
+    description: Description | None = None
+    config: Configuration | None = None
+    status: Status | None = None
+
+    # Messages of the run.
+    streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_STREAMS})
+    at: dict[str, dict[int, Any]] = field(
+        default_factory=lambda: {key: {} for key in _TICKED}
+    )  # key -> tick -> message
+    own: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
+    armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
+    replay_of: str = ""  # the recording whose sensors these are
+
+    # Missing data.
+    refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
+    lacks: list[str] = field(default_factory=list[str])
+    unreached: list[str] = field(default_factory=list[str])  # what did not reach the recorder
+    ticks: int = 0  # with setpoints as applied
+    ticks_lost: int | None = 0  # of these, as the file itself reports; None: it does not report that
+    last_tick_ns: int | None = None  # robot time of the last of them
+    whole: bool = True  # the file has an end
+
+    def add(self, recorded: RecordedMessage) -> None:
+        """Add one message at a key of ALL, in the order of the file."""
+        if keys.row_key(recorded.key) == keys.OWN_ALL:
+            self.own.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
+            return
+        message_type = keys.message_at(recorded.key)
+        if message_type is None:
+            return
+        try:
+            message = _decoder(message_type).decode(recorded.payload, recorded.encoding)
+            self._keep(recorded.key, message, recorded.wall_ns)
+        except WireError as error:
+            self.refused[f"{recorded.key}: {error}"[:200]] += 1
+
+    def _keep(self, key: str, message: Any, wall_ns: int) -> None:
+        match message:
+            case Description():
+                self.description = message
+            case Configuration():
+                self.config = message
+            case Status():
+                self.status = message
+            case Clock(paused=True):
+                pass  # a paused clock names no tick
+            case World() | Trajectory() | ControlState():
+                if isinstance(message, Trajectory):
+                    self.searched_nodes[message.tick] = message.searched_nodes
+                kept = self.streams[key]
+                if not kept or _is_news(kept[-1], message):
+                    kept.append(message)
+            case _:
+                self.at[key][message.tick] = message
+                if isinstance(message, Clock) and message.arm_session:
+                    self.armed_wall_ns.append(wall_ns)
+
+    def missing(self, ticks: int) -> list[str]:
+        """Describe the ticks that did not reach the recorder: nothing in the file itself shows them.
+
+        Args:
+            ticks: How many ticks the run had, as another source reports.
+        """
+        if self.ticks_lost is None:
+            return []
+        lost = ticks - self.ticks - self.ticks_lost
+        if lost <= 0:
+            return []
+        if self.last_tick_ns is None:
+            last = "none came"
+        else:
+            last = f"the last that came is of {self.last_tick_ns * 1e-9:.2f} s"
+        return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
+
+    def columns(self, robot: Description) -> dict[str, NDArray[Any]]:
+        """Return a row for each tick since the first arming, in columns that are named as in the black box."""
+        rows = self._rows(len(robot.joints))
+        row_count = len(rows)
+        shape = (row_count, len(robot.joints))
+        ticks = np.array([row.tick for row in rows], dtype=np.int64)
+        poses = np.array([row.pose for row in rows]).reshape(row_count, 7)
+        columns: dict[str, NDArray[Any]] = {
+            "tick": ticks,
+            "time_s": ticks * robot.period_ns * 1e-9,
+            "position_w": poses[:, :3],
+            "orientation_wxyz": poses[:, 3:],
+            "contact_peak_n": np.array([row.contact_peak_n for row in rows], dtype=float),
+            "contact_count": np.array([row.contact_count for row in rows], dtype=float),
+            "mode": np.array([row.setpoints.mode for row in rows], dtype=np.int8).reshape(shape),
+        }
+        for name in _JOINT_COLUMNS:
+            columns[name] = np.array([getattr(row.joints, name) for row in rows], dtype=float).reshape(shape)
+        for name in _SETPOINT_COLUMNS:
+            columns[name] = np.array([getattr(row.setpoints, name) for row in rows], dtype=float).reshape(shape)
+        return columns
+
+    def _rows(self, joint_count: int) -> list["_Row"]:
+        """Return the armed ticks of which joints, setpoints and clock are all known."""
+        joints = self.at[keys.JOINTS]
+        applied = self.at[keys.APPLIED]
+        clocks = self.at[keys.CLOCK]
+        poses = self.at[keys.POSE]
+        contacts = self.at[keys.CONTACTS]
+        rows: list[_Row] = []
+        pose = [np.nan] * 7
+        peak_n = 0.0
+        touched = 0
+        for tick in sorted(joints.keys() | poses.keys() | contacts.keys()):
+            if tick in poses:
+                pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
+            if tick in contacts:
+                peak_n, touched = touching(contacts[tick])
+            if tick not in joints or tick not in applied or tick not in clocks:
+                continue
+            state = joints[tick]
+            if clocks[tick].arm_session and state.is_of(joint_count):
+                rows.append(_Row(tick, state, applied[tick], pose, peak_n, touched))
+        return rows
+
+    def own_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Return columns of the custom sensors: at each row the newest sample, and its age.
+
+        They are called `bend_rad.left` and `age_s.left`. NaN: no sample came yet. Counts samples that cannot be
+        decoded in `refused`.
+
+        Args:
+            robot: The robot that has the sensors.
+            time_s: (n,) robot time of each row.
+        """
+        columns: dict[str, NDArray[np.float64]] = {}
+        for key, kind in own_kinds(robot).items():
+            sensor = key.rpartition("/")[2]
+            samples = self._own_samples(key, kind)
+            ticks = np.array(sorted(samples), dtype=np.int64)
+            row = np.searchsorted(ticks * (robot.period_ns * 1e-9), time_s + 1e-9, side="right") - 1
+            in_order = [samples[tick] for tick in ticks.tolist()]
+            names = dict.fromkeys(name for _, numbers in samples.values() for name in numbers) or kind.units
+            for name in names:
+                quantity, dot, part = name.partition(".")
+                values = [numbers.get(name, np.nan) for _, numbers in in_order]
+                columns[f"{quantity}.{sensor}{dot}{part}"] = _values_at(values, row)
+            sampled_at_s = _values_at([timestamp_ns * 1e-9 for timestamp_ns, _ in in_order], row)
+            columns[f"age_s.{sensor}"] = time_s - sampled_at_s
+        return columns
+
+    def _own_samples(self, key: str, kind: OwnKind) -> dict[int, tuple[int, dict[str, float]]]:
+        """Return the samples of a custom sensor: tick -> timestamp in ns, and numbers by name."""
+        decoder = Decoder(kind.message)
+        samples: dict[int, tuple[int, dict[str, float]]] = {}
+        for recorded in self.own.get(key, ()):
+            try:
+                sample = decoder.decode(recorded.payload, recorded.encoding)
+            except WireError as error:
+                self.refused[f"{key}: {error}"[:200]] += 1
+                continue
+            samples[sample.tick] = (sample.timestamp_ns, kind.numbers(sample))
+        return samples
+
+    def host(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
+        """Return the host's statistics, as far as the recording shows them.
+
+        Raises:
+            ConfigError: The recording holds no status of the host.
+        """
+        status = self.status
+        if status is None:
+            why = "; ".join(["", *self.lacks])
+            raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run{why}")
+        armed = {tick for tick, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
+        wall_s = 0.0
+        if self.armed_wall_ns:
+            wall_s = (self.armed_wall_ns[-1] - self.armed_wall_ns[0]) * 1e-9
+        return HostRecord(
+            ticks=len(columns["tick"]),
+            wall_s=wall_s,
+            overruns=status.overruns,
+            answered_ticks=len(armed & self.at[keys.JOINT_COMMAND].keys()),
+            armed_ticks=len(armed),
+            command_digest=digest_of(columns),
+            state_to_command_us={"p50": None, "p99": None},
+            tick_times=status.tick_times,
+            rejected_commands=status.commands_rejected,
+            limited_commands=status.commands_limited,
+            faults=status.faults,
+            faults_left_out=status.faults_left_out,
+            lifecycle=status.lifecycle,
+            why=status.why,
+            ended="finished",
+            ended_why="as far as it was recorded",
+            isolated=status.isolated,
+        )
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One tick of a run. Pose and contacts are as of their newest sample."""
+
+    tick: int
+    joints: JointState
+    setpoints: AppliedCommand
+    pose: list[float]  # position in m, then orientation wxyz
+    contact_peak_n: float
+    contact_count: int
+
+
+def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the value of each index, (n,); NaN for a negative index."""
+    picked = np.full(len(index), np.nan)
+    known = index >= 0
+    picked[known] = np.array(values, dtype=float)[index[known]]
+    return picked
+
+
+def read_recording(
+    path: Path, wanted: Collection[str] = ALL, hear: Callable[[RecordedMessage], None] | None = None
+) -> Contents:
+    """Read a recording's messages at some keys.
+
+    Args:
+        path: The recording.
+        wanted: The keys.
+        hear: Called with every message, at any key, so that the file need not be read again.
+
+    Raises:
+        ConfigError: The file is no recording.
+    """
+    from snakesim_operator.recording.reader import RecordingReader  # needs the extra `record`
+
+    contents = Contents(path)
+    reader = RecordingReader(path)
+    read_keys = {*wanted, keys.APPLIED} if hear is None else None
+    for recorded in reader.messages(read_keys):
+        if recorded.key == keys.APPLIED:
+            contents.ticks += 1
+            contents.last_tick_ns = recorded.time_ns
+        if hear is not None:
+            hear(recorded)
+        if recorded.key in wanted or keys.row_key(recorded.key) in wanted:
+            contents.add(recorded)
+    contents.lacks += describe_undecodable(contents.refused)
+    contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
+    contents.whole = reader.finished
+    contents.ticks_lost = _count_lost_ticks(reader)
+    contents.replay_of = str(reader.about.get("replay_of", ""))[:500]
+    if reader.losses.misplaced:
+        for messages in contents.streams.values():
+            messages.sort(key=lambda message: message.timestamp_ns or 0)
+    return contents
+
+
+def _count_lost_ticks(reader: "RecordingReader") -> int | None:
+    """Return how many ticks the file itself reports as lost, or None if it cannot report that."""
+    losses = reader.losses
+    chosen_keys = reader.about.get("keys")  # of a recording that was to have these alone
+    leaves_ticks_out = isinstance(chosen_keys, list) and keys.APPLIED not in chosen_keys
+    if not reader.finished or losses.places or leaves_ticks_out:
+        return None
+    return losses.lost[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
+
+
+def _is_news(before: Any, message: Any) -> bool:
+    """Return whether a message is kept: worlds are thinned, and a path is kept once."""
+    match message:
+        case World():
+            return message.timestamp_ns >= before.timestamp_ns + round(1e9 / MAX_WORLDS_PER_S)
+        case Trajectory():
+            return message.path_id != before.path_id
+        case _:
+            return True
