@@ -47,7 +47,7 @@ class ContactReader:
         )
 
     def _feel(self) -> None:
-        self._felt.add(self._touches.sizes_n())
+        self._felt.add(self._touches.sum_forces_n())
 
     def _in_link(self, touch: Touch) -> Contact:
         rotation = self._rotations[touch.link].tolist()  # world_from_link, row by row

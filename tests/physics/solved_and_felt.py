@@ -66,8 +66,8 @@ def recorded() -> Iterator[list[dict[str, float]]]:
     def felt(self: ContactReader) -> None:
         touches = self._touches  # pyright: ignore[reportPrivateUsage]
         found: dict[str, float] = {}
-        names = touches._obstacles  # pyright: ignore[reportPrivateUsage]
-        for pair, force_n in touches.sizes_n().items():
+        names = touches._obstacle_of_geom  # pyright: ignore[reportPrivateUsage]
+        for pair, force_n in touches.sum_forces_n().items():
             name = next(names[geom] for geom in pair if names[geom] is not None)  # pyright: ignore
             found[name] = found.get(name, 0.0) + force_n
         steps.append(found)
