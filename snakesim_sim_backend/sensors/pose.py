@@ -16,19 +16,21 @@ class PoseReader:
     """Pose and velocity of the base."""
 
     def __init__(self, data: mujoco.MjData, sensor: PoseSensor, noise: Normal) -> None:
-        self._qpos, self._qvel = data.qpos[:FREE_QPOS], data.qvel[:FREE_DOFS]
-        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion turns by half an angle
+        self._qpos = data.qpos[:FREE_QPOS]
+        self._qvel = data.qvel[:FREE_DOFS]
+        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
         self._sigma = np.repeat(sigma, 3)
         self._noise = noise if any(sigma) else None
 
     def read(self, tick: int, timestamp_ns: int) -> Pose:
-        """The base, as from motion capture. Velocities have no noise of their own."""
+        """Return the pose of the base, as motion capture measures it. Velocities have no noise of their own."""
         px, py, pz, w, x, y, z = self._qpos.tolist()
         vx, vy, vz, ox, oy, oz = self._qvel.tolist()
-        spin_w = rotate((w, x, y, z), (ox, oy, oz))  # MuJoCo gives a free joint's turning in its own frame
+        spin_w = rotate((w, x, y, z), (ox, oy, oz))  # MuJoCo gives a free joint's angular velocity in its own frame
         if self._noise is not None:
             ex, ey, ez, a, b, c = (self._sigma * self._noise(6)).tolist()
             px, py, pz = px + ex, py + ey, pz + ez
+            # The quaternion times (1, a, b, c), a small rotation about the axes of the base.
             w, x, y, z = (
                 w - a * x - b * y - c * z,
                 x + a * w + b * z - c * y,

@@ -61,7 +61,7 @@ def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.R
 def recorded() -> Iterator[list[dict[str, float]]]:
     """Forces of the obstacles that the body touches, one dict a physics step of the run within."""
     steps: list[dict[str, float]] = []
-    feel = ContactReader._feel  # pyright: ignore[reportPrivateUsage] - called in every physics step
+    feel = ContactReader._measure_force  # pyright: ignore[reportPrivateUsage] - called in every physics step
 
     def felt(self: ContactReader) -> None:
         touches = self._touches  # pyright: ignore[reportPrivateUsage]
@@ -73,7 +73,7 @@ def recorded() -> Iterator[list[dict[str, float]]]:
         steps.append(found)
         feel(self)
 
-    with mock.patch.object(ContactReader, "_feel", felt):
+    with mock.patch.object(ContactReader, "_measure_force", felt):
         yield steps
 
 
