@@ -60,7 +60,7 @@ class FlatGround:
         k = m g / sink                               stiffness of the normal and of the tangential spring, N/m
         d = 2 DAMPING_RATIO m sqrt(g / sink) / dt    damping, N per m of motion in one step
         N = max(0, k (r - h) - d dh)                 normal force; dh: rise since the last step
-        ds = dx + dt r (w_y, -w_x)                   slip of the lowest point since the last step, from the motion dx of
+        ds = dx + dt r (-w_y, w_x)                   slip of the lowest point since the last step, from the motion dx of
                                                      the center and the angular velocity w of the link
         s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the tangential spring, limited by friction
         F  = -(k s + d ds), limited to |F| <= mu N   friction force
@@ -153,7 +153,7 @@ class FlatGround:
         np.subtract(self._position, self._last_position, self._motion)
         self._last_position[:] = self._position
 
-        # ds = dx + dt r (w_y, -w_x)
+        # ds = dx + dt r (-w_y, w_x)
         self._twists.take(self._angular_yx_indices, None, slip_xy, "clip")
         slip_xy *= self._roll_per_rad_s_xy
         slip_xy += self._motion_xy
