@@ -14,8 +14,8 @@ FREE_DOFS = 6  # degrees of freedom of the base
 class Chain:
     """The links of one simulation, tail to head.
 
-    A wrench is a moment about the snake's center of mass, in N·m, followed by a force, in N; world frame. The wrenches of
-    all links from a joint to the head act on that joint, and those of all links act on the base:
+    A wrench is a moment about the snake's center of mass, in N·m, followed by a force, in N; world frame. The
+    wrenches of all links from a joint to the head act on that joint, and those of all links act on the base:
 
         generalized force of a degree of freedom = its axis of motion . sum of these wrenches
     """

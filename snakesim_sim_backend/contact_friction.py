@@ -223,7 +223,7 @@ class ContactFriction:
             link_body = bodies[link_geom]
             other_body = bodies[other_geom]
 
-            # Contacts of one pair of geoms are told apart by their order.
+            # Contacts of one pair of geoms are distinguished by their order.
             pair = link_geom * len(bodies) + other_geom
             nth = contacts_of_pair.get(pair, -1) + 1
             contacts_of_pair[pair] = nth
