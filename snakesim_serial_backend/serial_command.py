@@ -1,4 +1,4 @@
-"""`snakesim serial`: which servos answer on a port."""
+"""The command `snakesim serial`, which lists the servos that answer on a port."""
 
 import argparse
 import struct
@@ -11,8 +11,9 @@ from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.wire import SerialWire
 
-OK, FAILED = 0, 1
-GAP_S = 0.2
+OK = 0  # exit codes
+FAILED = 1
+GAP_S = 0.2  # silence that ends an answer: longer than any servo's return delay
 COLUMNS = (
     *("port", "baud", "id", "model", "firmware", "mode", "offset", "angle"),
     *("current limit", "voltage", "heat", "errors"),
@@ -20,13 +21,13 @@ COLUMNS = (
 
 
 def main(argv: Sequence[str]) -> int:
-    """Exit code: 0 done, 1 nobody answers. Raises SnakesimError."""
+    """Run the command, and return its exit code: 0 done, 1 no servo answers. Raises SnakesimError."""
     arguments = parser().parse_args(list(argv))
     return arguments.act(arguments)
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+    """Return the parser of the command's arguments."""
     parser = argparse.ArgumentParser(prog="snakesim serial", description="Servos on serial ports.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     scan = commands.add_parser("scan", help="list every Dynamixel that answers; reads only, and moves nothing")
@@ -40,50 +41,68 @@ def parser() -> argparse.ArgumentParser:
 
 def _scan(arguments: argparse.Namespace) -> int:
     rows: list[dict[str, str]] = []
-    failed: list[str] = []
+    failures: list[str] = []
     for name in arguments.port:
         for baud in arguments.baud or list(at.RATE):
             try:
                 wire = SerialWire(name, baud)
-            except BackendError as error:  # an adapter that cannot do this rate, or a port in use
-                failed.append(str(error))
+            except BackendError as error:  # an adapter that does not support this rate, or a port in use
+                failures.append(str(error))
                 continue
             try:
                 rows += scan(wire)
             finally:
                 wire.close()
-    for line in aligned(COLUMNS, rows) if rows else [*dict.fromkeys(failed), "nobody answers"]:
-        say(line)
-    return OK if rows else FAILED
+    if rows:
+        for line in aligned(COLUMNS, rows):
+            say(line)
+        return OK
+    for failure in dict.fromkeys(failures):  # each once
+        say(failure)
+    say("nobody answers")
+    return FAILED
 
 
 def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
-    """Everybody on a port at its baud rate; one row each, as text by `COLUMNS`."""
+    """Yield a row of text, by `COLUMNS`, for each servo that answers on a port at its baud rate."""
     port = Port(wire, GAP_S)
-    for said in port.scan():
-        yield _row(port, said)
+    for ping in port.scan():
+        yield _describe_servo(port, ping)
 
 
-def _row(port: Port, said: Packet) -> dict[str, str]:
-    number, firmware = struct.unpack("<HB", said.data[:3])
+def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
+    """Return the row of a servo. ping: its answer to a ping, with model and firmware."""
+    number, firmware = struct.unpack("<HB", ping.data[:3])
+    model = at.model_name(number)
+    if number in at.MODELS:
+        model = f"{model} ({number})"
     row = dict.fromkeys(COLUMNS, "-")
     row |= {
         "port": port.wire.port,
         "baud": str(port.wire.baud),
-        "id": str(said.id),
-        "model": f"{at.model_name(number)} ({number})" if number in at.MODELS else at.model_name(number),
+        "id": str(ping.id),
+        "model": model,
         "firmware": str(firmware),
     }
-    if (table := port.read(said.id, 0, at.SIZE)) is None:
-        return row
-    data = table.data
-    angle = struct.unpack_from("<i", data, at.PRESENT + 6)[0] * at.RAD
-    return row | {
+    table = port.read(ping.id, 0, at.SIZE)
+    if table is not None:
+        row |= _describe_registers(table.data)
+    return row
+
+
+def _describe_registers(data: bytes) -> dict[str, str]:
+    """Return the columns that are read from a servo's control table."""
+    (position,) = struct.unpack_from("<i", data, at.PRESENT_POSITION)
+    (homing_offset,) = struct.unpack_from("<i", data, at.HOMING_OFFSET)
+    (current_limit,) = struct.unpack_from("<H", data, at.CURRENT_LIMIT)
+    (voltage,) = struct.unpack_from("<H", data, at.VOLTAGE)
+    errors = data[at.HARDWARE_ERROR]
+    return {
         "mode": str(data[at.OPERATING_MODE]),
-        "offset": str(struct.unpack_from("<i", data, at.HOMING_OFFSET)[0]),
-        "angle": f"{angle:.3f} rad",
-        "current limit": str(struct.unpack_from("<H", data, at.CURRENT_LIMIT)[0]),
-        "voltage": f"{struct.unpack_from('<H', data, at.VOLTAGE)[0] * at.VOLTS:.1f} V",
+        "offset": str(homing_offset),
+        "angle": f"{position * at.RAD:.3f} rad",
+        "current limit": str(current_limit),
+        "voltage": f"{voltage * at.VOLTS:.1f} V",
         "heat": f"{data[at.TEMPERATURE]} °C",
-        "errors": at.error_names(data[at.HARDWARE_ERROR]) if data[at.HARDWARE_ERROR] else "none",
+        "errors": at.error_names(errors) if errors else "none",
     }

@@ -1,7 +1,7 @@
 """A half-duplex serial bus: a port behind a USB adapter, or a pseudo terminal with emulated drives at its other end.
 
-Who asks waits for the answer before anybody is asked again. An FTDI adapter holds back what it received for its latency
-timer, 16 ms at first: opening a port asks its driver for 1 ms.
+After a request the driver waits for the answer before it sends the next one. An FTDI adapter holds back received bytes
+until its latency timer expires, 16 ms by default; opening a port asks its driver for 1 ms.
 """
 
 import contextlib
@@ -18,57 +18,61 @@ import serial
 
 from snakesim_hal.base.errors import BackendError, ConfigError
 
-BITS_A_BYTE = 10  # with start and stop
-USB_LATENCY_S = 0.001  # of an adapter whose driver does not say it: a frame of USB
-PEER_LIMIT_S = 5.0  # in which a pseudo terminal hands on what was written
-REOPEN_EVERY_S = 0.5
+BITS_A_BYTE = 10  # with start and stop bit
+USB_LATENCY_S = 0.001  # of an adapter whose driver does not report it: one frame of USB
+KERNEL_LIMIT_S = 5.0  # in which a pseudo terminal passes on what was written
+REOPEN_PERIOD_S = 0.5  # between two attempts to open a port that is gone
 READ_BYTES = 4096
 WRITE_LIMIT_S = 1.0
 GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
-IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`, on a port that has gone
+IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`, on a port that is gone
 
-
-# Drives that are emulated in this process: they handle what was sent to them, answer, and let time pass up to now.
-Peer = Callable[[], None]
+# Runs the drives that are emulated in this process: they handle what was sent to them, answer, and let time pass.
+RunDrives = Callable[[], None]
 
 
 class Pty:
-    """A pseudo terminal. Emulated drives are at its one end; at the other is whoever opens `path`.
+    """A pseudo terminal. Emulated drives are at its one end; at the other is the program that opens `path`.
 
-    due: bytes that were written to it and must arrive; None: nobody in this process knows.
+    Attributes:
+        path: name of the end for the driver.
+        expected_bytes: how many bytes were written to it so far and must arrive; None if this process does not know.
+        sent_bytes: how many bytes the emulated drives have sent.
     """
 
     def __init__(self) -> None:
         self._master, self._slave = os.openpty()
-        self._ends: tuple[int, ...] = (self._master, self._slave)
+        self._open_ends: tuple[int, ...] = (self._master, self._slave)
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        self.due: int | None = None
-        self._taken = 0
-        self.given = 0
+        self.expected_bytes: int | None = None
+        self.sent_bytes = 0
+        self._received_bytes = 0
 
-    def take(self) -> bytes:
-        """What has arrived; all that is due, which the kernel may hand on late."""
-        taken = self._read()
-        while self.due is not None and self._taken < self.due:
-            if not select.select([self._master], [], [], PEER_LIMIT_S)[0]:
+    def receive(self) -> bytes:
+        """Return what has arrived. Waits for all expected bytes, which the kernel may pass on late."""
+        data = self._read()
+        while self.expected_bytes is not None and self._received_bytes < self.expected_bytes:
+            readable, _, _ = select.select([self._master], [], [], KERNEL_LIMIT_S)
+            if not readable:
                 raise BackendError(f"{self.path}: the kernel has not handed on what was written to it")
-            taken += self._read()
-        return taken
+            data += self._read()
+        return data
 
-    def give(self, data: bytes) -> None:
-        """Answer; what nobody reads is lost once the kernel's buffer is full."""
+    def send(self, data: bytes) -> None:
+        """Send an answer. If no program reads it, it is lost once the kernel's buffer is full."""
         with contextlib.suppress(BlockingIOError):
-            self.given += os.write(self._master, data)
+            self.sent_bytes += os.write(self._master, data)
 
     def fileno(self) -> int:
-        """To wait on."""
+        """Return the file descriptor to wait on."""
         return self._master
 
     def close(self) -> None:
-        """Both ends, once: their numbers may be another file's afterwards."""
-        ends, self._ends = self._ends, ()
+        """Close both ends, once: their numbers may be another file's afterwards."""
+        ends = self._open_ends
+        self._open_ends = ()
         for end in ends:
             os.close(end)
 
@@ -77,7 +81,7 @@ class Pty:
             data = os.read(self._master, READ_BYTES)
         except (BlockingIOError, OSError):
             return b""
-        self._taken += len(data)
+        self._received_bytes += len(data)
         return data
 
 
@@ -85,14 +89,39 @@ class SerialWire:
     """One port, opened for this process alone."""
 
     def __init__(
-        self, port: str, baud: int, log: TextIO | None = None, pty: Pty | None = None, peer: Peer | None = None
+        self,
+        port: str,
+        baud: int,
+        log: TextIO | None = None,
+        pty: Pty | None = None,
+        run_drives: RunDrives | None = None,
     ) -> None:
-        """pty, peer: drives that are emulated in this process. Raises ConfigError and BackendError."""
-        self.port, self.baud = port, baud
-        self._log, self._pty, self._peer = log, pty, peer
-        self._received, self._sent = 0, 0
-        self._lost_s: float | None = None  # since when the port is gone
-        self._cut = False
+        """Open a port.
+
+        Args:
+            port: name of the serial port, or path of a pseudo terminal.
+            baud: baud rate in bit/s.
+            log: gets a line for everything that is sent or received.
+            pty: the pseudo terminal, if its drives are emulated in this process.
+            run_drives: runs these drives.
+
+        Raises:
+            ConfigError: there is no such port.
+            BackendError: the port cannot be opened.
+        """
+        self.port = port
+        self.baud = baud
+        self._log = log
+
+        # Drives that are emulated in this process.
+        self._pty = pty
+        self._run_drives = run_drives
+        self._sent_bytes = 0
+        self._received_bytes = 0
+
+        # State of the port.
+        self._last_try_s: float | None = None  # when a port that is gone was last tried; None: the port is open
+        self._is_cut = False  # by an injected fault
         if not Path(port).exists():
             raise ConfigError(f"port {port!r}: there is none; plug the adapter in, and see `snakesim doctor`")
         try:
@@ -102,63 +131,69 @@ class SerialWire:
         self.latency_s = latency_s(port)
 
     def send(self, data: bytes) -> None:
-        """Send, after throwing away whatever came too late."""
-        if self._cut or (self._lost_s is not None and not self._reopened()):
+        """Send a request. Answers to earlier ones that came too late are thrown away first."""
+        if self._is_cut or not self._is_open_again():
             return
-        self._throw_away()
-        self._note("out", data)
+        self._discard_late_answers()
+        self._write_log("out", data)
         try:
             self._serial.write(data)
-        except serial.SerialTimeoutException:  # pyserial says it also of what it has written, after a long pause
+        except serial.SerialTimeoutException:
+            # After a long pause pyserial raises it also for data that it has written.
             if self._pty is None:
                 return
         except IO_ERRORS:
-            self._lose()
+            self._close_lost_port()
             return
-        self._sent += len(data)
+        self._sent_bytes += len(data)
         if self._pty is not None:
-            self._pty.due = self._sent
+            self._pty.expected_bytes = self._sent_bytes
 
     def receive(self, timeout_s: float) -> bytes:
-        """What has come; waits for the first of it. Nothing: the time is over, or no emulated drive has answered."""
-        if self._cut or self._lost_s is not None:
+        """Return what has arrived, and wait for the first byte of it.
+
+        Empty: the time is over, the port is gone, or no drive that is emulated in this process has answered.
+        """
+        if self._is_cut or self._last_try_s is not None:
             return b""
-        if self._peer is not None and self._pty is not None:
-            self._peer()
-            if self._received == self._pty.given:
+        if self._run_drives is not None and self._pty is not None:
+            self._run_drives()
+            if self._received_bytes == self._pty.sent_bytes:
                 return b""
-            timeout_s = PEER_LIMIT_S
+            timeout_s = KERNEL_LIMIT_S
         try:
             data = self._read(timeout_s)
         except IO_ERRORS:
-            self._lose()
+            self._close_lost_port()
             return b""
         if data:
-            self._received += len(data)
-            self._note("in", data)
+            self._received_bytes += len(data)
+            self._write_log("in", data)
         return data
 
     def time_s(self, size: int) -> float:
-        """That so many bytes take."""
+        """Return how long this number of bytes takes on the bus."""
         return size * BITS_A_BYTE / self.baud
 
-    def let_run(self) -> None:
-        """Emulated drives in this process."""
-        if self._peer is not None:
-            self._peer()
+    def run_emulated_drives(self) -> None:
+        """Let drives that are emulated in this process run up to now."""
+        if self._run_drives is not None:
+            self._run_drives()
 
     def error(self) -> str:
-        """Why nothing can be sent now; empty if it can."""
-        if self._cut:
+        """Return why nothing can be sent now; empty if it can."""
+        if self._is_cut:
             return "it is cut"
-        return "" if self._lost_s is None else "it is gone: the adapter was unplugged, or its driver has failed"
+        if self._last_try_s is not None:
+            return "it is gone: the adapter was unplugged, or its driver has failed"
+        return ""
 
     def cut(self, *, begins: bool) -> None:
-        """An injected fault: nothing gets through until it ends."""
-        self._cut = begins
+        """Begin or end an injected fault, in which nothing is sent or received."""
+        self._is_cut = begins
 
     def close(self) -> None:
-        """Close the port, and the pseudo terminal that is this one's other end."""
+        """Close the port, and the pseudo terminal if there is one."""
         with contextlib.suppress(OSError):
             self._serial.close()
         if self._pty is not None:
@@ -167,62 +202,73 @@ class SerialWire:
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _open(self) -> serial.Serial:
-        opened = serial.Serial(self.port, self.baud, timeout=0, write_timeout=WRITE_LIMIT_S, exclusive=True)
-        with contextlib.suppress(*IO_ERRORS):  # pseudo terminals and some adapters have no such thing
-            opened.set_low_latency_mode(True)
-        return opened
+        port = serial.Serial(self.port, self.baud, timeout=0, write_timeout=WRITE_LIMIT_S, exclusive=True)
+        with contextlib.suppress(*IO_ERRORS):  # pseudo terminals and some adapters do not have this mode
+            port.set_low_latency_mode(True)
+        return port
 
     def _read(self, timeout_s: float) -> bytes:
-        """What there is, or comes in time. The kernel now and then says too early that there is something."""
-        number, end_s = self._serial.fileno(), time.monotonic() + timeout_s
-        waiting = select.poll()
-        waiting.register(number, select.POLLIN)
-        while said := waiting.poll(max(end_s - time.monotonic(), 0.0) * 1000):
-            if said[0][1] & GONE:
-                raise OSError("suspended up")
-            if data := os.read(number, READ_BYTES):
+        """Return what has arrived, or arrives in time. Now and then the kernel reports data before there is any."""
+        descriptor = self._serial.fileno()
+        end_s = time.monotonic() + timeout_s
+        poll = select.poll()
+        poll.register(descriptor, select.POLLIN)
+        while True:
+            events = poll.poll(max(end_s - time.monotonic(), 0.0) * 1000)
+            if not events:
+                return b""
+            _, event = events[0]
+            if event & GONE:
+                raise OSError("hung up")
+            data = os.read(descriptor, READ_BYTES)
+            if data:
                 return data
-        return b""
 
-    def _throw_away(self) -> None:
+    def _discard_late_answers(self) -> None:
         if self._pty is not None:
-            while self._received < self._pty.given and self.receive(PEER_LIMIT_S):
-                pass
+            while self._received_bytes < self._pty.sent_bytes:
+                if not self.receive(KERNEL_LIMIT_S):
+                    return
             return
         with contextlib.suppress(*IO_ERRORS):
             self._serial.reset_input_buffer()
 
-    def _lose(self) -> None:
-        self._lost_s = time.monotonic()
+    def _close_lost_port(self) -> None:
+        self._last_try_s = time.monotonic()
         with contextlib.suppress(OSError):
             self._serial.close()
 
-    def _reopened(self) -> bool:
+    def _is_open_again(self) -> bool:
+        """Return whether the port is open. One that is gone is tried again now and then."""
+        if self._last_try_s is None:
+            return True
         now_s = time.monotonic()
-        if self._lost_s is None or now_s - self._lost_s < REOPEN_EVERY_S:
-            return self._lost_s is None
-        self._lost_s = now_s
+        if now_s - self._last_try_s < REOPEN_PERIOD_S:
+            return False
+        self._last_try_s = now_s
         try:
             self._serial = self._open()
         except IO_ERRORS:
             return False
-        self._lost_s = None
+        self._last_try_s = None
         return True
 
-    def _note(self, way: str, data: bytes) -> None:
+    def _write_log(self, direction: str, data: bytes) -> None:
         if self._log is not None:
-            self._log.write(f"({time.monotonic():.6f}) {self.port} {way:<3} {data.hex(' ')}\n")
+            self._log.write(f"({time.monotonic():.6f}) {self.port} {direction:<3} {data.hex(' ')}\n")
 
 
 def is_emulated(port: str) -> bool:
-    """Whether no real drive can be on a port: it is a pseudo terminal."""
+    """Return whether no real drive can be on a port, because it is a pseudo terminal."""
     return Path(port).resolve().parts[:3] == ("/", "dev", "pts")
 
 
 def latency_s(port: str, root: Path = Path("/")) -> float:
-    """How long an adapter may hold back what it received."""
+    """Return how long an adapter may hold back what it received. root: of the file system that describes it."""
     try:
         name = Path(port).resolve().name
         return int((root / "sys/class/tty" / name / "device/latency_timer").read_text()) / 1000
     except (OSError, ValueError):
-        return 0.0 if is_emulated(port) else USB_LATENCY_S
+        if is_emulated(port):
+            return 0.0
+        return USB_LATENCY_S

@@ -1,4 +1,4 @@
-"""The motors: four modes in one native MuJoCo actuator, so that no Python runs between physics steps.
+"""Drives the motors: four modes in one native MuJoCo actuator, so that no Python runs between physics steps.
 
 Each joint has a `dcmotor` with motor constant 1, so that its current is its torque. At every physics step
 
@@ -25,20 +25,25 @@ from snakesim_hal.physics.motor import roll_off
 from snakesim_hal.wire.messages import Mode
 
 # Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `Motors`.
-KP, KD, MAX_VOLTS = 4, 6, 7
-INPUTS = 3  # position, velocity, feed-forward torque
-INPUT_OF_MODE = {Mode.PASSIVE: 2, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: 2}
+KP = 4
+KD = 6
+MAX_VOLTS = 7
+# Inputs of a motor in `ctrl`: position, velocity, feed-forward torque.
+INPUTS = 3
+TORQUE_INPUT = 2
+INPUT_OF_MODE = {Mode.PASSIVE: TORQUE_INPUT, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: TORQUE_INPUT}
 
 
 def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) -> None:
     """Add the motor of one joint to a model; it starts passive."""
     limits = joint.limits
-    motor = spec.add_actuator(name=f"motor_{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    # With motor constant 1, volts are rad/s, and the torque at rest under full volts is speed limit / resistance.
+    stall_torque_nm = roll_off(joint, module, step_s) * limits.torque_nm
     inputs = mujoco.mjtCtrlInput
+    motor = spec.add_actuator(name=f"motor_{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     motor.set_to_dcmotor(
         motorconst=[1.0, 0.0],
-        # With constant 1, volts are rad/s, and torque at rest under full volts is limits.speed / resistance.
-        resistance=limits.speed_rad_s / (roll_off(joint, module, step_s) * limits.torque_nm),
+        resistance=limits.speed_rad_s / stall_torque_nm,
         inductance=[0.0, joint.motor.response_time_s],
         controller=[1.0, 0.0, 1.0, 0.0, 0.0, limits.speed_rad_s],
         saturation=[limits.torque_nm, 0.0, 0.0],
@@ -46,102 +51,138 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) 
     )
 
 
-def _gains(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
-    """Mode -> kp, kd and volts (0: unbounded)."""
-    motor, speed = joint.motor, joint.limits.speed_rad_s
+def _gains_by_mode(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
+    """Return kp, kd and volts (0: unbounded) of each mode that the joint's drive has. scale: of kp and kd."""
+    motor = joint.motor
+    max_volts = joint.limits.speed_rad_s
     gains = {
         Mode.PASSIVE: (0.0, 0.0, 0.0),
-        Mode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, speed),
-        Mode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, speed),
-        Mode.TORQUE: (0.0, 0.0, speed),
+        Mode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, max_volts),
+        Mode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, max_volts),
+        Mode.TORQUE: (0.0, 0.0, max_volts),
     }
-    has = ("passive", *joint.drive.modes)
-    return {mode: values for mode, values in gains.items() if mode.name.lower() in has}
+    mode_names = ("passive", *joint.drive.modes)
+    return {mode: values for mode, values in gains.items() if mode.name.lower() in mode_names}
 
 
 class Motors:
-    """All motors of a compiled model."""
+    """All motors of a compiled model, tail to head.
+
+    Attributes:
+        count: number of motors.
+        without_torque: joints whose drives do not measure their torque.
+    """
 
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
     ) -> None:
+        """Take over the motors of a model, and switch them off.
+
+        Args:
+            model: the compiled model.
+            data: its state.
+            robot: the robot file.
+            period_s: control period.
+            gain_scale: factor on the gains of the robot file.
+        """
         joints = robot.joint_table
-        self.count, self._names = len(joints), [joint.name for joint in joints]
+        self.count = len(joints)
         self.without_torque = [i for i, joint in enumerate(joints) if "torque" not in joint.drive.measures]
+        self._names = [joint.name for joint in joints]
+        self._gains_by_mode = [_gains_by_mode(joint, gain_scale) for joint in joints]
+
+        # Views of MuJoCo's arrays.
         self._gains = model.actuator_gainprm[: self.count]
-        self._force_range = model.actuator_forcerange[: self.count]
-        self._least, self._most = self._force_range[:, 0], self._force_range[:, 1]
-        self._torque = data.act  # empty when the motors have no lag
-        self._applied = data.actuator_force[: self.count]
+        self._min_torque_nm = model.actuator_forcerange[: self.count, 0]
+        self._max_torque_nm = model.actuator_forcerange[: self.count, 1]
+        self._torque_state = data.act  # empty when the motors have no lag
+        self._applied_nm = data.actuator_force[: self.count]
         self._inputs = data.ctrl[: INPUTS * self.count]
-        self._full_limit = np.array([joint.limits.torque_nm for joint in joints])
-        self._own_limit = self._full_limit  # after derating
-        self._limit = self._full_limit.copy()
-        self._limit_asked: list[float] = self._limit.tolist()
-        self._fading = False
-        lags_s = [joint.motor.response_time_s for joint in joints]
-        self._decay = np.array([math.exp(-period_s / lag_s) if lag_s > 0 else 0.0 for lag_s in lags_s])
-        self._gains_of_mode = [_gains(joint, gain_scale) for joint in joints]
-        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints])
-        self._mode: list[Mode] = []
-        self._slots = np.empty(0, dtype=np.intp)
+
+        # Torque limits, (n_joints,) each: of the robot file, after derating, and with the command's.
+        self._full_limit_nm = np.array([joint.limits.torque_nm for joint in joints])
+        self._derated_limit_nm = self._full_limit_nm
+        self._limit_nm = self._full_limit_nm.copy()
+        self._commanded_limit_nm: list[float] = self._limit_nm.tolist()
+        self._limit_is_changing = False
+        self._decay = np.array([_decay(period_s, joint.motor.response_time_s) for joint in joints])
+
+        # Present modes, and where their inputs are in `ctrl`.
+        self._modes: list[Mode] = []
+        self._input_indices = np.empty(0, dtype=np.intp)
+        self._passive_indices: list[int] = []
+        expected = [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints]
+        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == expected)
         self.switch_off()
 
     def enact(self, setpoints: SafeSetpoints) -> None:
-        """Take setpoints, tail to head; they hold until the next call."""
-        if setpoints.mode != self._mode:
+        """Apply setpoints, tail to head; they hold until the next call.
+
+        Raises:
+            BackendError: a drive does not have the mode of its setpoint.
+        """
+        if setpoints.mode != self._modes:
             self._change_modes(setpoints.mode)
-        self._inputs[self._slots] = setpoints.target
-        if self._passive:
-            self._inputs[self._passive] = 0.0
-        if setpoints.torque_limit_nm != self._limit_asked:
-            self._limit_asked = list(setpoints.torque_limit_nm)
-            self._bound()
+        self._inputs[self._input_indices] = setpoints.target
+        if self._passive_indices:
+            self._inputs[self._passive_indices] = 0.0
+        if setpoints.torque_limit_nm != self._commanded_limit_nm:
+            self._commanded_limit_nm = list(setpoints.torque_limit_nm)
+            self._update_limit()
 
     def derate(self, remaining_fraction: Floats) -> None:
-        """Derate each joint's own limit to this share, (n_joints,), whatever a command allows."""
-        self._own_limit = self._full_limit * remaining_fraction
-        self._bound()
+        """Derate each joint's own limit to this fraction, (n_joints,), whatever a command allows."""
+        self._derated_limit_nm = self._full_limit_nm * remaining_fraction
+        self._update_limit()
 
     def switch_off(self) -> None:
-        """All joints passive."""
+        """Make all joints passive."""
         zeros = [0.0] * self.count
-        self.enact(SafeSetpoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
+        self.enact(SafeSetpoints([Mode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist()))
 
     def before_steps(self) -> None:
-        """Once a tick: apply a lowered limit as fast as the motor can follow, and end wind-up above it."""
-        if len(self._torque) == 0:
-            if self._fading:
-                self._set_range(self._limit)
-                self._fading = False
+        """Apply a lowered limit as fast as the motor can follow, and end wind-up above it. Call it once a tick."""
+        if len(self._torque_state) == 0:
+            if self._limit_is_changing:
+                self._set_range(self._limit_nm)
+                self._limit_is_changing = False
             return
-        if self._fading:
-            left = np.abs(self._applied) * self._decay
-            self._fading = bool(np.any(left > self._limit))
-            self._set_range(np.maximum(self._limit, left))
-        np.minimum(self._torque, self._most, out=self._torque)
-        np.maximum(self._torque, self._least, out=self._torque)
+        if self._limit_is_changing:
+            remaining_nm = np.abs(self._applied_nm) * self._decay
+            self._limit_is_changing = bool(np.any(remaining_nm > self._limit_nm))
+            self._set_range(np.maximum(self._limit_nm, remaining_nm))
+        np.minimum(self._torque_state, self._max_torque_nm, out=self._torque_state)
+        np.maximum(self._torque_state, self._min_torque_nm, out=self._torque_state)
 
     def applied_nm(self) -> Floats:
-        """Torque of every motor over the last physics step, (n_joints,) float64."""
-        return self._applied
+        """Return a view of the torque of every motor over the last physics step, (n_joints,) float64."""
+        return self._applied_nm
 
-    def _bound(self) -> None:
-        self._limit = np.minimum(self._limit_asked, self._own_limit)
-        self._fading = True
+    def _update_limit(self) -> None:
+        self._limit_nm = np.minimum(self._commanded_limit_nm, self._derated_limit_nm)
+        self._limit_is_changing = True
 
     def _set_range(self, limit_nm: Floats) -> None:
-        self._most[:] = limit_nm
-        self._least[:] = -limit_nm
+        self._max_torque_nm[:] = limit_nm
+        self._min_torque_nm[:] = -limit_nm
 
     def _change_modes(self, modes: list[Mode]) -> None:
-        for gains, mode, name in zip(self._gains_of_mode, modes, self._names, strict=True):
+        """Set the gains of new modes, and find their inputs. Raises BackendError for a mode that a drive lacks."""
+        for gains, mode, name in zip(self._gains_by_mode, modes, self._names, strict=True):
             if mode not in gains:
                 raise BackendError(f"{name} was given a setpoint in {mode.name.lower()} mode, which its drive lacks")
-        self._mode = list(modes)
+        self._modes = list(modes)
         self._gains[:, [KP, KD, MAX_VOLTS]] = [
-            gains[mode] for gains, mode in zip(self._gains_of_mode, modes, strict=True)
+            gains[mode] for gains, mode in zip(self._gains_by_mode, modes, strict=True)
         ]
-        self._slots = np.array([INPUTS * i + INPUT_OF_MODE[mode] for i, mode in enumerate(modes)], dtype=np.intp)
-        self._passive = [INPUTS * i + 2 for i, mode in enumerate(modes) if mode == Mode.PASSIVE]
+        indices = [INPUTS * i + INPUT_OF_MODE[mode] for i, mode in enumerate(modes)]
+        self._input_indices = np.array(indices, dtype=np.intp)
+        self._passive_indices = [INPUTS * i + TORQUE_INPUT for i, mode in enumerate(modes) if mode == Mode.PASSIVE]
         self._inputs[:] = 0.0
+
+
+def _decay(period_s: float, response_time_s: float) -> float:
+    """Return the fraction of its torque that a motor without demand still has after a control period."""
+    if response_time_s > 0:
+        return math.exp(-period_s / response_time_s)
+    return 0.0

@@ -1,4 +1,4 @@
-"""The simulated robot behind the HAL. Thin: every task has its own module."""
+"""The simulated robot behind the HAL: joins model, motors, sensors and physics, which have modules of their own."""
 
 import math
 
@@ -23,12 +23,13 @@ from snakesim_sim_backend.sensors.registry import check_models
 from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.start import place_robot
-from snakesim_sim_backend.tether import Rope
+from snakesim_sim_backend.tether import TetherRope
 from snakesim_sim_backend.truth import TrueState
 
 NAME = "sim"
 CLOSED = "the simulation is closed; open a new backend"
-OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
+MOTORS_OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
+DIVERGED_SPEED_M_S = 10.0 * MAX_SPEED  # of the base, when a divergence is injected
 
 
 class SimBackend:
@@ -38,19 +39,28 @@ class SimBackend:
 
     @staticmethod
     def check(config: RunConfig, _settings: SimSettings) -> tuple[ClockMode, ...]:
-        """Simulated time supports all paces. Raises ConfigError."""
+        """Check that this backend can run a scenario, and return the clock modes that it supports: all of them.
+
+        Raises:
+            ConfigError: a gain, a sensor or an injected fault of the run is not possible here.
+        """
         check_gains(config.robot)
         check_models(config.robot)
-        does, because = ["diverge"], "the simulator has neither modules nor buses"
+        possible_faults = ["diverge"]
+        because = "the simulator has neither modules nor buses"
         if config.robot.sensors.power is not None:
-            does.append("overheat")
+            possible_faults.append("overheat")
         else:
             because += ", and without [sensors.power] in the robot file heat would not be measured"
-        check_backend_can(config, does=does, buses=0, because=because)
+        check_backend_can(config, does=possible_faults, buses=0, because=because)
         return ("lockstep", "realtime", "free")
 
     def __init__(self, config: RunConfig, settings: SimSettings) -> None:
-        """Build the scene, lay the snake down and let it come to rest. Raises ConfigError."""
+        """Build the scene, place the snake and let it come to rest.
+
+        Raises:
+            ConfigError: the settings do not match the robot or the scene.
+        """
         self._description = describe(
             config.robot,
             backend=NAME,
@@ -61,68 +71,88 @@ class SimBackend:
             simulated_time=True,
         )
         log_warnings()
-        self._sim = build(config, settings)
-        self._data = mujoco.MjData(self._sim.model)
-        self._physics = Physics(self._sim, self._data)
-        self._motors = Motors(
-            self._sim.model, self._data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale
-        )
-        place_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
-        self._rope = None
-        if settings.tether is not None:
-            self._rope = Rope(self._sim.model, self._data, settings.tether)
-            self._rope.tighten()
-        self._windings = Thermal(config.robot.joint_table)
-        self._heats, self._period_s = config.robot.sensors.power is not None, config.period_ns * 1e-9
-        self._sensors = Sensors(self._sim, self._data, config, self._motors, self._physics, self._windings)
-        self._watch = DivergenceWatch(self._sim.model, self._data, self._physics, self._sim.steps_per_tick)
-        self._option = self._sim.model.opt
-        self._with_sensors = int(self._option.disableflags)
-        self._without_sensors = self._with_sensors | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-        self._unread_steps = self._sim.steps_per_tick - 1 if self._sim.model.nsensor else 0
-        self._read_steps = self._sim.steps_per_tick - self._unread_steps
         self._tick = 0
         self._open = True
+        self._period_s = config.period_ns * 1e-9
+
+        # Physics and motors, with the snake at rest.
+        self._sim = build(config, settings)
+        model = self._sim.model
+        self._data = mujoco.MjData(model)
+        self._physics = Physics(self._sim, self._data)
+        self._motors = Motors(model, self._data, config.robot, self._period_s, settings.motor_gain_scale)
+        place_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
+        self._rope: TetherRope | None = None
+        if settings.tether is not None:
+            self._rope = TetherRope(model, self._data, settings.tether)
+            self._rope.tighten()
+
+        # Heat and sensors.
+        self._simulates_heat = config.robot.sensors.power is not None
+        self._windings = Thermal(config.robot.joint_table)
+        self._sensors = Sensors(self._sim, self._data, config, self._motors, self._physics, self._windings)
+        self._watch = DivergenceWatch(model, self._data, self._physics, self._sim.steps_per_tick)
+
+        # IMUs cost time, and only their values in the last step of a tick are read.
+        self._flags_with_sensors = int(model.opt.disableflags)
+        self._flags_without_sensors = self._flags_with_sensors | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        self._steps_without_sensors = 0
+        if model.nsensor:
+            self._steps_without_sensors = self._sim.steps_per_tick - 1
+        self._steps_with_sensors = self._sim.steps_per_tick - self._steps_without_sensors
+        self._option = model.opt
 
     def describe(self) -> Description:
-        """The robot of the robot file."""
+        """Return the robot of the robot file."""
         return self._description
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """Sensor samples at `tick`; after a divergence, of the last good state."""
+        """Return the sensor samples of `tick`; after a divergence, those of the last good state."""
         if not self._open:
             raise BackendError(CLOSED)
         return self._sensors.sample(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Give the motors new setpoints. While disarmed they are off, whatever the setpoints."""
-        if lifecycle in OFF:
+        if lifecycle in MOTORS_OFF:
             self._motors.switch_off()
         else:
             self._motors.enact(setpoints)
 
     def advance(self) -> None:
-        """Step the physics through one control period. Raises BackendError when it has diverged."""
+        """Step the physics through one control period.
+
+        Raises:
+            BackendError: the simulation has diverged, or is closed.
+        """
         if not self._open:
             raise BackendError(CLOSED)
         self._motors.before_steps()
         self._tick += 1
         try:
-            if self._unread_steps:  # IMUs cost time, and only their values in the last step are read
-                self._option.disableflags = self._without_sensors
-                self._physics.step(self._unread_steps)
-                self._option.disableflags = self._with_sensors
-            self._physics.step(self._read_steps)
+            if self._steps_without_sensors:
+                self._option.disableflags = self._flags_without_sensors
+                self._physics.step(self._steps_without_sensors)
+                self._option.disableflags = self._flags_with_sensors
+            self._physics.step(self._steps_with_sensors)
             self._watch.check(self._tick)
         except mujoco.FatalError as error:
             raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
-        if self._heats:  # from the torque of the last step: windings are slow
-            self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
-            if (remaining_fraction := self._windings.remaining_fraction()) is not None:
-                self._motors.derate(remaining_fraction)
+        if self._simulates_heat:
+            self._warm_windings()
+
+    def _warm_windings(self) -> None:
+        """Let a period of heat pass, and derate hot joints. The torque of the last step stands for the period."""
+        self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
+        remaining_fraction = self._windings.remaining_fraction()
+        if remaining_fraction is not None:
+            self._motors.derate(remaining_fraction)
 
     def faults(self) -> list[Fault]:
-        """Samples that came too late in real time; they stop nothing. A divergence is raised by `advance`."""
+        """Return faults for samples that came too late in real time; they stop nothing.
+
+        A divergence is raised by `advance`.
+        """
         if not self._sensors.late:
             return []
         return [
@@ -130,16 +160,21 @@ class SimBackend:
         ]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """`diverge`: the base becomes impossibly fast, as in a divergence. `overheat`: a winding is hot."""
-        if injection.target_type == "joint" and injection.kind == "overheat" and self._heats:
-            hold = begins and injection.end_s != math.inf
-            self._windings.inject(injection.number, heat=begins, hold=hold)
-            return True
-        if injection.target_type != "simulator" or injection.kind != "diverge":
-            return False
-        if begins:
-            self._data.qvel[0] = 10.0 * MAX_SPEED
-        return True
+        """Begin or end an injected fault; return False for a fault that the simulator does not have.
+
+        `diverge` makes the base impossibly fast, as in a divergence. `overheat` heats a winding.
+        """
+        match injection.target_type, injection.kind:
+            case "joint", "overheat" if self._simulates_heat:
+                hold = begins and injection.end_s != math.inf
+                self._windings.inject(injection.number, heat=begins, hold=hold)
+                return True
+            case "simulator", "diverge":
+                if begins:
+                    self._data.qvel[0] = DIVERGED_SPEED_M_S
+                return True
+            case _:
+                return False
 
     def close(self) -> None:
         """Switch the motors off; nothing moves any more. `true_state` stays readable."""
@@ -157,7 +192,7 @@ class SimBackend:
 
     @property
     def physics(self) -> Physics:
-        """The steps of the simulation, and the forces of flat ground."""
+        """The physics steps, and the forces that MuJoCo does not compute."""
         return self._physics
 
     @property
@@ -168,10 +203,12 @@ class SimBackend:
     @property
     def tether_tension_n(self) -> float | None:
         """Force in the tether over the last physics step; None without a tether."""
-        return None if self._rope is None else self._rope.tension_n()
+        if self._rope is None:
+            return None
+        return self._rope.tension_n()
 
     def true_state(self) -> TrueState:
-        """The state as it is, without noise, rate or delay."""
+        """Return the exact state, without noise, rate or delay."""
         data = self._data
         angles_rad, velocities_rad_s = of_joints(data, self._motors.count)
         return TrueState(

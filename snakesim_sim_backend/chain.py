@@ -1,4 +1,4 @@
-"""Forces on the links of a simulated snake: collected, and added to MuJoCo's passive ones at once."""
+"""Forces on the links of a simulated snake: collected, and added to MuJoCo's passive forces at once."""
 
 from collections.abc import Sequence
 
@@ -8,45 +8,63 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
 
-FREE_DOFS = 6  # of the base
+FREE_DOFS = 6  # degrees of freedom of the base
 
 
 class Chain:
-    """The links of one simulation, tail to head."""
+    """The links of one simulation, tail to head.
+
+    A wrench is a moment about the snake's center of mass, in N·m, followed by a force, in N; world frame. The
+    wrenches of all links from a joint to the head act on that joint, and those of all links act on the base:
+
+        generalized force of a degree of freedom = its axis of motion . sum of these wrenches
+    """
 
     def __init__(self, data: mujoco.MjData, first_body: int, links: int) -> None:
-        self._first, self._count = first_body, links
         dofs = FREE_DOFS + links - 1
-        self._about, axes, out = data.subtree_com[first_body], data.cdof[:dofs], data.qfrc_passive[:dofs]
-        self._base_axes, self._axes = axes[:FREE_DOFS], axes[FREE_DOFS:]
-        self._base, self._joints = out[:FREE_DOFS], out[FREE_DOFS:]
-        self._beyond = np.empty((links, 6))  # head to tail: a joint turns all that is nearer to the head
-        self._whole, self._beyond_joint = self._beyond[-1], self._beyond[-2::-1]
-        self._wrenches: Floats | None = None
+        self._first_body = first_body
+        self._link_count = links
+        self._wrenches: Floats | None = None  # (6, n_links), collected in this step
 
-    def push(self, forces_w: Sequence[Vector], places_w: Sequence[Vector], bodies: Sequence[int]) -> None:
-        """Collect forces on bodies."""
-        sums = [0.0] * (6 * self._count)
-        cx, cy, cz = self._about.tolist()
-        for (fx, fy, fz), (x, y, z), body in zip(forces_w, places_w, bodies, strict=True):
-            x, y, z, at = x - cx, y - cy, z - cz, 6 * (body - self._first)
-            sums[at] += y * fz - z * fy
-            sums[at + 1] += z * fx - x * fz
-            sums[at + 2] += x * fy - y * fx
-            sums[at + 3] += fx
-            sums[at + 4] += fy
-            sums[at + 5] += fz
+        # Views of MuJoCo's arrays.
+        self._reference_w = data.subtree_com[first_body]  # the point about which MuJoCo takes moments
+        self._base_axes = data.cdof[:FREE_DOFS]
+        self._joint_axes = data.cdof[FREE_DOFS:dofs]
+        self._base_forces = data.qfrc_passive[:FREE_DOFS]
+        self._joint_forces = data.qfrc_passive[FREE_DOFS:dofs]
+
+        # Sums of wrenches from the head to each link, head first, and views of them.
+        self._sums = np.empty((links, 6))
+        self._sum_of_all = self._sums[-1]
+        self._sums_beyond_joints = self._sums[-2::-1]  # tail to head
+
+    def push(self, forces_w: Sequence[Vector], points_w: Sequence[Vector], bodies: Sequence[int]) -> None:
+        """Collect forces, in N, that act at points on the links with these body numbers."""
+        sums = [0.0] * (6 * self._link_count)
+        cx, cy, cz = self._reference_w.tolist()
+        for (fx, fy, fz), (x, y, z), body in zip(forces_w, points_w, bodies, strict=True):
+            x, y, z = x - cx, y - cy, z - cz
+            start = 6 * (body - self._first_body)
+            sums[start] += y * fz - z * fy
+            sums[start + 1] += z * fx - x * fz
+            sums[start + 2] += x * fy - y * fx
+            sums[start + 3] += fx
+            sums[start + 4] += fy
+            sums[start + 5] += fz
         self.push_links(np.array(sums).reshape(-1, 6).T)
 
     def push_links(self, wrenches: Floats) -> None:
-        """Collect moments about the center of mass, and forces, (6, n_links)."""
-        self._wrenches = wrenches if self._wrenches is None else self._wrenches + wrenches
+        """Collect one wrench per link, (6, n_links)."""
+        if self._wrenches is None:
+            self._wrenches = wrenches
+        else:
+            self._wrenches = self._wrenches + wrenches
 
     def apply(self) -> None:
-        """Add what was collected."""
+        """Add the generalized forces of the collected wrenches to MuJoCo's passive forces."""
         if self._wrenches is None:
             return
-        np.add.accumulate(self._wrenches.T[::-1], 0, None, self._beyond)
-        self._base += np.vecdot(self._base_axes, self._whole)
-        self._joints += np.vecdot(self._axes, self._beyond_joint)
+        np.add.accumulate(self._wrenches.T[::-1], 0, None, self._sums)
+        self._base_forces += np.vecdot(self._base_axes, self._sum_of_all)
+        self._joint_forces += np.vecdot(self._joint_axes, self._sums_beyond_joints)
         self._wrenches = None

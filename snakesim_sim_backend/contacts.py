@@ -1,7 +1,8 @@
 """Contacts of the snake with obstacles, read from MuJoCo's contacts.
 
-Ground, steps and the snake's own links are skipped by number before anything is computed. Between two ticks the
-physics has flushed the processor's caches, and then a few plain floats cost less than a chain of numpy calls.
+Contacts with the ground, with steps and between the snake's own links are skipped by number before anything is
+computed. Between two ticks the physics has flushed the processor's caches, and then a few plain floats cost less than a
+chain of NumPy calls.
 """
 
 import math
@@ -22,42 +23,63 @@ class Touch(NamedTuple):
 
     link: int  # 0 at the tail
     obstacle: str
-    position_w: Vector
+    position_w: Vector  # m
     normal_w: Vector  # from the obstacle into the body
     force_w: Vector  # N, on the body
 
 
 class TouchReader:
-    """Finds the contacts in a simulation's data."""
+    """Finds the contacts with obstacles in a simulation's data."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
-        self._contact, self._made = data.contact, physics.contacts
-        self._obstacles = sim.obstacle_of_geom
-        self._struck = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
-        self._links: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
+        self._contact = data.contact
+        self._friction = physics.contacts
+        self._obstacle_of_geom = sim.obstacle_of_geom
+        self._obstacle_geoms = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
+        self._link_of_geom: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
 
     def read(self) -> Iterator[Touch]:
-        """All contacts, in MuJoCo's order."""
-        struck, made = self._struck, self._made
-        found = [i for i, (first, second) in enumerate(made.pairs) if (first in struck) != (second in struck)]
-        if not found:
+        """Yield all contacts of links with obstacles, in MuJoCo's order."""
+        obstacle_geoms = self._obstacle_geoms
+        pairs = self._friction.geom_pairs
+        touching = [
+            i for i, (first, second) in enumerate(pairs) if (first in obstacle_geoms) != (second in obstacle_geoms)
+        ]
+        if not touching:
             return
-        # Whole columns at once: a view of each contact would cost more.
-        frames, places = self._contact.frame.tolist(), self._contact.pos.tolist()
-        for i in found:
-            first, second = made.pairs[i]
-            link, obstacle, sign = (second, first, 1.0) if first in struck else (first, second, -1.0)
+        # Whole columns are converted at once: a view of each contact would cost more.
+        frames = self._contact.frame.tolist()
+        points_w = self._contact.pos.tolist()
+        for i in touching:
+            first, second = pairs[i]
+            if first in obstacle_geoms:
+                obstacle, link, sign = first, second, 1.0
+            else:
+                obstacle, link, sign = second, first, -1.0
             x, y, z = (sign * along for along in frames[i][:3])  # MuJoCo's is from the first geom to the second
-            push_n, (fx, fy, fz) = made.push_n[i], made.rub_w.get(i, NO_FORCE)
-            force_w = (fx + push_n * x, fy + push_n * y, fz + push_n * z)
-            yield Touch(self._links[link], self._obstacles[obstacle] or "", tuple(places[i]), (x, y, z), force_w)
+            normal_n = self._friction.normal_force_n[i]
+            fx, fy, fz = self._friction.friction_force_w.get(i, NO_FORCE)
+            yield Touch(
+                link=self._link_of_geom[link],
+                obstacle=self._obstacle_of_geom[obstacle] or "",
+                position_w=tuple(points_w[i]),
+                normal_w=(x, y, z),
+                force_w=(fx + normal_n * x, fy + normal_n * y, fz + normal_n * z),
+            )
 
-    def sizes_n(self) -> dict[object, float]:
-        """Size of the force between each link and each obstacle that it touches; for every physics step, so quick."""
-        found: dict[object, float] = {}
-        rub_w, struck = self._made.rub_w, self._struck
-        for i, ((first, second), push_n) in enumerate(zip(self._made.pairs, self._made.push_n, strict=True)):
-            if push_n > 0.0 and (first in struck) != (second in struck):
-                size_n = math.hypot(push_n, *rub_w[i]) if i in rub_w else push_n
-                found[first, second] = found.get((first, second), 0.0) + size_n
-        return found
+    def sum_forces_n(self) -> dict[object, float]:
+        """Return the summed force between each link and each obstacle that it touches, in N, by their geoms.
+
+        It runs in every physics step, so it computes no vectors.
+        """
+        obstacle_geoms = self._obstacle_geoms
+        friction_force_w = self._friction.friction_force_w
+        sums_n: dict[object, float] = {}
+        contacts = zip(self._friction.geom_pairs, self._friction.normal_force_n, strict=True)
+        for i, ((first, second), normal_n) in enumerate(contacts):
+            if normal_n > 0.0 and (first in obstacle_geoms) != (second in obstacle_geoms):
+                force_n = normal_n
+                if i in friction_force_w:
+                    force_n = math.hypot(normal_n, *friction_force_w[i])
+                sums_n[first, second] = sums_n.get((first, second), 0.0) + force_n
+        return sums_n

@@ -1,6 +1,6 @@
-"""Pictures of a motion by MuJoCo's renderer: the snake at given poses in its scene, without any physics.
+"""Renders pictures of a motion with MuJoCo: the snake at given poses in its scene, without any physics.
 
-It is the object of an entry point in the group `snakesim.films`, which `snakesim video` finds by name.
+`Film` is the object of an entry point in the group `snakesim.films`, which `snakesim video` finds by name.
 """
 
 from collections.abc import Sequence
@@ -19,16 +19,36 @@ from snakesim_sim_backend.settings import SimSettings
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
-AZIMUTH_DEG, ELEVATION_DEG = 60.0, -58.0
-MARKS = 400  # arrows and the like in a picture
-BLUE, ARROW_M = (0.0, 0.4, 0.75, 1.0), 0.012  # of arrows: color and width
-BACKGROUND = (236, 240, 244)  # beyond the scene
-LINK, NEXT_LINK, HEAD = (0.20, 0.36, 0.54, 1.0), (0.30, 0.48, 0.68, 1.0), (0.09, 0.18, 0.33, 1.0)
-OBSTACLE, FLOOR, GRID = (0.80, 0.67, 0.47, 1.0), (0.90, 0.91, 0.93, 1.0), (0.62, 0.66, 0.72, 1.0)
-CELL_M, CELLS, LINE_M = 0.5, 8, 0.006  # of the grid on flat ground, by which one sees how far the snake has come
+# Camera.
+AZIMUTH_DEG = 60.0
+ELEVATION_DEG = -58.0
+DISTANCE_LENGTHS = 1.25  # of the snake
+
+# Colors: red, green, blue, opacity.
+BLUE = (0.0, 0.4, 0.75, 1.0)  # arrows
+LINK = (0.20, 0.36, 0.54, 1.0)
+NEXT_LINK = (0.30, 0.48, 0.68, 1.0)  # every second link
+HEAD = (0.09, 0.18, 0.33, 1.0)
+OBSTACLE = (0.80, 0.67, 0.47, 1.0)
+FLOOR = (0.90, 0.91, 0.93, 1.0)
+GRID = (0.62, 0.66, 0.72, 1.0)
+BACKGROUND = (236, 240, 244)  # beyond the scene, as bytes
+
+# Arrows, and the grid on flat ground, which shows how far the snake has advanced.
+ARROW_M = 0.012  # width
+MAX_MARKS = 400  # arrows and lines in a picture
+CELL_M = 0.5
+CELLS = 8  # to each side of the middle
+LINE_M = 0.006  # width
+
+# Light.
 SUN = np.array([0.45, 0.35, -0.82])  # its direction
-AMBIENT, HEADLIGHT, SUNLIGHT = 0.35, 0.25, 0.55
-SAMPLES = 4  # a pixel
+SUN_DISTANCE = 4.0  # in lengths of that vector
+AMBIENT = 0.35
+HEADLIGHT = 0.25
+SUNLIGHT = 0.55
+SUN_SPECULAR = 0.1
+SAMPLES_PER_PIXEL = 4
 
 
 class Film:
@@ -37,27 +57,41 @@ class Film:
     Settings = SimSettings  # of the backend, which the scene is built with
 
     def __init__(self, config: RunConfig, width: int, height: int) -> None:
-        """Raises ConfigError when there is no OpenGL."""
-        own = config.backends.get("sim", {})
-        self._sim = build(config, plugin_settings(Film, own, f"run {config.name!r}", "backends.sim"))
-        self._model, self._data = self._sim.model, mujoco.MjData(self._sim.model)
-        view, quality = self._model.vis.global_, self._model.vis.quality
-        view.offwidth, view.offheight, quality.offsamples = width, height, SAMPLES
-        self._model.vis.headlight.ambient[:], self._model.vis.headlight.diffuse[:] = AMBIENT, HEADLIGHT
-        self._flat = config.scene.ground.heightfield is None
+        """Prepare to render the scene of a run in pictures of this size, in pixels.
+
+        Raises:
+            ConfigError: the scene cannot be built, or there is no OpenGL.
+        """
+        section = config.backends.get("sim", {})
+        settings = plugin_settings(Film, section, f"run {config.name!r}", "backends.sim")
+        self._sim = build(config, settings)
+        self._model = self._sim.model
+        self._data = mujoco.MjData(self._model)
+        self._is_flat = config.scene.ground.heightfield is None
+        self._set_visuals(width, height)
         self._paint(config.robot.chain.modules)
+
+        # Renderer.
         self._gl = opened_context(width, height, "the film")
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(self._model, self._model.ngeom + MARKS)
-        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._option.geomgroup[:], self._option.geomgroup[FOOT_GROUP] = 1, 0
+        self._scene = mujoco.MjvScene(self._model, self._model.ngeom + MAX_MARKS)
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = 1
+        self._option.geomgroup[FOOT_GROUP] = 0
         self._option.geomgroup[PLANE_GROUP] = 1
-        first, joints = self._sim.first_link_body, config.robot.chain.modules
-        length_m = float(self._model.body_pos[first + 1 : first + 1 + joints, 0].sum())  # of all links but the head
-        self._camera.azimuth, self._camera.elevation = AZIMUTH_DEG, ELEVATION_DEG
-        self._camera.distance = 1.25 * length_m
+
+        # Camera.
+        first_joint_body = self._sim.first_link_body + 1
+        joint_bodies = slice(first_joint_body, first_joint_body + config.robot.chain.modules)
+        length_m = float(self._model.body_pos[joint_bodies, 0].sum())  # of all links but the head
+        self._camera = mujoco.MjvCamera()
+        self._camera.azimuth = AZIMUTH_DEG
+        self._camera.elevation = ELEVATION_DEG
+        self._camera.distance = DISTANCE_LENGTHS * length_m
+
+        # Buffers.
         self._frame = mujoco.MjrRect(0, 0, width, height)
         self._rgb = np.zeros((height, width, 3), np.uint8)
         self._depth = np.zeros((height, width), np.float32)
@@ -65,61 +99,105 @@ class Film:
     def picture(
         self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: Sequence[Floats] = ()
     ) -> Picture:
-        """The snake at a pose of its tail end, seen from above and behind. arrows_w: each (2, 3), from and to."""
-        self._data.qpos[:3], self._data.qpos[3:7] = position_w, wxyz
-        of_joints(self._data, len(angles_rad))[0][:] = angles_rad
+        """Render the snake, seen from above and behind.
+
+        Args:
+            position_w: (3,), position of the tail end, m.
+            wxyz: (4,), orientation of the tail link.
+            angles_rad: (n_joints,), tail to head.
+            look_at_w: (3,), middle of the picture, m.
+            arrows_w: arrows to draw, (2, 3) each: start and end, m.
+
+        Returns:
+            (height, width, 3), rows from the top.
+        """
+        self._data.qpos[:3] = position_w
+        self._data.qpos[3:7] = wxyz
+        joint_angles_rad, _ = of_joints(self._data, len(angles_rad))
+        joint_angles_rad[:] = angles_rad
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._camera.lookat[:] = look_at_w
+
         self._gl.make_current()
-        every = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, every, self._scene)
+        categories = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, categories, self._scene)
         self._add_sun(look_at_w)
-        if self._flat:
+        if self._is_flat:
             self._add_grid(look_at_w)
         for start_w, end_w in arrows_w:
-            self._add(mujoco.mjtGeom.mjGEOM_ARROW, ARROW_M, start_w, end_w, BLUE)
+            self._add_mark(mujoco.mjtGeom.mjGEOM_ARROW, ARROW_M, start_w, end_w, BLUE)
         mujoco.mjr_render(self._frame, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._depth, self._frame, self._context)
         picture = self._rgb.copy()
         picture[self._depth >= 1.0] = BACKGROUND
         return np.flipud(picture)
 
+    def _set_visuals(self, width: int, height: int) -> None:
+        """Set the size of the pictures, the number of samples and the light of the model."""
+        visuals = self._model.vis
+        visuals.global_.offwidth = width
+        visuals.global_.offheight = height
+        visuals.quality.offsamples = SAMPLES_PER_PIXEL
+        visuals.headlight.ambient[:] = AMBIENT
+        visuals.headlight.diffuse[:] = HEADLIGHT
+
     def _paint(self, joints: int) -> None:
-        """Colours of a film: the model's own are those that its color cameras see."""
-        colors, first = self._model.geom_rgba, self._sim.first_link_body
-        colors[:], head = OBSTACLE, first + joints
+        """Set the colors of a film: the model's own are those that its color cameras see."""
+        colors = self._model.geom_rgba
+        colors[:] = OBSTACLE
+        first = self._sim.first_link_body
+        head = first + joints
         for body in range(first, head + 1):
-            shade = HEAD if body == head else (LINK, NEXT_LINK)[(body - first) % 2]
-            colors[self._model.geom_bodyid == body] = shade
-        for name in (GROUND,) if self._flat else (GROUND, HILLS):
-            self._model.geom(name).rgba[:] = FLOOR
+            if body == head:
+                color = HEAD
+            elif (body - first) % 2:
+                color = NEXT_LINK
+            else:
+                color = LINK
+            colors[self._model.geom_bodyid == body] = color
+        self._model.geom(GROUND).rgba[:] = FLOOR
+        if not self._is_flat:
+            self._model.geom(HILLS).rgba[:] = FLOOR
 
     def _add_sun(self, look_at_w: Floats) -> None:
-        """A light from above the picture's left edge, for shadows: they show what stands where."""
+        """Add a light from above the picture's left edge: its shadows show what is where."""
         sun = self._scene.lights[self._scene.nlight]
-        sun.type, sun.castshadow, sun.headlight, sun.texid = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, 1, 0, -1
-        sun.pos[:], sun.dir[:] = look_at_w - 4.0 * SUN, SUN / np.linalg.norm(SUN)
-        sun.ambient[:], sun.diffuse[:], sun.specular[:] = 0.0, SUNLIGHT, 0.1
+        sun.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        sun.castshadow = 1
+        sun.headlight = 0
+        sun.texid = -1
+        sun.pos[:] = look_at_w - SUN_DISTANCE * SUN
+        sun.dir[:] = SUN / np.linalg.norm(SUN)
+        sun.ambient[:] = 0.0
+        sun.diffuse[:] = SUNLIGHT
+        sun.specular[:] = SUN_SPECULAR
         self._scene.nlight += 1
 
     def _add_grid(self, look_at_w: Floats) -> None:
-        middle, reach_m = CELL_M * np.round(look_at_w[:2] / CELL_M), CELL_M * CELLS
+        """Add a grid of lines that are half in the floor, and fixed in the world."""
+        middle = CELL_M * np.round(look_at_w[:2] / CELL_M)
+        half_length_m = CELL_M * CELLS
         for along in (0, 1):
+            across = 1 - along
             for k in range(-CELLS, CELLS + 1):
-                start, end = np.array([*middle, -0.5 * LINE_M]), np.array([*middle, -0.5 * LINE_M])  # half in the floor
-                start[1 - along] += k * CELL_M
-                end[1 - along] += k * CELL_M
-                start[along] -= reach_m
-                end[along] += reach_m
-                self._add(mujoco.mjtGeom.mjGEOM_CAPSULE, LINE_M, start, end, GRID)
+                start = np.array([*middle, -0.5 * LINE_M])
+                end = start.copy()
+                start[across] += k * CELL_M
+                end[across] += k * CELL_M
+                start[along] -= half_length_m
+                end[along] += half_length_m
+                self._add_mark(mujoco.mjtGeom.mjGEOM_CAPSULE, LINE_M, start, end, GRID)
 
-    def _add(self, kind: mujoco.mjtGeom, width_m: float, start_w: Floats, end_w: Floats, rgba: Sequence[float]) -> None:
+    def _add_mark(
+        self, shape: mujoco.mjtGeom, width_m: float, start_w: Floats, end_w: Floats, rgba: Sequence[float]
+    ) -> None:
+        """Add an arrow or a line to the picture, unless it is full."""
         if self._scene.ngeom >= self._scene.maxgeom:
             return
         geom = self._scene.geoms[self._scene.ngeom]
-        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, np.float32))
-        mujoco.mjv_connector(geom, kind, width_m, start_w, end_w)
+        mujoco.mjv_initGeom(geom, shape, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, np.float32))
+        mujoco.mjv_connector(geom, shape, width_m, start_w, end_w)
         self._scene.ngeom += 1
 
     def close(self) -> None:

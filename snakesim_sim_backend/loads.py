@@ -1,47 +1,71 @@
 """Readings of the force sensors: per link, the resultant of all contacts with obstacles."""
 
 import math
+from dataclasses import dataclass
 
 import mujoco
 
 from snakesim_hal.physics.physics_model import LinkLoad
-from snakesim_sim_backend.contacts import TouchReader
+from snakesim_sim_backend.contacts import Touch, TouchReader
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.physics import Physics
-from snakesim_sim_backend.sensors.frames import into
+from snakesim_sim_backend.sensors.frames import rotate_into
 
-Sums = tuple[float, float, float, float, float, float, float]
+
+@dataclass
+class _Sum:
+    """Contacts of one link, added up in the world frame."""
+
+    weight_n: float = 0.0  # sum of the sizes of the forces
+    x: float = 0.0  # sum of the positions, each times the size of its force, N·m
+    y: float = 0.0
+    z: float = 0.0
+    fx: float = 0.0  # sum of the forces, N
+    fy: float = 0.0
+    fz: float = 0.0
+
+    def add(self, touch: Touch, force_n: float) -> None:
+        """Add a contact. force_n: size of its force."""
+        x, y, z = touch.position_w
+        fx, fy, fz = touch.force_w
+        self.weight_n += force_n
+        self.x += force_n * x
+        self.y += force_n * y
+        self.z += force_n * z
+        self.fx += fx
+        self.fy += fy
+        self.fz += fz
 
 
 class LoadReader:
     """Adds up the contacts in a simulation's data."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
-        self._touches = TouchReader(sim, data, physics)
         first = sim.first_link_body
-        self._origins, self._rotations = data.xpos[first:], data.xmat[first:]  # of links and what follows
+        self._touches = TouchReader(sim, data, physics)
+        self._origins = data.xpos[first:]  # of links, and of the bodies behind them
+        self._rotations = data.xmat[first:]
 
     def read(self) -> list[LinkLoad]:
-        """Loads of the links in contact, tail to head; a contact without force is ignored."""
-        sums: dict[int, Sums] = {}
+        """Return the loads of the links in contact, tail to head; a contact without force is ignored."""
+        sums: dict[int, _Sum] = {}
         for touch in self._touches.read():
-            (fx, fy, fz), (x, y, z) = touch.force_w, touch.position_w
-            weight = math.sqrt(fx * fx + fy * fy + fz * fz)
-            if weight > 0.0:
-                w, wx, wy, wz, sx, sy, sz = sums.get(touch.link, (0.0,) * 7)
-                sums[touch.link] = (
-                    *(w + weight, wx + weight * x, wy + weight * y, wz + weight * z),
-                    *(sx + fx, sy + fy, sz + fz),
-                )
-        return [self._load(link, sums[link]) for link in sorted(sums)]
+            fx, fy, fz = touch.force_w
+            force_n = math.sqrt(fx * fx + fy * fy + fz * fz)
+            if force_n > 0.0:
+                if touch.link not in sums:
+                    sums[touch.link] = _Sum()
+                sums[touch.link].add(touch, force_n)
+        return [self._make_load(link, sums[link]) for link in sorted(sums)]
 
-    def _load(self, link: int, sums: Sums) -> LinkLoad:
-        weight, x, y, z, *force_w = sums
+    def _make_load(self, link: int, total: _Sum) -> LinkLoad:
+        """Return a link's load: the sum of the forces, at the mean position weighted by their sizes."""
         rotation = self._rotations[link].tolist()  # world_from_link, row by row
         ox, oy, oz = self._origins[link].tolist()
-        fx, fy, fz = force_w
+        weight_n = total.weight_n
+        offset_w = (total.x / weight_n - ox, total.y / weight_n - oy, total.z / weight_n - oz)
         return LinkLoad(
             link=link,
-            position_l=into(rotation, (x / weight - ox, y / weight - oy, z / weight - oz)),
-            force_l=into(rotation, (fx, fy, fz)),
+            position_l=rotate_into(rotation, offset_w),
+            force_l=rotate_into(rotation, (total.fx, total.fy, total.fz)),
         )

@@ -1,7 +1,7 @@
 """The simulated body for joint modules that are emulated elsewhere: MuJoCo without motors.
 
-The modules' firmware is not part of this model. It computes its motors' torques, passes them in for one physics step
-at a time, and reads back its encoders, strain gauges and force sensors.
+The firmware of the joint modules is not part of this model. It computes the torques of its motors, passes them in for
+one physics step at a time, and reads its encoders, strain gauges and force sensors here.
 """
 
 import msgspec
@@ -23,15 +23,15 @@ from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from snakesim_sim_backend.start import place_robot
-from snakesim_sim_backend.tether import Rope
+from snakesim_sim_backend.tether import TetherRope
 
-STEPS_PER_CHECK = 10  # the search for the cause repeats them under the last torques
-MAX_SQUARED = MAX_ACCELERATION**2
+STEPS_PER_CHECK = 10  # the search for the cause of a divergence repeats them under the last torques
+MAX_ACCELERATION_SQUARED = MAX_ACCELERATION**2
 NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
 class MujocoPhysicsModel:
-    """A `PhysicsModel` on MuJoCo. Deterministic: start and torques decide every byte.
+    """A `PhysicsModel` on MuJoCo. Deterministic: the start and the torques decide every byte.
 
     Angles, velocities and the pose are present values. Loads, shaft torques and IMU readings are forces and
     accelerations, so they are those of the last step; before the first one, of the start.
@@ -40,60 +40,91 @@ class MujocoPhysicsModel:
     Settings = PhysicsModelSettings
 
     def __init__(self, config: RunConfig, settings: PhysicsModelSettings) -> None:
-        """Lay the snake down as `SimBackend` does, at rest. Raises ConfigError."""
+        """Place the snake as `SimBackend` does, at rest.
+
+        Raises:
+            ConfigError: the settings do not match the robot or the scene.
+        """
         log_warnings()
         self._sim = build(config, settings, motors=False)
-        self._model, self._data = self._sim.model, mujoco.MjData(self._sim.model)
-        model, data = self._model, self._data
-        self.step_s: float = model.opt.timestep
-        data.qpos[:] = _rest(config, settings, yields=bool(self._sim.yielding))
-        self._physics = Physics(self._sim, data)
+        self._model = self._sim.model
+        self._data = mujoco.MjData(self._model)
+        self.step_s: float = self._model.opt.timestep
+        self._data.qpos[:] = _compute_rest(config, settings, yields=bool(self._sim.yielding))
+        self._physics = Physics(self._sim, self._data)
         self._physics.begin()
         if settings.tether is not None:
-            Rope(model, data, settings.tether).tighten()
+            TetherRope(self._model, self._data, settings.tether).tighten()
+        self._make_views(config)
+        self._make_sensors(config)
+
+        # Detection of divergence.
+        self._step_count = 0
+        self._unchecked_steps = 0
+        self._diverged = False
+        self._watch = DivergenceWatch(self._model, self._data, self._physics, STEPS_PER_CHECK, "step")
+
+    def _make_views(self, config: RunConfig) -> None:
+        """Make the views of MuJoCo's arrays that a step reads and writes."""
+        data = self._data
         count = config.robot.chain.modules
-        hinges = slice(FREE_DOFS, FREE_DOFS + count)
+        joints = slice(FREE_DOFS, FREE_DOFS + count)
         self._angles, self._velocities = of_joints(data, count)
-        self._torques, self._passive = data.qfrc_applied[hinges], data.qfrc_damper[hinges]
-        self._qacc, self._accelerations = data.qacc, data.qacc[hinges]
-        self._armature = model.dof_armature[hinges]
-        # Of all constraints MuJoCo lists equalities first, of which there are none, then the friction of the joints.
-        self._rubbing = [i for i, joint in enumerate(config.robot.joint_table) if joint.motor.friction_nm > 0]
-        self._speeds, self._speeds_before = data.qvel, data.qvel.copy()
-        self._loads = LoadReader(self._sim, data, self._physics)
-        self._pose = PoseReader(data, PoseSensor(), np.zeros)
+        self._motor_torques = data.qfrc_applied[joints]
+        self._viscous_torques = data.qfrc_damper[joints]
+        self._all_accelerations = data.qacc
+        self._joint_accelerations = data.qacc[joints]
+        self._armature = self._model.dof_armature[joints]
+        self._all_velocities = data.qvel
+        self._velocities_before_step = data.qvel.copy()
+        # MuJoCo lists equality constraints first, of which there are none, then the dry friction of joints.
+        self._joints_with_friction = [
+            i for i, joint in enumerate(config.robot.joint_table) if joint.motor.friction_nm > 0
+        ]
+
+    def _make_sensors(self, config: RunConfig) -> None:
+        """Make the readers, and switch off what MuJoCo computes for IMUs: it costs more than all else; see `imu`."""
+        self._loads = LoadReader(self._sim, self._data, self._physics)
+        self._pose = PoseReader(self._data, PoseSensor(), np.zeros)
         self._imu = None
         if config.robot.sensors.imu is not None:
-            self._imu = ImuReader(data, ImuSensor(), count + 1, np.zeros)
-        self._flags = int(model.opt.disableflags)
-        model.opt.disableflags = self._flags | NO_SENSORS  # IMUs cost more than all else here; see `imu`
-        self._steps, self._unchecked, self._diverged = 0, 0, False
-        self._watch = DivergenceWatch(model, data, self._physics, STEPS_PER_CHECK, "step")
+            links = config.robot.chain.modules + 1
+            self._imu = ImuReader(self._data, ImuSensor(), links, np.zeros)
+        self._flags_with_sensors = int(self._model.opt.disableflags)
+        self._flags_without_sensors = self._flags_with_sensors | NO_SENSORS
+        self._model.opt.disableflags = self._flags_without_sensors
 
     def advance(self, torque_nm: Floats) -> None:
-        """One physics step under these motor torques, (n_joints,).
+        """Make one physics step under these motor torques, (n_joints,).
 
-        Raises BackendError when it has diverged, and from then on always; the last state known to be good stays.
+        Raises:
+            BackendError: the simulation has diverged, in this step or before. The last good state stays.
         """
         if self._diverged:
-            self._watch.check(self._steps)  # raises again
-        self._torques[:] = torque_nm
-        self._speeds_before[:] = self._speeds
-        self._steps += 1
+            self._watch.check(self._step_count)  # raises again
+        self._motor_torques[:] = torque_nm
+        self._velocities_before_step[:] = self._all_velocities
+        self._step_count += 1
         try:
             self._physics.step(1)
         except mujoco.FatalError as error:
-            raise BackendError(f"MuJoCo cannot go on at step {self._steps}: {error}") from error
-        self._unchecked += 1
-        # Divergence shows here first; it is detected in the same step, or firmware would read NaN.
-        if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MAX_SQUARED:
-            self._diverged = True
-            try:
-                self._watch.check(self._steps)
-            except BackendError:
-                self._speeds_before[:] = self._speeds  # those of the last good state, to which the watch has gone back
-                raise
-            self._diverged, self._unchecked = False, 0
+            raise BackendError(f"MuJoCo cannot go on at step {self._step_count}: {error}") from error
+        self._unchecked_steps += 1
+        # Divergence shows here first. It is detected in the same step, because firmware would read NaN otherwise.
+        plausible = self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED
+        if self._unchecked_steps == STEPS_PER_CHECK or not plausible:
+            self._check_divergence()
+
+    def _check_divergence(self) -> None:
+        """Keep a good state. Restore the last good one and raise BackendError if the simulation has diverged."""
+        self._diverged = True
+        try:
+            self._watch.check(self._step_count)
+        except BackendError:
+            self._velocities_before_step[:] = self._all_velocities  # those of the state that the watch has restored
+            raise
+        self._diverged = False
+        self._unchecked_steps = 0
 
     @property
     def angle_rad(self) -> Floats:
@@ -106,9 +137,10 @@ class MujocoPhysicsModel:
         return self._velocities
 
     def shaft_torque_nm(self) -> Floats:
-        """Torque through each joint's shaft, as measured by a strain gauge between gear and outer link, (n_joints,).
+        """Return the torque through each joint's shaft, (n_joints,), as a strain gauge measures it.
 
-        The rotor, seen through its gear, is between motor and gauge, and so is the friction inside the module:
+        The gauge is between the gear and the outer link. The rotor, seen through its gear, is between motor and gauge,
+        and so is the friction inside the joint module:
 
             armature * acceleration = motor torque + viscous and dry friction - shaft torque
 
@@ -116,35 +148,35 @@ class MujocoPhysicsModel:
         rotor. End stops act on the outer link, beyond the gauge: a motor that pushes against its stop is measured in
         full, a load on the stop is not.
         """
-        torque = self._torques + self._passive
-        torque -= self._armature * self._accelerations
-        if self._rubbing:
-            torque[self._rubbing] += self._data.efc_force[: len(self._rubbing)]
-        return torque
+        torque_nm = self._motor_torques + self._viscous_torques
+        torque_nm -= self._armature * self._joint_accelerations
+        if self._joints_with_friction:
+            torque_nm[self._joints_with_friction] += self._data.efc_force[: len(self._joints_with_friction)]
+        return torque_nm
 
     def loads(self) -> list[LinkLoad]:
-        """Resultant of the contacts of every link that obstacles push."""
+        """Return the resultant of the contacts of every link that obstacles push."""
         return self._loads.read()
 
     def imu(self) -> Imu | None:
-        """Angular velocity and specific force of every link, without noise; None for a robot that has no IMUs.
+        """Return angular velocity and specific force of every link, without noise; None for a robot without IMUs.
 
-        Its stamp is the time since the start.
+        Its timestamp is the time since the start.
         """
         if self._imu is None:
             return None
-        model, data = self._model, self._data
-        speeds = self._speeds.copy()
-        self._speeds[:] = self._speeds_before  # all that MuJoCo computes sensors from, but these, is of the step made
-        model.opt.disableflags = self._flags
-        mujoco.mj_sensorVel(model, data)
-        mujoco.mj_sensorAcc(model, data)
-        model.opt.disableflags = self._flags | NO_SENSORS
-        self._speeds[:] = speeds
+        # MuJoCo computes sensors from the velocities before a step, and from everything else of the step itself.
+        velocities_now = self._all_velocities.copy()
+        self._all_velocities[:] = self._velocities_before_step
+        self._model.opt.disableflags = self._flags_with_sensors
+        mujoco.mj_sensorVel(self._model, self._data)
+        mujoco.mj_sensorAcc(self._model, self._data)
+        self._model.opt.disableflags = self._flags_without_sensors
+        self._all_velocities[:] = velocities_now
         return self._imu.read(0, self._timestamp_ns())
 
     def pose(self) -> Pose:
-        """Pose and velocity of the base, without noise. Its stamp is the time since the start."""
+        """Return the base's pose and velocity, without noise. Its timestamp is the time since the start."""
         return self._pose.read(0, self._timestamp_ns())
 
     def _timestamp_ns(self) -> int:
@@ -159,7 +191,7 @@ class MujocoPhysicsModel:
 
     @property
     def physics(self) -> Physics:
-        """The steps, and the forces that MuJoCo does not compute."""
+        """The physics steps, and the forces that MuJoCo does not compute."""
         return self._physics
 
     @property
@@ -168,11 +200,11 @@ class MujocoPhysicsModel:
         return self._data
 
 
-def _rest(config: RunConfig, settings: PhysicsModelSettings, *, yields: bool) -> Floats:
-    """The rest pose of `SimBackend`, (nq,): motors are needed to hold the start angles until then.
+def _compute_rest(config: RunConfig, settings: PhysicsModelSettings, *, yields: bool) -> Floats:
+    """Return the coordinates at which `SimBackend` comes to rest, (nq,): its motors hold the start angles until then.
 
-    On rough ground it depends on the step by millimetres, so the step is the default one of `SimBackend`, unless
-    obstacles that yield may need a shorter one.
+    On rough ground they depend on the step by millimeters, so the step is the default one of `SimBackend`, unless
+    obstacles that yield need a shorter one.
     """
     step_s = min(SimSettings().timestep_s, settings.contact_time_s / 2)
     if yields:

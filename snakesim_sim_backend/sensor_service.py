@@ -1,8 +1,8 @@
 """The service `sensor`: cameras and lidars in a process of their own, for a backend that has none, such as CAN.
 
-It publishes at the same keys as the simulator does, from the same models: what the robot would see if it stood in the
-scene file's world where its joints and its pose say, or a recording. A real camera's driver is such a service, too: the
-name is the first part of its keys, and in lockstep the clock names its samples by that.
+It publishes at the same keys as the simulator does, from the same models: a recording, or what the robot would see in
+the world of the scene file at its present pose and joint angles. A driver of a real camera is such a service, too. The
+service's name is the first part of its keys, and in lockstep the clock names its samples by that.
 """
 
 import mujoco
@@ -20,34 +20,50 @@ from snakesim_sim_backend.settings import SimSettings
 
 
 class SensorService(Service):
-    """What looks around."""
+    """Publishes the samples of cameras and lidars that the robot's HAL does not publish."""
 
     name = "sensor"
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Raises ConfigError for a sensor that cannot be made."""
-        self._client, self._config = client, config
-        self._joints, self._pose = client.subscribe(keys.JOINTS, JointState), client.subscribe(keys.POSE, Pose)
+        """Build the scene.
+
+        Raises:
+            ConfigError: the scene cannot be built.
+        """
+        self._client = client
+        self._config = config
+        self._joints = client.subscribe(keys.JOINTS, JointState)
+        self._pose = client.subscribe(keys.POSE, Pose)
         self._sim = build(config, SimSettings(), motors=False)
         self._data = mujoco.MjData(self._sim.model)
         self._readers: list[tuple[str, Reader]] = []
 
     def configure(self, robot: Description) -> None:
-        """Look with the sensors of the robot file that its HAL does not have."""
-        config, listed = self._config, {sensor.key for sensor in robot.sensors}
-        self._readers = [
-            (key, mounted_reader(key, sensor, Scope(config, self._sim, self._data, own_noise(key, config.seed))))
-            for key, sensor in config.robot.sensors.mounted()
-            if key not in listed
-        ]
+        """Make a reader for each sensor of the robot file that the robot's HAL does not have."""
+        published = {sensor.key for sensor in robot.sensors}
+        self._readers = []
+        for key, sensor in self._config.robot.sensors.mounted():
+            if key not in published:
+                scope = Scope(self._config, self._sim, self._data, own_noise(key, self._config.seed))
+                self._readers.append((key, mounted_reader(key, sensor, scope)))
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """A sample of each, at every turn, whatever rate the robot file says; None while joints or pose are unknown."""
-        joints, pose = self._client.read(self._joints), self._client.read(self._pose)
+        """Return a sample of each sensor, in every cycle, whatever rate the robot file has.
+
+        None while joint angles or pose are unknown.
+        """
+        joints = self._client.read(self._joints)
+        pose = self._client.read(self._pose)
         if joints is None or pose is None:
             return None
-        self._data.qpos[:3] = pose.position_w
-        self._data.qpos[3:FREE_QPOS] = np.asarray(pose.orientation_wxyz) / np.linalg.norm(pose.orientation_wxyz)
-        of_joints(self._data, len(joints.angle_rad))[0][:] = joints.angle_rad
-        mujoco.mj_kinematics(self._sim.model, self._data)
+        self._set_state(joints, pose)
         return [(key, reader.read(clock.tick, joints.timestamp_ns)) for key, reader in self._readers]
+
+    def _set_state(self, joints: JointState, pose: Pose) -> None:
+        """Put the model's robot where the real one is."""
+        orientation = np.asarray(pose.orientation_wxyz)
+        self._data.qpos[:3] = pose.position_w
+        self._data.qpos[3:FREE_QPOS] = orientation / np.linalg.norm(pose.orientation_wxyz)
+        angles_rad, _ = of_joints(self._data, len(joints.angle_rad))
+        angles_rad[:] = joints.angle_rad
+        mujoco.mj_kinematics(self._sim.model, self._data)

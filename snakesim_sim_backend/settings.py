@@ -22,7 +22,7 @@ class Tether(FileStruct, frozen=True, kw_only=True):
 
 
 class SimSettings(FileStruct, frozen=True, kw_only=True):
-    """Parameters of the physics. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
+    """Parameters of the physics. The defaults suit robots of centimeters to decimeters and of a few kilograms."""
 
     # The longest physics step; it is shortened so that a control period is a multiple of it.
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.002
@@ -30,7 +30,7 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     contact_time_s: Annotated[float, bounded(1e-4, 0.1, "s")] = 0.005
     # Between links of the snake itself.
     self_friction: Annotated[float, from_zero(5, "1 (Coulomb coefficient)")] = 0.3
-    # What the simulated body has, over what the robot file says, which everybody else goes by.
+    # Value of the simulated body divided by that of the robot file, which all other programs use.
     mass_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0  # of every link
     motor_gain_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0
     # Longest time that the snake may take to come to rest before the run begins.
@@ -45,6 +45,6 @@ class PhysicsModelSettings(SimSettings, frozen=True, kw_only=True):
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.001
 
     def __post_init__(self) -> None:
-        """The motors are the firmware's."""
+        """Reject a gain scale: the motors belong to the firmware."""
         if self.motor_gain_scale != 1.0:
             raise ValueError("`motor_gain_scale` is of motors in the simulator; those of emulated modules are firmware")

@@ -1,13 +1,17 @@
-"""How hard everything is that MuJoCo finds contacts of. They only push: friction is in contact_friction.py."""
+"""Contact parameters of everything that MuJoCo finds contacts of.
+
+MuJoCo only pushes: friction is in contact_friction.py.
+"""
 
 from typing import TypedDict
 
 from snakesim_sim_backend.settings import SimSettings
 
 IMPEDANCE = [0.95, 0.99, 0.001, 0.5, 2.0]  # solimp, see MuJoCo's manual: at first touch, and 1 mm deeper
+FRICTIONLESS_DIMENSION = 1  # condim: normal force alone
 
 
-class Skin(TypedDict):
+class ContactParameters(TypedDict):
     """Keyword arguments of MjsBody.add_geom."""
 
     condim: int
@@ -15,6 +19,6 @@ class Skin(TypedDict):
     solimp: list[float]
 
 
-def skin(settings: SimSettings) -> Skin:
-    """Of every geom that touches."""
-    return Skin(condim=1, solref=[settings.contact_time_s, 1.0], solimp=IMPEDANCE)
+def contact_parameters(settings: SimSettings) -> ContactParameters:
+    """Return the contact parameters of every geom that can touch another."""
+    return ContactParameters(condim=FRICTIONLESS_DIMENSION, solref=[settings.contact_time_s, 1.0], solimp=IMPEDANCE)

@@ -13,7 +13,7 @@ from snakesim_drivers.kit.readings import Readings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_serial_backend.dynamixel.emulator import CURRENT_A, MOST_CURRENT, EmulatedDynamixel
+from snakesim_serial_backend.dynamixel.emulator import CURRENT_A, MAX_CURRENT, EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import Port
@@ -22,28 +22,30 @@ from snakesim_serial_backend.dynamixel.servos import Servos
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
 from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
 
-GAP_S, GAP_SHARE = 0.002, 0.2  # of silence, or of a period, after which no answer is expected
+# A silence of this length ends an answer, whichever is longer.
+MIN_GAP_S = 0.002
+GAP_PER_PERIOD = 0.2
 
 
 class DynamixelBackend(DriverTypeBackend):
     """A `snakesim_hal.backend.Backend` on Dynamixel X servos, real or emulated."""
 
-    Settings, name = DynamixelSettings, NAME
-    MODES = ("position", "torque")  # what else a robot file says its joints have, they do not have here
+    Settings = DynamixelSettings
+    name = NAME
+    MODES = ("position", "torque")  # servos have no other mode, even if the robot file lists one
 
     @classmethod
     def ports(cls, settings: DynamixelSettings) -> Sequence[str]:
-        """Its serial ports."""
         return settings.ports
 
     @classmethod
     def bus_faults(cls, settings: DynamixelSettings) -> Collection[str]:
-        """Of emulated servos."""
-        return set() if settings.ports else {"cut"}
+        if settings.ports:
+            return set()
+        return {"cut"}
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
-        """Servos, and the load of their ports."""
         check_joints(config, settings, joints)
         check_load(config.rate_hz / settings.decimation, settings, joints)
 
@@ -56,54 +58,62 @@ class DynamixelBackend(DriverTypeBackend):
         clock: Clock,
         body: EmulatedBody | None,
     ) -> list[Bus]:
-        """One for each port, or one of emulated servos."""
-        gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
-        log = _log(settings.log)
+        gap_s = max(MIN_GAP_S, GAP_PER_PERIOD * config.period_ns * 1e-9)
+        log = _open_log(settings.log)
 
-        def open_servos(port: str, mine: Sequence[int], readings: Readings) -> Servos:
+        def open_servos(port_name: str, numbers: Sequence[int], readings: Readings) -> Servos:
+            """Open a port with the servos of these joints; emulated servos are on a pseudo terminal."""
             emulator = None
-            if body is not None:
+            if body is None:
+                wire = SerialWire(port_name, settings.baud, log)
+            else:
                 pty = Pty()
                 emulator = emulator_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
-            else:
-                wire = SerialWire(port, settings.baud, log)
-            on_it = Port(wire, gap_s)
-            servos = [servo_of(joints[j], on_it) for j in mine]
+            port = Port(wire, gap_s)
+            servos = [servo_of(joints[number], port) for number in numbers]
             answer_s = answer_limit_s(config, settings.decimation)
-            return Servos(servos, on_it, readings, settings, clock.ns, answer_s, emulator)
+            return Servos(servos, port, readings, settings, clock.ns, answer_s, emulator)
 
-        return buses_of(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
+        ports = settings.ports
+        if body is not None:
+            ports = [NAME]
+        return buses_of(joints, settings, ports, open_servos)
 
 
 def servo_of(joint: Joint, port: Port) -> Servo:
-    """A servo with the numbers of its joint, at its horn."""
-    drive, motor, limits = joint.drive, joint.motor, joint.limits
-    turns = drive.sign * drive.gear
-    ends = drive.zero_rad + turns * limits.lower_rad, drive.zero_rad + turns * limits.upper_rad
+    """Return a servo with the parameters of its joint, converted to its horn."""
+    drive = joint.drive
+    limits = joint.limits
+    ratio = drive.sign * drive.gear  # rotation of the horn for one of the joint
+    end_a_rad = drive.zero_rad + ratio * limits.lower_rad
+    end_b_rad = drive.zero_rad + ratio * limits.upper_rad
     return Servo(
         id=joint.id,
         name=joint.name,
         port=port,
         constant=constant_of(joint),
-        stiffness=motor.stiffness_nm_per_rad / drive.gear**2,
-        damping=motor.damping_nm_s_per_rad / drive.gear**2,
-        lower_rad=min(ends),
-        upper_rad=max(ends),
+        stiffness=joint.motor.stiffness_nm_per_rad / drive.gear**2,
+        damping=joint.motor.damping_nm_s_per_rad / drive.gear**2,
+        lower_rad=min(end_a_rad, end_b_rad),
+        upper_rad=max(end_a_rad, end_b_rad),
         torque_nm=limits.torque_nm / drive.gear,
         speed_rad_s=limits.speed_rad_s * drive.gear,
     )
 
 
 def constant_of(joint: Joint) -> float:
-    """Its torque constant, N·m/A; without one, that of an emulator with twice the current it needs."""
-    max_a = MOST_CURRENT * CURRENT_A / 2
+    """Return a joint's torque constant in N·m/A.
+
+    Without one, which only emulated servos may lack, it is such that half of the possible current gives full torque.
+    """
+    max_a = MAX_CURRENT * CURRENT_A / 2
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / max_a
 
 
 def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
-    """Raise ConfigError for joints that no servo can be."""
-    real = not all(map(is_emulated, settings.ports))
+    """Raise ConfigError for joints that no servo can drive."""
+    has_real_servos = not all(is_emulated(port) for port in settings.ports)
     for joint in joints:
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
@@ -114,7 +124,7 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
                 f"off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
                 f"{TURN - 2 * SLACK_RAD:.2f} rad"
             )
-        if joint.motor.torque_constant_nm_per_a is None and real:
+        if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
                 f"{who(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit amperes: "
                 f"take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
@@ -123,8 +133,8 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
 
 def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError when a port cannot carry its servos."""
-    on = port_of(joints, settings.ports)
-    fullest = max(on.count(bus) for bus in set(on))
+    bus_of_joint = port_of(joints, settings.ports)
+    fullest = max(bus_of_joint.count(bus) for bus in set(bus_of_joint))
     busy_s = cycle_s(fullest, settings.baud)
     if busy_s * rate_hz > MAX_LOAD:
         raise ConfigError(
@@ -138,21 +148,34 @@ def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joi
 def emulator_on(
     config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: Clock, pose: str | None
 ) -> EmulatedDynamixel:
-    """Emulated servos of a whole robot."""
+    """Make emulated servos for a whole robot.
+
+    Args:
+        config: the run.
+        settings: the scenario's section of this driver type.
+        ptys: a pseudo terminal for each of its ports.
+        clock: the time of the servos.
+        pose: where motion capture sends poses, HOST:PORT; None: nowhere.
+    """
     joints = config.robot.joint_table
-    each = [ptys[bus] for bus in port_of(joints, settings.ports)]
-    return emulator_of(joints, settings, body_of(config, settings, NAME, pose), each, clock)
+    body = body_of(config, settings, NAME, pose)
+    pty_of_joint = [ptys[bus] for bus in port_of(joints, settings.ports)]
+    return emulator_of(joints, settings, body, pty_of_joint, clock)
 
 
 def emulator_of(
     joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: Clock
 ) -> EmulatedDynamixel:
-    """Emulated servos. ptys: of every joint."""
-    return EmulatedDynamixel(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.ns)
+    """Make emulated servos for joints. ptys: the pseudo terminal of every joint's servo."""
+    constants = [constant_of(joint) for joint in joints]
+    return EmulatedDynamixel(body, ptys, constants, settings.baud, clock.ns)
 
 
-def _log(path: str) -> TextIO | None:
+def _open_log(path: str) -> TextIO | None:
+    """Open the file for all bytes; None without a path. Raises BackendError."""
+    if not path:
+        return None
     try:
-        return Path(path).open("w", encoding="utf-8") if path else None
+        return Path(path).open("w", encoding="utf-8")
     except OSError as error:
         raise BackendError(f"`backends.dynamixel.log` = {path!r}: {error.strerror}") from error

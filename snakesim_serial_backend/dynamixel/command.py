@@ -23,11 +23,11 @@ from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
 from snakesim_serial_backend.wire import Pty
 
-TABLE_OF = (1, 4, 8, 13, 18, 24)  # servos on a port
+TABLE_SERVOS = (1, 4, 8, 13, 18, 24)  # numbers of servos on a port in the load table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code: 0 when stopped, 1 a fault, 2 wrong input and nothing started."""
+    """Run the command, and return its exit code: 0 when stopped, 1 for a fault, 2 for wrong input."""
     arguments = parser().parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+    """Return the parser of the command's arguments."""
     parser = argparse.ArgumentParser(prog="snakesim dynamixels", description=__doc__)
     add = parser.add_argument
     add("scenario", help="name of a shipped scenario, or path of a scenario file")
@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def serve(arguments: argparse.Namespace) -> int:
-    """Until a stop signal."""
+    """Emulate the servos until a stop signal."""
     overrides = [Override("backend", NAME, "snakesim dynamixels"), *map(parse_set, arguments.set)]
     loaded = load(arguments.scenario, overrides)
     config = msgspec.structs.replace(loaded.config, clock_mode="realtime")
@@ -69,16 +69,16 @@ def serve(arguments: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def named(links: Sequence[Path]) -> Iterator[list[Pty]]:
-    """Pseudo terminals with names, which are taken away at the end. Raises ConfigError."""
-    ptys, made = [Pty() for _ in links], list[Path]()
+    """Make pseudo terminals with names, which are removed at the end.
+
+    Raises:
+        ConfigError: a name cannot be given.
+    """
+    ptys = [Pty() for _ in links]
+    made: list[Path] = []
     try:
         for link, pty in zip(links, ptys, strict=True):
-            try:
-                if link.is_symlink() and not link.exists():  # left behind
-                    link.unlink()
-                link.symlink_to(pty.path)
-            except OSError as error:
-                raise ConfigError(f"--link {link}: {error.strerror}; give another name") from error
+            _make_link(link, pty.path)
             made.append(link)
         yield ptys
     finally:
@@ -88,11 +88,21 @@ def named(links: Sequence[Path]) -> Iterator[list[Pty]]:
             pty.close()
 
 
+def _make_link(link: Path, target: str) -> None:
+    """Make a symbolic link. One that an earlier run has left behind is replaced. Raises ConfigError."""
+    try:
+        if link.is_symlink() and not link.exists():
+            link.unlink()
+        link.symlink_to(target)
+    except OSError as error:
+        raise ConfigError(f"--link {link}: {error.strerror}; give another name") from error
+
+
 def table() -> Iterator[str]:
-    """The load table."""
+    """Yield the lines of the load table."""
     rates = list(RATE)
     yield "servos   bytes" + "".join(f"{_baud(baud):>19}" for baud in rates)
-    for servos in TABLE_OF:
+    for servos in TABLE_SERVOS:
         cells = [f"{1e3 * cycle_s(servos, baud):.1f} ms, {fits_hz(servos, baud)} Hz" for baud in rates]
         yield f"{servos:6}{cycle_bytes(servos):8}" + "".join(f"{cell:>19}" for cell in cells)
     yield (
@@ -102,7 +112,9 @@ def table() -> Iterator[str]:
 
 
 def _baud(baud: int) -> str:
-    return f"{baud / 1e6:g} Mbit/s" if baud >= 1_000_000 else f"{baud} bit/s"
+    if baud >= 1_000_000:
+        return f"{baud / 1e6:g} Mbit/s"
+    return f"{baud} bit/s"
 
 
 if __name__ == "__main__":

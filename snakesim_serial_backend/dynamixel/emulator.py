@@ -1,11 +1,12 @@
 """Emulated servos: control table, packets, refusals, alerts and bus watchdog of the X series, on a body that moves.
 
-They do *not* simulate bit rate and delays of answers, collisions, profiles, the integral and feed-forward gains, PWM
-and velocity limits, encoder faults. The scale of the position law's gains is assumed, as the driver's is.
+They do *not* simulate bit rate and delays of answers, profiles, the integral and feed-forward gains, PWM and velocity
+limits, or encoder faults. Answers collide only when a second servo with the same id is injected. The scale of the
+position law's gains is assumed, as the driver's is.
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody, EmulatedDrive
@@ -23,44 +24,56 @@ from snakesim_serial_backend.dynamixel.packets import (
 )
 from snakesim_serial_backend.wire import Pty
 
-MODEL, FIRMWARE = 1120, 46  # XM540-W270
-CURRENT_A = 0.00269
-MOST_CURRENT = 2047
-PWM_LIMIT, MOST_PWM = 36, 885
+MODEL = 1120  # XM540-W270
+FIRMWARE = 46
+CURRENT_A = 0.00269  # one unit of current
+MAX_CURRENT = 2047  # units of current
+MAX_PWM = 885
 FACTORY_DELAY = 250  # of an answer, in 2 us
-ELSEWHERE_COUNTS = 1000  # how far from a servo a second one with its id is
-SHUTDOWN, SHUTDOWN_BY = 63, 0x34  # overload, electrical shock, overheating
-MODES = (0, 1, 3, 4, 5, 16)
+ID_WITHOUT_SERVO = 255  # as secondary id: there is none
+SECOND_SERVO_COUNTS = 1000  # how far from a servo a second one with its id is
+SHUTDOWN_ERRORS = 0x34  # overload, electrical shock, overheating: these switch the torque off
+OPERATING_MODES = (0, 1, 3, 4, 5, 16)
 WRITABLE = [(7, 14), (20, 64), (64, 70), (76, 120)]  # addresses from, to
+
+# Registers that only the emulator uses.
+FIRMWARE_VERSION = 6
+ID = 7
+BAUD_RATE = 8
+PROTOCOL = 13
+MAX_TEMPERATURE = 31
+PWM_LIMIT = 36
+SHUTDOWN = 63
+FIRST_GOAL = 100  # the goals of PWM, current, velocity and position follow each other
 
 
 @dataclass
-class Servo:
-    """One servo: its table, and what is not in it."""
+class EmulatedServo:
+    """One servo: its control table, and what the table does not hold."""
 
     table: bytearray
     port: Pty
-    unit_nm: float
-    from_counts: int = 0  # what its turns count from, since it woke up
-    fed_us: float = 0.0
+    unit_nm: float  # torque of one unit of current
+    from_counts: int = 0  # angle at which its present position was 0 when it woke up
+    fed_us: float = 0.0  # when it received its last packet
     held_counts: int | None = None  # where the watchdog has stopped it
 
-    def get(self, form: str, address: int) -> int:
-        """A register."""
+    def read_register(self, form: str, address: int) -> int:
+        """Return a register; form: its type for `struct`."""
         return struct.unpack_from("<" + form, self.table, address)[0]
 
-    def put(self, form: str, address: int, value: int) -> None:
-        """Set a register."""
+    def write_register(self, form: str, address: int, value: int) -> None:
+        """Set a register; form: its type for `struct`."""
         struct.pack_into("<" + form, self.table, address, value)
 
     @property
     def id(self) -> int:
-        """Its id."""
-        return self.table[7]
+        """The id to which the servo answers."""
+        return self.table[ID]
 
     @property
     def on(self) -> bool:
-        """Whether its torque is on."""
+        """Whether the torque is on."""
         return self.table[at.TORQUE_ENABLE] == 1
 
 
@@ -75,18 +88,20 @@ class EmulatedDynamixel(EmulatedDrive):
         baud: int,
         clock_ns: Callable[[], int],
     ) -> None:
-        """ports: of every joint; constants: torque constants, N·m/A; clock_ns: the time, since anything."""
-        self.servos: list[Servo] = []
+        """Make a servo for every joint of a body.
+
+        Args:
+            body: the body that the servos move.
+            ports: the port of every joint's servo.
+            constants: torque constant of every joint's servo, N·m/A.
+            baud: baud rate that the servos are set to.
+            clock_ns: a clock with any origin.
+        """
+        self.servos: list[EmulatedServo] = []
         for joint, port, constant in zip(body.joints, ports, constants, strict=True):
-            servo = Servo(bytearray(at.SIZE), port, CURRENT_A * constant)
-            servo.put("H", at.MODEL, MODEL)
-            servo.table[6], servo.table[7], servo.table[8] = FIRMWARE, joint.id, at.RATE[baud]
-            servo.table[at.DELAY], servo.table[at.OPERATING_MODE], servo.table[13] = FACTORY_DELAY, 3, 2
-            servo.table[at.SECONDARY_ID] = 255
-            servo.put("H", PWM_LIMIT, MOST_PWM)
-            servo.table[31], servo.table[SHUTDOWN] = 80, SHUTDOWN_BY
-            servo.put("H", at.LEAST_VOLTAGE, round(joint.limits.min_voltage_v / at.VOLTS))
-            servo.put("H", at.CURRENT_LIMIT, MOST_CURRENT)
+            servo = EmulatedServo(bytearray(at.SIZE), port, CURRENT_A * constant)
+            self._write_factory_settings(servo, joint.id, baud)
+            servo.write_register("H", at.MIN_VOLTAGE, round(joint.limits.min_voltage_v / at.VOLTS))
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
         self._decoders = [Decoder() for _ in self._ends]
@@ -94,51 +109,69 @@ class EmulatedDynamixel(EmulatedDrive):
         for i in range(len(self.servos)):
             self.restart(i)
 
+    @staticmethod
+    def _write_factory_settings(servo: EmulatedServo, id_: int, baud: int) -> None:
+        """Set the registers that a servo keeps without power."""
+        servo.write_register("H", at.MODEL, MODEL)
+        servo.table[FIRMWARE_VERSION] = FIRMWARE
+        servo.table[ID] = id_
+        servo.table[BAUD_RATE] = at.RATE[baud]
+        servo.table[at.DELAY] = FACTORY_DELAY
+        servo.table[at.OPERATING_MODE] = 3  # position
+        servo.table[at.SECONDARY_ID] = ID_WITHOUT_SERVO
+        servo.table[PROTOCOL] = 2
+        servo.table[MAX_TEMPERATURE] = 80  # °C
+        servo.write_register("H", PWM_LIMIT, MAX_PWM)
+        servo.write_register("H", at.CURRENT_LIMIT, MAX_CURRENT)
+        servo.table[SHUTDOWN] = SHUTDOWN_ERRORS
+
     def __call__(self) -> None:
         """Handle what has arrived, and let time pass up to now."""
-        taken = [port.take() for port in self._ends]  # may wait for the kernel; nobody else has to wait for it
+        received = [port.receive() for port in self._ends]  # may wait for the kernel, so it comes before the lock
         with self.body.lock:
             self.catch_up()
-            for port, decoder, data in zip(self._ends, self._decoders, taken, strict=True):
+            for port, decoder, data in zip(self._ends, self._decoders, received, strict=True):
                 for packet in decoder.feed(data):
                     if packet.instruction != Instruction.STATUS:
-                        self._take(port, packet)
+                        self._handle_packet(port, packet)
             self.pass_time()
 
     # --- packets ----------------------------------------------------------------------------------------------
 
-    def _take(self, port: Pty, packet: Packet) -> None:
-        mine = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.deaf(i)]
-        by_id = {self.servos[i].id: i for i in mine}
-        for i in mine:
+    def _handle_packet(self, port: Pty, packet: Packet) -> None:
+        """Handle a packet for one servo or for several servos of a port."""
+        listening = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.deaf(i)]
+        index_of_id = {self.servos[i].id: i for i in listening}
+        for i in listening:
             self.servos[i].fed_us = self.body.now_us
-        given = packet.parameters
+        parameters = packet.parameters
         match packet.instruction:
             case Instruction.SYNC_WRITE:
-                address, size = struct.unpack_from("<HH", given)
-                for start in range(4, len(given), size + 1):
-                    if (i := by_id.get(given[start])) is not None:
-                        self._write(i, address, given[start + 1 : start + 1 + size])
+                self._write_several(parameters, index_of_id)
             case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
-                self._read_all(port, packet.instruction, given[:4], [by_id.get(id_) for id_ in given[4:]])
+                indices = [index_of_id.get(id_) for id_ in parameters[4:]]
+                self._read_several(port, packet.instruction, parameters[:4], indices)
             case Instruction.PING if packet.id == EVERYBODY:
-                for _, i in sorted(by_id.items()):
-                    self._obey(i, packet.instruction, given)
-            case instruction if packet.id in by_id:
-                self._obey(by_id[packet.id], instruction, given)
+                for _, i in sorted(index_of_id.items()):
+                    self._execute(i, packet.instruction, parameters)
+            case instruction if packet.id in index_of_id:
+                self._execute(index_of_id[packet.id], instruction, parameters)
             case _:
                 pass
 
-    def _obey(self, i: int, instruction: int, given: bytes) -> None:
-        """What one servo is told, or asked for."""
+    def _execute(self, i: int, instruction: int, parameters: bytes) -> None:
+        """Execute an instruction to one servo, and answer it."""
+        servo = self.servos[i]
         match instruction:
             case Instruction.PING:
-                self._answer(i, bytes(self.servos[i].table[:2]) + bytes([self.servos[i].table[6]]))
+                self._answer(i, bytes(servo.table[:2]) + bytes([servo.table[FIRMWARE_VERSION]]))
             case Instruction.READ:
-                data, refusal = self._read(i, given)
-                self._answer(i, data, refusal, self._read_second(i, given))
+                data, refusal = self._read(i, parameters)
+                self._answer(i, data, refusal, self._read_second(i, parameters))
             case Instruction.WRITE:
-                self._answer(i, b"", self._write(i, struct.unpack_from("<H", given)[0], given[2:]))
+                (address,) = struct.unpack_from("<H", parameters)
+                refusal = self._write(i, address, parameters[2:])
+                self._answer(i, b"", refusal)
             case Instruction.REBOOT:
                 self._answer(i, b"")
                 self.body.boot(i)
@@ -146,148 +179,200 @@ class EmulatedDynamixel(EmulatedDrive):
             case _:
                 self._answer(i, b"", Refusal.INSTRUCTION)
 
-    def _read_all(self, port: Pty, instruction: int, what: bytes, asked: Sequence[int | None]) -> None:
-        """In the order of their ids in the packet: each waits for the one before it, for ever."""
-        parts: list[tuple[int, int, bytes]] = []
-        seconds: list[tuple[int, int, bytes]] = []  # the same, with what a second servo of an id puts there
-        for i in asked:
+    def _write_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+        """Execute a sync write: address, size, and an id with data for each servo."""
+        address, size = struct.unpack_from("<HH", parameters)
+        for start in range(4, len(parameters), size + 1):
+            i = index_of_id.get(parameters[start])
+            if i is not None:
+                self._write(i, address, parameters[start + 1 : start + 1 + size])
+
+    def _read_several(self, port: Pty, instruction: int, registers: bytes, indices: Sequence[int | None]) -> None:
+        """Answer a sync read in the order of its ids.
+
+        Each servo waits for the one before it without end, so the first one that is silent ends the answer.
+
+        Args:
+            port: the port of the servos.
+            instruction: SYNC_READ or FAST_SYNC_READ.
+            registers: address and size, as in the packet.
+            indices: the servo of each id in the packet; None for an id that no servo has.
+        """
+        parts: list[tuple[int, int, bytes]] = []  # error, id and data of each servo
+        second_parts: list[tuple[int, int, bytes]] = []  # the same, with the data of a second servo with its id
+        for i in indices:
             if i is None or self.body.silent(i):
                 break
-            data, refusal = self._read(i, what)
-            second = self._read_second(i, what)
+            data, refusal = self._read(i, registers)
+            second_data = self._read_second(i, registers)
             if instruction == Instruction.SYNC_READ:
-                self._answer(i, data, refusal, second)
+                self._answer(i, data, refusal, second_data)
             else:
-                parts.append((refusal | self._alert(i), self.servos[i].id, data))
-                seconds.append((refusal | self._alert(i), self.servos[i].id, second))
+                error = refusal | self._alert(i)
+                parts.append((error, self.servos[i].id, data))
+                second_parts.append((error, self.servos[i].id, second_data))
         if parts:
-            port.give(collided(fast_status(parts, len(asked)), fast_status(seconds, len(asked))))
+            port.send(collide(fast_status(parts, len(indices)), fast_status(second_parts, len(indices))))
 
-    def _answer(self, i: int, data: bytes, refusal: int = 0, second: bytes | None = None) -> None:
-        """Give a servo's status. second: the data of a second servo with its id, where they differ."""
+    def _answer(self, i: int, data: bytes, refusal: int = 0, second_data: bytes | None = None) -> None:
+        """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
         if self.body.silent(i):
             return
-        servo, error = self.servos[i], bytes([refusal | self._alert(i)])
+        servo = self.servos[i]
+        error = bytes([refusal | self._alert(i)])
         status = encoded(servo.id, Instruction.STATUS, error + data)
         if not self.body.is_doubled(i):
-            servo.port.give(status)
+            servo.port.send(status)
             return
-        other = encoded(servo.id, Instruction.STATUS, error + (data if second is None else second))
+        if second_data is None:
+            second_data = data
+        second_status = encoded(servo.id, Instruction.STATUS, error + second_data)
         if servo.table[at.DELAY] == self._delay_of_second[i]:
-            servo.port.give(collided(status, other))
+            servo.port.send(collide(status, second_status))
         else:
-            servo.port.give(status + other)
+            servo.port.send(status + second_status)
 
     def _alert(self, i: int) -> int:
-        return ALERT if self.servos[i].table[at.HARDWARE_ERROR] else 0
+        """Return the bit of a status that reports a hardware error."""
+        if self.servos[i].table[at.HARDWARE_ERROR]:
+            return ALERT
+        return 0
 
-    def _read(self, i: int, what: bytes) -> tuple[bytes, int]:
-        address, size = struct.unpack("<HH", what)
+    def _read(self, i: int, registers: bytes) -> tuple[bytes, int]:
+        """Return the data of registers, and the refusal, 0 for none. registers: address and size."""
+        address, size = struct.unpack("<HH", registers)
         if address + size > at.SIZE:
             return b"", Refusal.ACCESS
         self._measure(i)
         return bytes(self.servos[i].table[address : address + size]), 0
 
-    def _read_second(self, i: int, what: bytes) -> bytes:
-        """The same registers of a second servo with the id of this one; without one, of the servo itself."""
-        address, size = struct.unpack("<HH", what)
+    def _read_second(self, i: int, registers: bytes) -> bytes:
+        """Return the same registers of a second servo with the id of this one; without one, of the servo itself."""
+        address, size = struct.unpack("<HH", registers)
         table = self.servos[i].table[:]
         if self.body.is_doubled(i):
-            (counts,) = struct.unpack_from("<i", table, at.PRESENT + 6)
-            struct.pack_into("<i", table, at.PRESENT + 6, counts + ELSEWHERE_COUNTS)
+            (counts,) = struct.unpack_from("<i", table, at.PRESENT_POSITION)
+            struct.pack_into("<i", table, at.PRESENT_POSITION, counts + SECOND_SERVO_COUNTS)
         return bytes(table[address : address + size])
 
     def _measure(self, i: int) -> None:
-        servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self.body.shaft(i)
-        servo.put("h", at.PRESENT, max(min(round(torque_nm / servo.unit_nm), 32767), -32768))
-        servo.put("i", at.PRESENT + 2, round(velocity_rad_s / at.SPEED))
-        servo.put("i", at.PRESENT + 6, round(angle_rad / at.RAD) - servo.from_counts)
-        servo.put("H", at.VOLTAGE, round(self.body.supply(i)[0] / at.VOLTS))
-        servo.table[at.TEMPERATURE] = min(max(round(self.body.temperatures(i)[0]), 0), 255)
+        """Update the registers of what a servo measures."""
+        servo = self.servos[i]
+        angle_rad, velocity_rad_s, torque_nm = self.body.shaft(i)
+        voltage_v = self.body.supply(i)[0]
+        temperature_c = self.body.temperatures(i)[0]
+        current = max(min(round(torque_nm / servo.unit_nm), 32767), -32768)
+        servo.write_register("h", at.PRESENT, current)
+        servo.write_register("i", at.PRESENT_VELOCITY, round(velocity_rad_s / at.SPEED))
+        servo.write_register("i", at.PRESENT_POSITION, round(angle_rad / at.RAD) - servo.from_counts)
+        servo.write_register("H", at.VOLTAGE, round(voltage_v / at.VOLTS))
+        servo.table[at.TEMPERATURE] = min(max(round(temperature_c), 0), 255)
 
     def _write(self, i: int, address: int, data: bytes) -> int:
-        """Set registers, all of them or none; why not."""
-        servo, end = self.servos[i], address + len(data)
+        """Set registers, all of them or none, and return the refusal, 0 for none."""
+        servo = self.servos[i]
+        end = address + len(data)
         if not any(first <= address and end <= last for first, last in WRITABLE):
             return Refusal.ACCESS
         if address < at.TORQUE_ENABLE and servo.on:
             return Refusal.ACCESS
-        after = servo.table[:]
-        after[address:end] = data
-        if why := self._refusal(servo, after, address, end):
-            return why
-        servo.table = after
+        table = servo.table[:]
+        table[address:end] = data
+        refusal = self._check_registers(servo, table, address, end)
+        if refusal:
+            return refusal
+        servo.table = table
         if address <= at.DELAY < end and self.body.is_doubled(i):
-            self._delay_of_second[i] = after[at.DELAY]
-        if address <= at.WATCHDOG < end and after[at.WATCHDOG] == 0:
+            self._delay_of_second[i] = table[at.DELAY]
+        if address <= at.WATCHDOG < end and table[at.WATCHDOG] == 0:
             servo.held_counts = None
         self._drive(i)
         return 0
 
     @staticmethod
-    def _refusal(servo: Servo, after: bytearray, address: int, end: int) -> int:
-        new = Servo(after, servo.port, servo.unit_nm)
-        goals = address < at.GOAL_POSITION + 4 and end > 100
-        if servo.table[at.WATCHDOG] == at.TRIPPED and goals:
+    def _check_registers(servo: EmulatedServo, table: bytearray, address: int, end: int) -> int:
+        """Return the refusal of a write, 0 for none. table: the control table after it; address, end: what it sets."""
+        after = EmulatedServo(table, servo.port, servo.unit_nm)
+        sets_watchdog = address <= at.WATCHDOG < end
+        sets_goals = address < at.GOAL_POSITION + 4 and end > FIRST_GOAL
+        if servo.table[at.WATCHDOG] == at.TRIPPED and sets_goals:
             return Refusal.RANGE
-        if after[at.OPERATING_MODE] not in MODES or (address <= at.WATCHDOG < end and after[at.WATCHDOG] > 127):
+        if table[at.OPERATING_MODE] not in OPERATING_MODES or (sets_watchdog and table[at.WATCHDOG] > 127):
             return Refusal.RANGE
-        if after[at.TORQUE_ENABLE] > 1 or after[at.DELAY] > 254:
+        if table[at.TORQUE_ENABLE] > 1 or table[at.DELAY] > 254:
             return Refusal.RANGE
-        if goals and abs(new.get("h", at.GOALS)) > new.get("H", at.CURRENT_LIMIT):
+        if sets_goals and abs(after.read_register("h", at.GOALS)) > after.read_register("H", at.CURRENT_LIMIT):
             return Refusal.LIMIT
-        shut = servo.table[at.HARDWARE_ERROR] & servo.table[SHUTDOWN]
-        return Refusal.FAILED if after[at.TORQUE_ENABLE] and shut else 0
+        if table[at.TORQUE_ENABLE] and servo.table[at.HARDWARE_ERROR] & servo.table[SHUTDOWN]:
+            return Refusal.FAILED
+        return 0
 
     # --- motors -----------------------------------------------------------------------------------------------
 
     def restart(self, i: int) -> None:
-        """Everything from address 64 on is as at first, and the turns are forgotten."""
+        """Reset all registers from address 64 on, and forget whole revolutions."""
         servo = self.servos[i]
         servo.table[at.TORQUE_ENABLE :] = bytes(at.SIZE - at.TORQUE_ENABLE)
-        servo.table[at.STATUS_LEVEL], servo.held_counts = 2, None
-        servo.put("H", at.GAINS + 4, 800)
-        servo.put("h", at.GOALS, servo.get("H", at.CURRENT_LIMIT))
-        servo.from_counts = round(self.body.shaft(i)[0] / at.RAD) // at.COUNTS * at.COUNTS
+        servo.table[at.STATUS_LEVEL] = 2
+        servo.held_counts = None
+        servo.write_register("H", at.P_GAIN, 800)
+        servo.write_register("h", at.GOALS, servo.read_register("H", at.CURRENT_LIMIT))
+        counts = round(self.body.shaft(i)[0] / at.RAD)
+        servo.from_counts = counts // at.COUNTS * at.COUNTS
         self._measure(i)
-        servo.put("i", at.GOAL_POSITION, servo.get("i", at.PRESENT + 6))
+        servo.write_register("i", at.GOAL_POSITION, servo.read_register("i", at.PRESENT_POSITION))
         self._drive(i)
 
     def _drive(self, i: int) -> None:
-        """Current-based position; of the other modes current, and none else moves."""
+        """Drive the body as the registers say: in current-based position mode or in current mode, else not at all."""
         servo = self.servos[i]
-        mode, d, p = servo.table[at.OPERATING_MODE], servo.get("H", at.GAINS), servo.get("H", at.GAINS + 4)
-        current, goal = servo.get("h", at.GOALS), servo.get("i", at.GOAL_POSITION)
-        stiffness, damping = at.law(d, p, servo.unit_nm)
-        goal_rad = (goal + servo.from_counts if servo.held_counts is None else servo.held_counts) * at.RAD
-        limit_nm, joint = abs(current) * servo.unit_nm, self.body.joints[i]
+        current = servo.read_register("h", at.GOALS)
+        limit_nm = abs(current) * servo.unit_nm
+        joint = self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
+        mode = servo.table[at.OPERATING_MODE]
         if servo.on and mode == at.CURRENT_BASED_POSITION:
-            self.body.drive(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
-        elif servo.on and mode == 0:
+            d_gain = servo.read_register("H", at.GAINS)
+            p_gain = servo.read_register("H", at.P_GAIN)
+            stiffness, damping = at.law(d_gain, p_gain, servo.unit_nm)
+            goal_counts = servo.held_counts
+            if goal_counts is None:
+                goal_counts = servo.read_register("i", at.GOAL_POSITION) + servo.from_counts
+            self.body.drive(i, Mode.POSITION, goal_counts * at.RAD, limit_nm, stiffness, damping, speed_rad_s)
+        elif servo.on and mode == at.CURRENT_CONTROL:
             self.body.drive(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
         else:
             self.body.drive(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
     def each_step(self, now_us: float) -> None:
-        """Watchdogs, heat and supply."""
+        """Let watchdogs expire, and detect servos that are too hot or have too little supply voltage."""
         for i, servo in enumerate(self.servos):
             watchdog = servo.table[at.WATCHDOG]
             if servo.on and 0 < watchdog != at.TRIPPED and now_us - servo.fed_us > watchdog * at.WATCHDOG_S * 1e6:
                 servo.table[at.WATCHDOG] = at.TRIPPED
                 servo.held_counts = round(self.body.shaft(i)[0] / at.RAD)
                 self._drive(i)
-            hot = at.HardwareError.OVERHEATING if self.body.too_hot(i) else 0
-            weak = self.body.supply(i)[0] < servo.get("H", at.LEAST_VOLTAGE) * at.VOLTS
-            found = hot | (at.HardwareError.INPUT_VOLTAGE if weak else 0)
-            if found & ~servo.table[at.HARDWARE_ERROR]:
-                servo.table[at.HARDWARE_ERROR] |= found
-                if found & SHUTDOWN_BY:
+            errors = self._detect_errors(i)
+            if errors & ~servo.table[at.HARDWARE_ERROR]:
+                servo.table[at.HARDWARE_ERROR] |= errors
+                if errors & SHUTDOWN_ERRORS:
                     servo.table[at.TORQUE_ENABLE] = 0
                     self._drive(i)
 
+    def _detect_errors(self, i: int) -> int:
+        """Return the bits of the hardware errors that a servo has now."""
+        errors = 0
+        if self.body.too_hot(i):
+            errors |= at.HardwareError.OVERHEATING
+        min_voltage_v = self.servos[i].read_register("H", at.MIN_VOLTAGE) * at.VOLTS
+        if self.body.supply(i)[0] < min_voltage_v:
+            errors |= at.HardwareError.INPUT_VOLTAGE
+        return errors
 
-def collided(one: bytes, other: bytes) -> bytes:
+
+def collide(first: bytes, second: bytes) -> bytes:
     """Return what two servos that send at the same time leave on the line: a 0 of either wins."""
-    longest = max(len(one), len(other))
-    return bytes(a & b for a, b in zip(one.ljust(longest, b"\xff"), other.ljust(longest, b"\xff"), strict=True))
+    longest = max(len(first), len(second))
+    first = first.ljust(longest, b"\xff")
+    second = second.ljust(longest, b"\xff")
+    return bytes(a & b for a, b in zip(first, second, strict=True))

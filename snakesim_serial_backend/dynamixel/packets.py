@@ -13,17 +13,20 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 HEADER = b"\xff\xff\xfd\x00"
-STUFFED, PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
-BEFORE, AFTER = 7, 2  # bytes around instruction and parameters
-LONGEST = 1024
-EVERYBODY = 0xFE
+PLAIN = b"\xff\xff\xfd"  # the begin of a header, which must not occur among the parameters
+STUFFED = b"\xff\xff\xfd\xfd"  # what is sent in its place
+BYTES_BEFORE = 7  # instruction and parameters: header, id, length
+BYTES_AFTER = 2  # instruction and parameters: CRC
+MAX_PACKET_BYTES = 1024
+EVERYBODY = 0xFE  # id of a packet to all servos
 LAST_ID = 252
-ALERT = 0x80  # bit of a status' error: look at the hardware error
-POLYNOMIAL = 0x8005
+ALERT = 0x80  # bit of a status' error: there is a hardware error
+POLYNOMIAL = 0x8005  # of the CRC
+PART_OVERHEAD = 4  # bytes of a servo's part in a fast status around its data: error, id, CRC
 
 
 class Instruction(IntEnum):
-    """What a packet asks for; STATUS is an answer."""
+    """What a packet requests; STATUS is an answer."""
 
     PING = 0x01
     READ = 0x02
@@ -36,7 +39,7 @@ class Instruction(IntEnum):
 
 
 class Refusal(IntEnum):
-    """Why a servo did not do what it was told: the error of a status, without the alert."""
+    """Why a servo did not execute an instruction: the error of a status, without the alert."""
 
     FAILED = 1
     INSTRUCTION = 2
@@ -57,69 +60,83 @@ class Packet:
 
     @property
     def error(self) -> int:
-        """Of a status."""
+        """The error of a status, without the alert; 0 for none."""
         return self.parameters[0] & ~ALERT
 
     @property
     def alert(self) -> bool:
-        """Whether a servo says in its status that there is a hardware error."""
+        """Whether a servo reports in its status that there is a hardware error."""
         return bool(self.parameters[0] & ALERT)
 
     @property
     def data(self) -> bytes:
-        """Of a status."""
+        """The data of a status."""
         return self.parameters[1:]
 
 
-def _crc_table() -> list[int]:
+def _make_crc_table() -> list[int]:
+    """Return the CRC-16 of every single byte."""
     table: list[int] = []
     for byte in range(256):
         crc = byte << 8
         for _ in range(8):
-            crc = (crc << 1 ^ POLYNOMIAL if crc & 0x8000 else crc << 1) & 0xFFFF
+            crc <<= 1
+            if crc & 0x10000:
+                crc ^= POLYNOMIAL
+            crc &= 0xFFFF
         table.append(crc)
     return table
 
 
-_CRC = _crc_table()
+_CRC_TABLE = _make_crc_table()
 
 
 def crc16(data: bytes) -> int:
-    """Checksum of bytes."""
+    """Return the CRC-16 of bytes."""
     crc = 0
     for byte in data:
-        crc = (crc << 8 & 0xFFFF) ^ _CRC[crc >> 8 ^ byte]
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
     return crc
 
 
 def encoded(id_: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A packet's bytes."""
+    """Return the bytes of a packet."""
     inside = (bytes([instruction]) + parameters).replace(PLAIN, STUFFED)
-    packet = HEADER + struct.pack("<BH", id_, len(inside) + AFTER) + inside
+    packet = HEADER + struct.pack("<BH", id_, len(inside) + BYTES_AFTER) + inside
     return packet + struct.pack("<H", crc16(packet))
 
 
 def read_request(id_: int, address: int, size: int) -> bytes:
-    """Ask one servo for registers."""
+    """Return a packet that reads registers of one servo."""
     return encoded(id_, Instruction.READ, struct.pack("<HH", address, size))
 
 
 def sync_read_request(ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
-    """Ask several for the same registers; they answer in this order."""
+    """Return a packet that reads the same registers of several servos; they answer in this order."""
     instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
     return encoded(EVERYBODY, instruction, struct.pack("<HH", address, size) + bytes(ids))
 
 
-def sync_write(address: int, each: Sequence[tuple[int, bytes]]) -> bytes:
-    """Write the same registers of several servos, which do not answer. each: id and data, all equally long."""
-    values = b"".join(bytes([id_]) + data for id_, data in each)
-    return encoded(EVERYBODY, Instruction.SYNC_WRITE, struct.pack("<HH", address, len(each[0][1])) + values)
+def sync_write(address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> bytes:
+    """Return a packet that writes the same registers of several servos, which do not answer.
+
+    data_of_ids: id and data of each servo, all equally long.
+    """
+    _, first_data = data_of_ids[0]
+    values = b"".join(bytes([id_]) + data for id_, data in data_of_ids)
+    return encoded(EVERYBODY, Instruction.SYNC_WRITE, struct.pack("<HH", address, len(first_data)) + values)
 
 
-def fast_status(parts: Sequence[tuple[int, int, bytes]], of: int) -> bytes:
-    """The answer to a fast sync read. parts: error, id and data of those that answer; of: how many were asked."""
-    size = len(parts[0][2]) + 4
-    packet = HEADER + struct.pack("<BHB", EVERYBODY, 1 + of * size, Instruction.STATUS)
+def fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) -> bytes:
+    """Return the answer to a fast sync read.
+
+    Args:
+        parts: error, id and data of each servo that answers.
+        requested: number of servos in the request, which decides the length in the header.
+    """
+    _, _, first_data = parts[0]
+    part_size = len(first_data) + PART_OVERHEAD
+    packet = HEADER + struct.pack("<BHB", EVERYBODY, 1 + requested * part_size, Instruction.STATUS)
     for error, id_, data in parts:
         packet += bytes([error, id_]) + data
         packet += struct.pack("<H", crc16(packet))
@@ -134,47 +151,59 @@ class Decoder:
         self.skipped = 0  # bytes
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Packets that are whole now."""
+        """Take in bytes, and yield the packets that are complete now."""
         self._bytes += data
         while True:
-            self._to_header()
-            whole = self._length()
-            if whole is None or len(self._bytes) < whole:
+            self._skip_to_header()
+            length = self._find_length()
+            if length is None or len(self._bytes) < length:
                 return
-            if (packet := self._packet(bytes(self._bytes[:whole]))) is not None:
-                del self._bytes[:whole]
-                yield packet
-            else:
+            packet = self._decode(bytes(self._bytes[:length]))
+            if packet is None:
                 self._skip(1)
+            else:
+                del self._bytes[:length]
+                yield packet
 
     @property
     def garbled(self) -> bool:
-        """Whether bytes have come that are no packet."""
+        """Whether bytes have arrived that are no packet."""
         return self.skipped > 0 or len(self._bytes) > 0
 
-    def _to_header(self) -> None:
-        at = self._bytes.find(HEADER)
-        if at < 0:  # its beginning may be the end of what has come
-            at = max(len(self._bytes) - len(HEADER) + 1, 0)
-        self._skip(at)
+    def _skip_to_header(self) -> None:
+        """Skip bytes up to the next header, or up to bytes that may be the begin of one."""
+        start = self._bytes.find(HEADER)
+        if start < 0:
+            start = max(len(self._bytes) - len(HEADER) + 1, 0)
+        self._skip(start)
 
-    def _length(self) -> int | None:
-        while len(self._bytes) >= BEFORE and self._bytes.startswith(HEADER):
-            whole = BEFORE + struct.unpack_from("<H", self._bytes, 5)[0]
-            if BEFORE + 1 + AFTER <= whole <= LONGEST:
-                return whole
+    def _find_length(self) -> int | None:
+        """Return the length of the packet at the begin of the bytes; None if more bytes are needed to know it.
+
+        A header that is followed by an impossible length is skipped.
+        """
+        while len(self._bytes) >= BYTES_BEFORE and self._bytes.startswith(HEADER):
+            length = BYTES_BEFORE + struct.unpack_from("<H", self._bytes, 5)[0]
+            if BYTES_BEFORE + 1 + BYTES_AFTER <= length <= MAX_PACKET_BYTES:
+                return length
             self._skip(1)
-            self._to_header()
+            self._skip_to_header()
         return None
 
-    def _packet(self, whole: bytes) -> Packet | None:
-        if crc16(whole[:-AFTER]) != struct.unpack("<H", whole[-AFTER:])[0]:
+    def _decode(self, data: bytes) -> Packet | None:
+        """Return the packet that these bytes are; None for a wrong CRC, or a status without an error."""
+        (crc,) = struct.unpack("<H", data[-BYTES_AFTER:])
+        if crc16(data[:-BYTES_AFTER]) != crc:
             return None
-        id_, inside = whole[4], whole[BEFORE:-AFTER]
+        id_ = data[4]
+        inside = data[BYTES_BEFORE:-BYTES_AFTER]
         if id_ == EVERYBODY and inside[0] == Instruction.STATUS:
-            return Packet(id_, inside[0], whole[BEFORE + 1 :])
+            # A fast status is not stuffed. Its last CRC belongs to the last servo's part.
+            return Packet(id_, inside[0], data[BYTES_BEFORE + 1 :])
         inside = inside.replace(STUFFED, PLAIN)
-        return Packet(id_, inside[0], inside[1:]) if inside[0] != Instruction.STATUS or len(inside) > 1 else None
+        if inside[0] == Instruction.STATUS and len(inside) == 1:
+            return None
+        return Packet(id_, inside[0], inside[1:])
 
     def _skip(self, count: int) -> None:
         self.skipped += count
@@ -182,22 +211,39 @@ class Decoder:
 
 
 def fast_parts(packet: Packet, size: int) -> list[Packet]:
-    """The statuses in the answer to a fast sync read of so many bytes each. The packet's own CRC is right."""
-    step = size + 4
-    blocks = (packet.parameters[at : at + step] for at in range(0, len(packet.parameters), step))
-    return [Packet(block[1], Instruction.STATUS, block[:1] + block[2:-2]) for block in blocks if len(block) == step]
+    """Return the statuses in the answer to a fast sync read of `size` bytes each.
+
+    Only the packet's own CRC has been checked, which covers all parts.
+    """
+    part_size = size + PART_OVERHEAD
+    statuses: list[Packet] = []
+    for start in range(0, len(packet.parameters), part_size):
+        part = packet.parameters[start : start + part_size]
+        if len(part) == part_size:
+            statuses.append(_part_status(part))
+    return statuses
 
 
 def intact_parts(data: bytes, size: int) -> list[Packet]:
-    """Return what is intact of a fast answer that ends early, or is garbled from some servo on, as statuses."""
+    """Return the statuses that are intact in a fast answer that ends early, or is garbled from some servo on."""
     start = data.find(HEADER + bytes([EVERYBODY]))
-    return list(_parts(data[start:], size)) if start >= 0 else []
+    if start < 0:
+        return []
+    packet = data[start:]
+    part_size = size + PART_OVERHEAD
+    statuses: list[Packet] = []
+    for start in range(BYTES_BEFORE + 1, len(packet) - part_size + 1, part_size):
+        end = start + part_size
+        (crc,) = struct.unpack("<H", packet[end - 2 : end])
+        if crc16(packet[: end - 2]) != crc:
+            break
+        statuses.append(_part_status(packet[start:end]))
+    return statuses
 
 
-def _parts(packet: bytes, size: int) -> Iterator[Packet]:
-    step = size + 4
-    for at in range(BEFORE + 1, len(packet) - step + 1, step):
-        end = at + step
-        if crc16(packet[: end - 2]) != struct.unpack("<H", packet[end - 2 : end])[0]:
-            return
-        yield Packet(packet[at + 1], Instruction.STATUS, packet[at : at + 1] + packet[at + 2 : end - 2])
+def _part_status(part: bytes) -> Packet:
+    """Return one servo's part of a fast status as a status of its own: error, id, data, CRC."""
+    error = part[:1]
+    id_ = part[1]
+    data = part[2:-2]
+    return Packet(id_, Instruction.STATUS, error + data)

@@ -1,4 +1,4 @@
-"""One serial port with servos: questions with their answers, and writes that nobody answers."""
+"""One serial port with servos: requests with their answers, and writes that no servo answers."""
 
 import struct
 from collections.abc import Sequence
@@ -19,87 +19,116 @@ from snakesim_serial_backend.dynamixel.packets import (
 )
 from snakesim_serial_backend.wire import SerialWire
 
-CHUNK_BYTES = 64  # that an adapter hands on at once
-SCAN_S = 0.003  # in which each id may answer a ping of everybody
+CHUNK_BYTES = 64  # that an adapter passes on at once
+SCAN_S = 0.003  # in which each id may answer a ping to all
 
 
 class Answers(NamedTuple):
-    """Everything that came after one question to one servo."""
+    """Everything that arrived after one request to one servo."""
 
     statuses: list[Packet]  # of that servo; more than one: two servos have its id, and answer one after the other
-    garbled: bool  # bytes came that are no packet: two servos answer at the same time, or the line is disturbed
+    garbled: bool  # bytes arrived that are no packet: two servos answer at the same time, or the line is disturbed
 
 
 class Port:
-    """Asks one thing after another: the bus is half duplex."""
+    """Sends one request after another, because the bus is half duplex.
+
+    Attributes:
+        wire: the serial port.
+        fast: whether its servos support fast sync reads.
+    """
 
     def __init__(self, wire: SerialWire, gap_s: float) -> None:
-        """gap_s: silence after which no more is expected, besides what bytes and adapter take."""
-        self.wire, self._gap_s = wire, gap_s
-        self.fast = True  # whether its servos know fast sync reads
-        self._heard = bytearray()  # since the newest question
+        """gap_s: silence that ends an answer, besides the time that bytes and adapter take."""
+        self.wire = wire
+        self.fast = True
+        self._gap_s = gap_s
+        self._received = bytearray()  # since the newest request
 
     def ping(self, id_: int) -> Answers:
-        """Ask a servo for its model (2 bytes) and firmware; listens for a second answer, too."""
-        return self._all_answers(id_, encoded(id_, Instruction.PING))
+        """Request the model (2 bytes) and firmware of a servo, and wait for a second answer, too."""
+        return self._request_all_answers(id_, encoded(id_, Instruction.PING))
 
     def read_alone(self, id_: int, address: int, size: int) -> Answers:
-        """Ask a servo for registers, and listen for a second answer."""
-        answers = self._all_answers(id_, read_request(id_, address, size))
-        return answers._replace(statuses=[one for one in answers.statuses if len(one.data) == size])
+        """Read registers of a servo, and wait for a second answer, too."""
+        answers = self._request_all_answers(id_, read_request(id_, address, size))
+        whole = [status for status in answers.statuses if len(status.data) == size]
+        return answers._replace(statuses=whole)
 
     def scan(self) -> list[Packet]:
-        """All servos that answer a ping of everybody."""
+        """Return the answers of all servos to a ping to all."""
         gap_s = self._gap_s + LAST_ID * SCAN_S
-        return self._packets(Decoder(), encoded(EVERYBODY, Instruction.PING), LAST_ID + 1, gap_s)
+        return self._request(Decoder(), encoded(EVERYBODY, Instruction.PING), LAST_ID + 1, gap_s)
 
     def read(self, id_: int, address: int, size: int) -> Packet | None:
-        """Registers of a servo."""
-        answer = self._one(id_, read_request(id_, address, size))
-        return answer if answer is not None and len(answer.data) == size else None
+        """Read registers of a servo; None without an answer that is complete."""
+        status = self._request_one(id_, read_request(id_, address, size))
+        if status is None or len(status.data) != size:
+            return None
+        return status
 
     def write(self, id_: int, address: int, data: bytes) -> Packet | None:
-        """Registers of a servo; its answer says whether it took them."""
-        return self._one(id_, encoded(id_, Instruction.WRITE, struct.pack("<H", address) + data))
+        """Write registers of a servo, and return its answer, whose error tells whether it accepted them."""
+        return self._request_one(id_, encoded(id_, Instruction.WRITE, struct.pack("<H", address) + data))
 
     def reboot(self, id_: int) -> None:
         """Restart a servo."""
-        self._one(id_, encoded(id_, Instruction.REBOOT))
+        self._request_one(id_, encoded(id_, Instruction.REBOOT))
 
     def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, Packet]:
-        """The same registers of several servos, of those that answer: who is silent may silence all behind it."""
+        """Read the same registers of several servos at once.
+
+        Returns:
+            The statuses of the servos that answer, by id. A silent servo may silence all behind it.
+        """
         if not ids:
             return {}
-        decoder, found = Decoder(), list[Packet]()
         request = sync_read_request(ids, address, size, fast=self.fast)
-        for packet in self._packets(decoder, request, 1 if self.fast else len(ids), self._gap_s):
-            found += fast_parts(packet, size) if packet.id == EVERYBODY else [packet]
-        if self.fast and not found:
-            found = intact_parts(bytes(self._heard), size)
-        return {packet.id: packet for packet in found if packet.id in ids and len(packet.data) == size}
+        max_answers = 1 if self.fast else len(ids)  # all servos write one packet together in a fast sync read
+        statuses: list[Packet] = []
+        for packet in self._request(Decoder(), request, max_answers, self._gap_s):
+            if packet.id == EVERYBODY:
+                statuses += fast_parts(packet, size)
+            else:
+                statuses.append(packet)
+        if self.fast and not statuses:
+            statuses = intact_parts(bytes(self._received), size)
+        return {status.id: status for status in statuses if status.id in ids and len(status.data) == size}
 
-    def write_all(self, address: int, each: Sequence[tuple[int, bytes]]) -> None:
-        """The same registers of several servos, at once. Nobody answers."""
-        if each:
-            self.wire.send(sync_write(address, each))
+    def write_all(self, address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> None:
+        """Write the same registers of several servos at once; they do not answer.
+
+        data_of_ids: id and data of each servo, all equally long.
+        """
+        if data_of_ids:
+            self.wire.send(sync_write(address, data_of_ids))
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _one(self, id_: int, request: bytes) -> Packet | None:
-        answers = self._packets(Decoder(), request, 1, self._gap_s)
-        return next((packet for packet in answers if packet.id == id_), None)
+    def _request_one(self, id_: int, request: bytes) -> Packet | None:
+        """Send a request to one servo, and return its answer."""
+        for status in self._request(Decoder(), request, 1, self._gap_s):
+            if status.id == id_:
+                return status
+        return None
 
-    def _all_answers(self, id_: int, request: bytes) -> Answers:
+    def _request_all_answers(self, id_: int, request: bytes) -> Answers:
+        """Send a request to one servo, and return its answer with all else that arrives."""
         decoder = Decoder()
-        packets = self._packets(decoder, request, 2, self._gap_s)
-        return Answers([packet for packet in packets if packet.id == id_], decoder.garbled)
+        statuses = self._request(decoder, request, 2, self._gap_s)
+        return Answers([status for status in statuses if status.id == id_], decoder.garbled)
 
-    def _packets(self, decoder: Decoder, request: bytes, answers: int, gap_s: float) -> list[Packet]:
-        wire, found = self.wire, list[Packet]()
-        self._heard.clear()
+    def _request(self, decoder: Decoder, request: bytes, max_answers: int, gap_s: float) -> list[Packet]:
+        """Send a request, and return the statuses that arrive until there are enough or the bus is silent."""
+        wire = self.wire
+        statuses: list[Packet] = []
+        self._received.clear()
         wire.send(request)
         gap_s += wire.time_s(len(request) + CHUNK_BYTES) + wire.latency_s
-        while len(found) < answers and (data := wire.receive(gap_s)):
-            self._heard += data
-            found += [packet for packet in decoder.feed(data) if packet.instruction == Instruction.STATUS]
-        return found
+        while len(statuses) < max_answers:
+            data = wire.receive(gap_s)
+            if not data:
+                break
+            self._received += data
+            statuses += [packet for packet in decoder.feed(data) if packet.instruction == Instruction.STATUS]
+        return statuses

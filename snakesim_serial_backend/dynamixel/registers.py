@@ -1,6 +1,8 @@
-"""The control table of the X series, its models, and between its units and SI. Pure; from ROBOTIS' e-Manual.
+"""The control table of the X series, its models, and the conversion of its units to SI units. Pure.
 
-What is below address 64 is kept without power, and may be written only with torque off.
+The registers below address 64 are kept without power, and may be written only with torque off.
+
+Source: ROBOTIS' public e-Manual, "Control Table" of the X series.
 """
 
 import math
@@ -8,39 +10,54 @@ from dataclasses import dataclass
 from enum import IntFlag
 from struct import Struct
 
-COUNTS = 4096  # a turn
-RAD = 2 * math.pi / COUNTS  # a count
-SPEED = 0.229 * 2 * math.pi / 60  # rad/s, a unit of velocity
-VOLTS = 0.1
-WATCHDOG_S = 0.02  # a unit of it
-TRIPPED = 0xFF  # the watchdog's value, -1, after it has stopped a servo
-P_SCALE, D_SCALE = 128, 16  # of the gains' registers
-LAW_S = 0.001  # in which the position law takes its difference: assumed
-MOST_GAIN = 16383
-CURRENT_BASED_POSITION = 5
-FIRST_FIRMWARE = 38  # with a bus watchdog
+# Units.
+COUNTS = 4096  # in a revolution
+RAD = 2 * math.pi / COUNTS  # in a count
+SPEED = 0.229 * 2 * math.pi / 60  # rad/s in a unit of velocity
+VOLTS = 0.1  # in a unit of voltage
+WATCHDOG_S = 0.02  # in a unit of the bus watchdog
+P_SCALE = 128  # divides the register of the P gain
+D_SCALE = 16  # divides the register of the D gain
+LAW_S = 0.001  # time over which the position law takes its difference: assumed
+MAX_GAIN = 16383
 
-MODEL = 0  # 2 bytes, with the model's information 6, and the firmware
-KEPT = 64  # bytes from 0 on
+# Values of registers.
+CURRENT_CONTROL = 0  # operating mode
+CURRENT_BASED_POSITION = 5  # operating mode
+TRIPPED = 0xFF  # value of the watchdog, -1, after it has stopped a servo
+FIRST_FIRMWARE = 38  # the first one with a bus watchdog
+
+# Addresses.
+MODEL = 0  # 2 bytes; the model's information follows at 2, and the firmware at 6
+KEPT = 64  # size of what is kept without power, from 0 on
 DELAY = 9  # of an answer
-DRIVE_MODE, OPERATING_MODE = 10, 11
-SECONDARY_ID = 12  # a servo takes writes to it, too; 253 and above: off
+DRIVE_MODE = 10
+OPERATING_MODE = 11
+SECONDARY_ID = 12  # a servo executes writes to this id, too; 253 and above: off
 HOMING_OFFSET = 20
-LEAST_VOLTAGE, CURRENT_LIMIT = 34, 38
+MIN_VOLTAGE = 34
+CURRENT_LIMIT = 38
 STARTUP = 60  # bit 0: torque on when it starts
 TORQUE_ENABLE = 64
 STATUS_LEVEL = 68
 HARDWARE_ERROR = 70
 GAINS = 80  # D, I, P of the position law
+P_GAIN = 84
 WATCHDOG = 98
-GOALS = 102
+GOALS = 102  # from the goal current on
 GOAL_POSITION = 116
-PRESENT = 126
-VOLTAGE, TEMPERATURE = 144, 146
-SIZE = 147  # of what is used here
+PRESENT = 126  # from the present current on
+PRESENT_VELOCITY = 128
+PRESENT_POSITION = 132
+VOLTAGE = 144
+TEMPERATURE = 146
+SIZE = 147  # of the part of the control table that is used here
 
+# Value of the baud rate's register for each rate in bit/s.
 RATE = {9600: 0, 57600: 1, 115200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
-gains_form = Struct("<HHH")
+
+# Groups of registers that are read or written at once.
+gains_form = Struct("<HHH")  # D, I, P
 goals_form = Struct("<hiIIi")  # current, velocity, acceleration and velocity of the profile (0: none), position
 present_form = Struct("<hii")  # current, velocity, position: signed
 HEALTH_SIZE = TEMPERATURE + 1 - TORQUE_ENABLE  # from TORQUE_ENABLE on
@@ -59,10 +76,10 @@ class HardwareError(IntFlag):
 
 @dataclass(frozen=True)
 class Model:
-    """What a model number says."""
+    """What is known of a model by its number."""
 
     name: str
-    current_a: float | None  # a unit of current; None: not known here
+    current_a: float | None  # in a unit of current; None: not known here
 
 
 MODELS = {
@@ -90,34 +107,52 @@ WITHOUT_CURRENT = {
 
 
 def model_name(number: int) -> str:
-    """As people know it."""
-    known = MODELS.get(number)
-    return known.name if known else WITHOUT_CURRENT.get(number, f"model {number}")
+    """Return the name of a model as its maker writes it."""
+    model = MODELS.get(number)
+    if model is not None:
+        return model.name
+    return WITHOUT_CURRENT.get(number, f"model {number}")
 
 
 def error_names(errors: int) -> str:
-    """Bits of a hardware error in words."""
-    said = [error.name.lower().replace("_", " ") for error in HardwareError if errors & error and error.name]
-    return ", ".join(said) or f"0x{errors:02x}"
+    """Return the names of the bits of a hardware error."""
+    names = [error.name.lower().replace("_", " ") for error in HardwareError if errors & error and error.name]
+    return ", ".join(names) or f"0x{errors:02x}"
 
 
 def gains(stiffness: float, damping: float, unit_nm: float) -> tuple[int, int, int]:
-    """D, I and P for N·m/rad and N·m·s/rad at the horn. unit_nm: torque of a unit of current.
+    """Return the registers of the gains D, I and P for a stiffness and a damping at the horn.
 
-    Assumed: the law's output is in units of current, its error in counts, and its difference over `LAW_S`.
+    Assumed: the output of the position law is in units of current, its error in counts, and its difference is taken
+    over `LAW_S`:
+
+        current = P / P_SCALE * error + D / D_SCALE * difference of the error
+
+    Args:
+        stiffness: N·m/rad.
+        damping: N·m·s/rad.
+        unit_nm: torque of one unit of current, N·m.
     """
-    p, d = stiffness * RAD / unit_nm * P_SCALE, damping * RAD / LAW_S / unit_nm * D_SCALE
-    return min(round(d), MOST_GAIN), 0, min(round(p), MOST_GAIN)
+    p_gain = stiffness * RAD / unit_nm * P_SCALE
+    d_gain = damping * RAD / LAW_S / unit_nm * D_SCALE
+    return min(round(d_gain), MAX_GAIN), 0, min(round(p_gain), MAX_GAIN)
 
 
-def law(d: int, p: int, unit_nm: float) -> tuple[float, float]:
-    """Stiffness and damping of gains, the other way round."""
-    return p / P_SCALE * unit_nm / RAD, d / D_SCALE * unit_nm / RAD * LAW_S
+def law(d_gain: int, p_gain: int, unit_nm: float) -> tuple[float, float]:
+    """Return the stiffness in N·m/rad and the damping in N·m·s/rad of gains: the inverse of `gains`."""
+    stiffness = p_gain / P_SCALE * unit_nm / RAD
+    damping = d_gain / D_SCALE * unit_nm / RAD * LAW_S
+    return stiffness, damping
 
 
 def whole_turns(angle_rad: float, lower_rad: float, upper_rad: float, slack_rad: float) -> int | None:
-    """Turns to add to what a servo says, so that it is within its travel; None: there are none, or several such."""
-    turn = 2 * math.pi
-    first = math.ceil((lower_rad - slack_rad - angle_rad) / turn)
-    last = math.floor((upper_rad + slack_rad - angle_rad) / turn)
-    return first if first == last else None
+    """Return how many revolutions to add to the reported angle, so that a servo is within its travel.
+
+    None: no number of revolutions does it, or several do.
+    """
+    turn_rad = 2 * math.pi
+    first = math.ceil((lower_rad - slack_rad - angle_rad) / turn_rad)
+    last = math.floor((upper_rad + slack_rad - angle_rad) / turn_rad)
+    if first != last:
+        return None
+    return first

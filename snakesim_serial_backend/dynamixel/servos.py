@@ -1,10 +1,12 @@
-"""Dynamixel X servos as a driver type of drives: a `snakesim_drivers.kit.drive_backend.Drives`.
+"""Dynamixel X servos as a driver type: a `snakesim_drivers.kit.drive_backend.Drives`.
 
-Every tick all servos say current, velocity and position in one fast sync read, one of them says its health,
-and all get goal current and goal position in one sync write. They stay in current-based position mode: a torque is that
-current with a goal just out of reach in its direction. Mode 0 would be torque alone, but a change of mode needs the
-torque off, and is a write to memory that wears out; and whoever has lost its driver turns on without end, in place of
-to a stop just beyond its travel.
+In every tick all servos report current, velocity and position in one fast sync read, one of them reports its health,
+and all get goal current and goal position in one sync write.
+
+The servos stay in current-based position mode. A torque is sent as that current, with a goal just out of reach in its
+direction. Mode 0 would control torque alone, but a change of mode needs the torque off, and writes to memory that wears
+out. A servo in mode 0 that loses its driver would also rotate without end. In the mode used here it stops just beyond
+its travel.
 """
 
 import struct
@@ -26,9 +28,9 @@ from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.wire import is_emulated
 
-BOOTS_WITHIN_NS = 2_000_000_000
-INJECTED = {("bus", "cut"), *(("joint", kind) for kind in FAULTS)}
-IN_A_ROW = 2  # questions answered twice, or in garbled bytes, until that is a fault: before `drive_silent`, after 3
+BOOT_NS = 2_000_000_000  # in which the silence of a servo that restarts is no fault
+INJECTABLE = {("bus", "cut"), *(("joint", kind) for kind in FAULTS)}
+MAX_BAD_ANSWERS = 2  # in a row, doubled or garbled, until that is a fault: before `drive_silent`, which comes after 3
 BUS_CUT = "nothing gets through; check the adapter, its cable and its power"
 
 
@@ -45,110 +47,151 @@ class Servos:
         answer_s: float,
         emulator: EmulatedDynamixel | None,
     ) -> None:
-        """emulator: the servos, if they are emulated here; answer_s: how long a tick waits for answers."""
-        self._emulator, self.servos = emulator, list(servos)
+        """Take over the servos of a port that is open.
+
+        Args:
+            servos: the servos of this port, tail to head.
+            port: sends and receives packets.
+            readings: gets what the servos measure.
+            settings: the scenario's section of this driver type.
+            clock_ns: the time of the driver.
+            answer_s: how long a tick waits for answers.
+            emulator: the servos, if they are emulated in this process.
+        """
+        self._emulator = emulator
+        self.servos = list(servos)
         self.emulated = is_emulated(port.wire.port)
         self._port = port
-        self._readings, self._settings, self._clock_ns, self._answer_s = readings, settings, clock_ns, answer_s
+        self._readings = readings
+        self._settings = settings
+        self._clock_ns = clock_ns
+        self._answer_s = answer_s
         self._watchdog = bytes([round(settings.watchdog_s / at.WATCHDOG_S)])
-        self._lost: set[int] = set()  # silent: asked apart, as they would silence others
-        self._turn, self._end_s = 0, 0.0
-        self._ours = False  # whether they may be written to
+        self._silent: set[int] = set()  # read one by one, as they would silence others in a sync read
+        self._cycle = 0
+        self._read_deadline_s = 0.0
+        self._may_write = False  # until bring-up has checked that these are the servos of the robot
 
     def bring_up(self) -> None:
-        """Find all, check what they keep, write what differs. Torque is off, and stays so."""
-        found = bring_up(self.servos, self._port, self._settings)
-        self._ours = True
-        for i, (present, health) in enumerate(found):
-            self.hear(i, present)
-            self._check(i, health)
+        """Find all servos, check the registers that they keep, and write what differs. Torque is off, and stays off."""
+        answers = bring_up(self.servos, self._port, self._settings)
+        self._may_write = True
+        for i, (present, health) in enumerate(answers):
+            self._take_over_motion(i, present)
+            self._take_over_health(i, health)
 
-    # --- a tick -----------------------------------------------------------------------------------------------
+    # --- reading ----------------------------------------------------------------------------------------------
 
     def read(self) -> None:
-        """Ask all at once, one that was silent, and one for its health."""
-        self._end_s = time.monotonic() + self._answer_s
-        self._turn += 1
-        everybody = range(len(self.servos))
-        steady, silent = [i for i in everybody if i not in self._lost], sorted(self._lost)
-        self._read_states([i for i in steady if i in self._readings.doubted])
-        self._ask(steady)
+        """Read all servos at once, one of the silent ones alone, and the health of one."""
+        self._read_deadline_s = time.monotonic() + self._answer_s
+        self._cycle += 1
+        silent = sorted(self._silent)
+        answering = [i for i in range(len(self.servos)) if i not in self._silent]
+        self._read_states([i for i in answering if i in self._readings.doubted])
+        self._read_motion(answering)
         if silent:
-            self._ask_lost(silent[self._turn % len(silent)])
-        if heard := [i for i in steady if i not in self._lost]:
-            alarmed = [i for i in heard if self.servos[i].alert and not self.servos[i].errors]
-            self._ask_health((alarmed or heard)[self._turn % len(alarmed or heard)])
+            self._read_silent(silent[self._cycle % len(silent)])
+        self._read_next_health([i for i in answering if i not in self._silent])
         for i, servo in enumerate(self.servos):
-            if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOTS_WITHIN_NS:
+            if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOT_NS:
                 self._readings.not_asked(i)
 
-    def _ask(self, left: list[int]) -> None:
-        """All of these; without whoever is the first that is silent, as often as time allows."""
-        while left and time.monotonic() < self._end_s:
-            answers = self._port.read_all([self.servos[i].id for i in left], at.PRESENT, at.present_form.size)
-            for i in left:
-                if (answer := answers.get(self.servos[i].id)) is not None:
-                    self.hear(i, answer)
-            left = [i for i in left if self.servos[i].id not in answers]
-            if left:
-                self._lost.add(left.pop(0))
+    def _read_motion(self, indices: list[int]) -> None:
+        """Read the motion of these servos at once.
 
-    def _ask_lost(self, i: int) -> None:
+        A silent servo silences all behind it. So the first one without an answer is left out, and the others are read
+        again, as often as time allows.
+        """
+        missing = indices
+        while missing and time.monotonic() < self._read_deadline_s:
+            ids = [self.servos[i].id for i in missing]
+            answers = self._port.read_all(ids, at.PRESENT, at.present_form.size)
+            for i in missing:
+                answer = answers.get(self.servos[i].id)
+                if answer is not None:
+                    self._take_over_motion(i, answer)
+            missing = [i for i in missing if self.servos[i].id not in answers]
+            if missing:
+                self._silent.add(missing.pop(0))
+
+    def _read_silent(self, i: int) -> None:
+        """Read the motion of a silent servo alone, and count answers that are doubled or garbled."""
         servo = self.servos[i]
         answers = servo.port.read_alone(servo.id, at.PRESENT, at.present_form.size)
-        servo.answered_twice = servo.answered_twice + 1 if len(answers.statuses) > 1 else 0
-        servo.garbled = servo.garbled + 1 if answers.garbled and not answers.statuses else 0
+        if len(answers.statuses) > 1:
+            servo.answered_twice += 1
+        else:
+            servo.answered_twice = 0
+        if answers.garbled and not answers.statuses:
+            servo.garbled += 1
+        else:
+            servo.garbled = 0
         if len(answers.statuses) == 1:
-            self._lost.clear()  # perhaps others are back, too
-            self.hear(i, answers.statuses[0])
+            self._silent.clear()  # perhaps others answer again, too
+            self._take_over_motion(i, answers.statuses[0])
 
-    def hear(self, i: int, said: Packet) -> None:
-        """What a servo measures."""
+    def _take_over_motion(self, i: int, status: Packet) -> None:
+        """Put what a servo measures into the readings."""
         servo = self.servos[i]
-        current, velocity, position = at.present_form.unpack(said.data)
-        angle_rad, servo.booting_ns, servo.alert = position * at.RAD, -1, said.alert
-        if not said.alert:
+        current, velocity, position = at.present_form.unpack(status.data)
+        angle_rad = position * at.RAD
+        servo.booting_ns = -1
+        servo.alert = status.alert
+        if not status.alert:
             servo.errors = 0
-        if not servo.follows:  # it may have restarted, and forgotten its turns
+        if not servo.follows:  # it may have restarted, and lost count of its revolutions
             turns = at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD)
-            servo.turns = servo.turns if turns is None else turns
+            if turns is not None:
+                servo.turns = turns
         self._readings.moved(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
         self._readings.pushed(i, current * servo.unit_nm)
         servo.current_a = abs(current) * servo.unit_nm / servo.constant
 
-    def _read_states(self, which: Sequence[int]) -> None:
-        """Read at once whether these servos have stopped by themselves; one that is silent is asked later."""
-        answers = self._port.read_all([self.servos[i].id for i in which], at.TORQUE_ENABLE, at.STATE_SIZE)
-        for i in which:
-            if (said := answers.get(self.servos[i].id)) is not None:
-                self._take_state(i, said)
+    def _read_states(self, indices: Sequence[int]) -> None:
+        """Read at once whether these servos have stopped by themselves; a silent one is read again later."""
+        answers = self._port.read_all([self.servos[i].id for i in indices], at.TORQUE_ENABLE, at.STATE_SIZE)
+        for i in indices:
+            status = answers.get(self.servos[i].id)
+            if status is not None:
+                self._take_over_state(i, status)
 
-    def _ask_health(self, i: int) -> None:
+    def _read_next_health(self, indices: list[int]) -> None:
+        """Read the health of one of these servos: first of those with an alert whose error is unknown, in turn."""
+        alarmed = [i for i in indices if self.servos[i].alert and not self.servos[i].errors]
+        candidates = alarmed or indices
+        if not candidates:
+            return
+        i = candidates[self._cycle % len(candidates)]
         servo = self.servos[i]
-        if (said := servo.port.read(servo.id, at.TORQUE_ENABLE, at.HEALTH_SIZE)) is not None:
-            self._check(i, said)
+        status = servo.port.read(servo.id, at.TORQUE_ENABLE, at.HEALTH_SIZE)
+        if status is not None:
+            self._take_over_health(i, status)
 
-    def _check(self, i: int, said: Packet) -> None:
-        """What a servo says of its health."""
-        servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
-        self._take_state(i, said)
-        volts = struct.unpack_from("<H", data, at.VOLTAGE - first)[0] * at.VOLTS
-        self._readings.supplied(i, volts, servo.current_a)
-        temperature_c = float(data[at.TEMPERATURE - first])
+    def _take_over_health(self, i: int, status: Packet) -> None:
+        """Put a servo's supply and temperature into the readings, and store its state."""
+        self._take_over_state(i, status)
+        data = status.data  # registers from TORQUE_ENABLE on
+        (voltage,) = struct.unpack_from("<H", data, at.VOLTAGE - at.TORQUE_ENABLE)
+        self._readings.supplied(i, voltage * at.VOLTS, self.servos[i].current_a)
+        temperature_c = float(data[at.TEMPERATURE - at.TORQUE_ENABLE])
         self._readings.warmed(i, temperature_c, temperature_c)
 
-    def _take_state(self, i: int, said: Packet) -> None:
-        """Whether a servo's torque is on, and what has switched it off."""
-        servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
+    def _take_over_state(self, i: int, status: Packet) -> None:
+        """Store whether a servo's torque is on, and what has switched it off."""
+        servo = self.servos[i]
+        data = status.data  # registers from TORQUE_ENABLE on
         servo.enabled = bool(data[0])
-        servo.errors = data[at.HARDWARE_ERROR - first]
-        servo.watchdog = data[at.WATCHDOG - first]
+        servo.errors = data[at.HARDWARE_ERROR - at.TORQUE_ENABLE]
+        servo.watchdog = data[at.WATCHDOG - at.TORQUE_ENABLE]
         servo.health_ns = self._clock_ns()
         self._readings.state_was_read(i)
 
     def let_run(self) -> None:
-        """Emulated servos."""
-        self._port.wire.let_run()
+        """Let servos that are emulated in this process run up to the present time."""
+        self._port.wire.run_emulated_drives()
+
+    # --- commands ---------------------------------------------------------------------------------------------
 
     def command(
         self,
@@ -160,25 +203,38 @@ class Servos:
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """SafeSetpoints; torque on and off. An emergency stop is torque off, too: servos know no other."""
+        """Send setpoints, and switch torque on and off as `Drives.command` declares.
+
+        An emergency stop switches the torque off, too: servos have no other stop.
+        """
         everybody = range(len(self.servos))
         if not may_enable:
             following &= {i for i in everybody if self.servos[i].follows}
-        off = [i for i in everybody if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
-        on = [i for i in everybody if i in following and not self.servos[i].follows]
-        self._tell(at.TORQUE_ENABLE, off, b"\0")
-        if self._settings.write_gains:
-            self._port.write_all(at.GAINS, [(self.servos[i].id, self.servos[i].gains()) for i in on])
-        self._tell(at.WATCHDOG, on, b"\0")
-        self._tell(at.WATCHDOG, on, self._watchdog)
-        goals = {i: self._goals(i, modes[i], targets[i], limits_nm[i]) for i in everybody if i in following}
-        self._port.write_all(at.GOALS, [(self.servos[i].id, goal) for i, goal in goals.items()])
-        self._tell(at.TORQUE_ENABLE, on, b"\1")
-        for i in (*off, *on):
-            self.servos[i].told(follows=i in on, now_ns=self._clock_ns())
+        to_disable = [i for i in everybody if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
+        to_enable = [i for i in everybody if i in following and not self.servos[i].follows]
 
-    def _goals(self, i: int, mode: Mode, target: float, limit_nm: float) -> bytes:
-        servo, goal_rad = self.servos[i], float(self._readings.angle_rad[i])
+        # A servo gets its gains, its watchdog and its goal before its torque is switched on.
+        self._write_same(at.TORQUE_ENABLE, to_disable, b"\0")
+        if self._settings.write_gains:
+            self._port.write_all(at.GAINS, [(self.servos[i].id, self.servos[i].gain_registers()) for i in to_enable])
+        self._write_same(at.WATCHDOG, to_enable, b"\0")  # 0 clears a watchdog that has expired
+        self._write_same(at.WATCHDOG, to_enable, self._watchdog)
+        goals = [
+            (self.servos[i].id, self._goal_registers(i, modes[i], targets[i], limits_nm[i]))
+            for i in everybody
+            if i in following
+        ]
+        self._port.write_all(at.GOALS, goals)
+        self._write_same(at.TORQUE_ENABLE, to_enable, b"\1")
+        for i in to_disable:
+            self.servos[i].record_switch(follows=False, now_ns=self._clock_ns())
+        for i in to_enable:
+            self.servos[i].record_switch(follows=True, now_ns=self._clock_ns())
+
+    def _goal_registers(self, i: int, mode: Mode, target: float, limit_nm: float) -> bytes:
+        """Return the goal registers of a setpoint; a mode that servos do not have gets no current."""
+        servo = self.servos[i]
+        goal_rad = float(self._readings.angle_rad[i])
         match mode:
             case Mode.POSITION:
                 goal_rad = target
@@ -187,51 +243,48 @@ class Servos:
                 limit_nm = min(abs(target), limit_nm)
             case _:
                 limit_nm = 0.0
-        current = min(round(limit_nm / servo.unit_nm), servo.most_current)
-        return at.goals_form.pack(current, 0, 0, 0, round((goal_rad - servo.turns * TURN) / at.RAD))
+        current = min(round(limit_nm / servo.unit_nm), servo.max_current)
+        position = round((goal_rad - servo.turns * TURN) / at.RAD)
+        return at.goals_form.pack(current, 0, 0, 0, position)
 
-    def _tell(self, address: int, who: Sequence[int], data: bytes) -> None:
-        self._port.write_all(address, [(self.servos[i].id, data) for i in who])
+    def _write_same(self, address: int, indices: Sequence[int], data: bytes) -> None:
+        """Write the same data to registers of several servos."""
+        self._port.write_all(address, [(self.servos[i].id, data) for i in indices])
 
     def clear(self, joints: frozenset[int]) -> None:
-        """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second.
+        """Restart servos with a hardware error, as nothing else clears it; a restart takes about half a second.
 
         A watchdog that has stopped its servo is cleared by writing 0.
         """
         for i in sorted(joints):
             servo = self.servos[i]
             if servo.watchdog == at.TRIPPED:
-                self._tell(at.WATCHDOG, [i], b"\0")
+                self._write_same(at.WATCHDOG, [i], b"\0")
                 servo.watchdog = 0
             if servo.errors or servo.alert:
                 servo.port.reboot(servo.id)
-                servo.errors, servo.alert, servo.booting_ns = 0, False, self._clock_ns()
-                self._lost.add(i)
+                servo.errors = 0
+                servo.alert = False
+                servo.booting_ns = self._clock_ns()
+                self._silent.add(i)
+
+    # --- faults -----------------------------------------------------------------------------------------------
 
     def findings(self) -> list[Finding]:
-        """Of port and servos."""
-        found: list[Finding] = []
-        if error := self._port.wire.error():
-            found.append(Finding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
+        """Return what is wrong now with the port and its servos."""
+        findings: list[Finding] = []
+        error = self._port.wire.error()
+        if error:
+            findings.append(Finding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
         for i, servo in enumerate(self.servos):
-            if servo.answered_twice >= IN_A_ROW:  # it concerns all: nothing is known of which of the two is where
-                found.append(Finding("duplicate_node", f"{servo.who} {ANSWERS_TWICE}", i))
-            elif servo.garbled >= IN_A_ROW:
-                found.append(Finding("drive_silent", f"{servo.who} sends garbled bytes: {GARBLED}", i, alone=True))
-            if servo.errors:
-                cause = f"{servo.who} reports {at.error_names(servo.errors)}; a clear restarts it"
-                found.append(Finding("drive_fault", cause, i, alone=True))
-            elif servo.watchdog == at.TRIPPED:
-                cause = f"{servo.who} was stopped by its bus watchdog, as it got no packet in time"
-                found.append(Finding("drive_fault", cause, i, alone=True))
-            elif servo.follows and servo.health_ns > servo.told_ns and not servo.enabled:
-                cause = f"{servo.who} does not follow: its torque is off: it has restarted"
-                found.append(Finding("drive_not_armed", cause, i, alone=True))
-        return found
+            for finding in (_answer_finding(i, servo), _state_finding(i, servo)):
+                if finding is not None:
+                    findings.append(finding)
+        return findings
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Faults of servos that are emulated here, and of their bus."""
-        if self._emulator is None or (injection.target_type, injection.kind) not in INJECTED:
+        """Begin or end a fault of servos that are emulated in this process, or of their bus."""
+        if self._emulator is None or (injection.target_type, injection.kind) not in INJECTABLE:
             return False
         if injection.target_type == "joint":
             self._emulator.inject(injection, begins=begins)
@@ -240,12 +293,36 @@ class Servos:
         return True
 
     def close(self) -> None:
-        """Torque off, as far as the bus still works."""
+        """Switch the torque off, as far as the bus still works, and close the port."""
         try:
-            if self._ours:
-                self._tell(at.TORQUE_ENABLE, range(len(self.servos)), b"\0")
-                self._port.wire.let_run()
+            if self._may_write:
+                self._write_same(at.TORQUE_ENABLE, range(len(self.servos)), b"\0")
+                self._port.wire.run_emulated_drives()
         finally:
             self._port.wire.close()
         if self._emulator is not None:
             self._emulator.close()
+
+
+def _answer_finding(i: int, servo: Servo) -> Finding | None:
+    """Return what is wrong with a servo's answers, if anything."""
+    if servo.answered_twice >= MAX_BAD_ANSWERS:
+        # It concerns the whole robot: which of the two servos is where is unknown.
+        return Finding("duplicate_node", f"{servo.label} {ANSWERS_TWICE}", i)
+    if servo.garbled >= MAX_BAD_ANSWERS:
+        return Finding("drive_silent", f"{servo.label} sends garbled bytes: {GARBLED}", i, alone=True)
+    return None
+
+
+def _state_finding(i: int, servo: Servo) -> Finding | None:
+    """Return what has switched a servo's torque off, if anything."""
+    if servo.errors:
+        cause = f"{servo.label} reports {at.error_names(servo.errors)}; a clear restarts it"
+        return Finding("drive_fault", cause, i, alone=True)
+    if servo.watchdog == at.TRIPPED:
+        cause = f"{servo.label} was stopped by its bus watchdog, as it got no packet in time"
+        return Finding("drive_fault", cause, i, alone=True)
+    if servo.follows and servo.health_ns > servo.switched_ns and not servo.enabled:
+        cause = f"{servo.label} does not follow: its torque is off: it has restarted"
+        return Finding("drive_not_armed", cause, i, alone=True)
+    return None

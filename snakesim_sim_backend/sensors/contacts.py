@@ -12,10 +12,10 @@ from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.contacts import Touch, TouchReader
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.physics import Physics
-from snakesim_sim_backend.sensors.frames import into
+from snakesim_sim_backend.sensors.frames import rotate_into
 from snakesim_sim_backend.sensors.scope import Normal
 
-LARGEST_N = 1e7  # as a message may carry
+MAX_FORCE_N = 1e7  # that a message may carry
 NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own point
 
 
@@ -25,41 +25,53 @@ class ContactReader:
     def __init__(
         self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
     ) -> None:
-        self._touches = TouchReader(sim, data, physics)
         first = sim.first_link_body
-        self._origins, self._rotations = data.xpos[first:], data.xmat[first:]  # of links and what follows
+        self._touches = TouchReader(sim, data, physics)
+        self._origins = data.xpos[first:]  # of links, and of the bodies behind them
+        self._rotations = data.xmat[first:]
         self._threshold_n = sensor.threshold_n
-        self._sigma_m, self._sigma_n = sensor.position_noise_m, sensor.force_noise_n
-        self._noise = noise if self._sigma_m or self._sigma_n else None
-        self._felt = FeltForce(sim.model.opt.timestep)
-        physics.after_step = self._feel
+        self._sigma_m = sensor.position_noise_m
+        self._sigma_n = sensor.force_noise_n
+        self._noise: Normal | None = None
+        if self._sigma_m or self._sigma_n:
+            self._noise = noise
+        self._measured_force = FeltForce(sim.model.opt.timestep)
+        physics.after_step = self._measure_force
 
     def read(self, tick: int, timestamp_ns: int) -> Contacts:
-        """All contacts above the threshold."""
-        found = [
-            self._in_link(touch) for touch in self._touches.read() if math.hypot(*touch.force_w) >= self._threshold_n
+        """Return all contacts above the threshold, and the largest force since the last reading."""
+        contacts = [
+            self._measure_contact(touch)
+            for touch in self._touches.read()
+            if math.hypot(*touch.force_w) >= self._threshold_n
         ]
-        measured_force_n = self._felt.max_n
-        if not measured_force_n < LARGEST_N:  # also what is no number: of the steps in which a simulation diverged
-            measured_force_n = None
+        max_force_n = self._measured_force.max_n
+        if not max_force_n < MAX_FORCE_N:  # also NaN, of the steps in which a simulation diverged
+            max_force_n = None
         return Contacts(
-            tick=tick, timestamp_ns=timestamp_ns, contacts=found[:MAX_CONTACTS], measured_force_n=measured_force_n
+            tick=tick,
+            timestamp_ns=timestamp_ns,
+            contacts=contacts[:MAX_CONTACTS],
+            measured_force_n=max_force_n,
         )
 
-    def _feel(self) -> None:
-        self._felt.add(self._touches.sizes_n())
+    def _measure_force(self) -> None:
+        """Measure the forces of one physics step."""
+        self._measured_force.add(self._touches.sum_forces_n())
 
-    def _in_link(self, touch: Touch) -> Contact:
+    def _measure_contact(self, touch: Touch) -> Contact:
+        """Return a contact in the frame of its link, with noise."""
         rotation = self._rotations[touch.link].tolist()  # world_from_link, row by row
         ox, oy, oz = self._origins[touch.link].tolist()
         x, y, z = touch.position_w
-        px, py, pz = into(rotation, (x - ox, y - oy, z - oz))
-        fx, fy, fz = into(rotation, touch.force_w)
-        normal = into(rotation, touch.normal_w)
+        px, py, pz = rotate_into(rotation, (x - ox, y - oy, z - oz))
+        fx, fy, fz = rotate_into(rotation, touch.force_w)
+        normal = rotate_into(rotation, touch.normal_w)
         if self._noise is not None:
             a, b, c, d, e, f = self._noise(6).tolist()
-            m, n = self._sigma_m, self._sigma_n
-            px, py, pz, fx, fy, fz = px + m * a, py + m * b, pz + m * c, fx + n * d, fy + n * e, fz + n * f
+            sigma_m, sigma_n = self._sigma_m, self._sigma_n
+            px, py, pz = px + sigma_m * a, py + sigma_m * b, pz + sigma_m * c
+            fx, fy, fz = fx + sigma_n * d, fy + sigma_n * e, fz + sigma_n * f
         tangent_1, tangent_2 = tangents(normal)
         return Contact(
             link=touch.link,

@@ -20,7 +20,7 @@ class ImuReader:
         self._links = list(range(count))
 
     def read(self, tick: int, timestamp_ns: int) -> Imu:
-        """One entry a link, tail to head."""
+        """Return one entry per link, tail to head."""
         values = self._values
         if self._noise is not None:
             values = values + self._sigma * self._noise(len(self._sigma))

@@ -10,13 +10,13 @@ from snakesim_hal.wire.messages import JointState
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model import of_joints
 from snakesim_sim_backend.sensors.scope import Normal
-from snakesim_sim_backend.sensors.timing import ticks_of
+from snakesim_sim_backend.sensors.timing import round_to_ticks
 
 
 class JointReader:
     """Angle, velocity and torque of every joint, every tick.
 
-    A delayed reading has the stamp of its tick, and its age is the delay. Until the first one has arrived the
+    A delayed reading has the timestamp of its tick, and its age is the delay. Until the first one is delivered, the
     reading of the start is used.
     """
 
@@ -30,18 +30,18 @@ class JointReader:
         self._sigma = np.repeat(sigma, count)
         self._noise = noise if any(sigma) else None
         self._all_valid = [True] * count
-        self._under_way: deque[tuple[int, list[float]]] = deque(maxlen=1 + ticks_of(sensor.delay_s, period_ns))
+        self._waiting: deque[tuple[int, list[float]]] = deque(maxlen=1 + round_to_ticks(sensor.delay_s, period_ns))
 
     def read(self, tick: int, timestamp_ns: int) -> JointState:
-        """The reading that arrives at this tick."""
+        """Return the reading that is delivered at this tick."""
         values = np.concatenate((self._angles, self._velocities, self._torques))
         count = self._count
         if self._noise is not None:
             values += self._sigma * self._noise(3 * count)
         if self._unmeasured:
             values[self._unmeasured] = 0.0
-        self._under_way.append((timestamp_ns, values.tolist()))
-        taken_ns, numbers = self._under_way[0]
+        self._waiting.append((timestamp_ns, values.tolist()))
+        sampled_ns, numbers = self._waiting[0]
         return JointState(
             tick=tick,
             timestamp_ns=timestamp_ns,
@@ -49,5 +49,5 @@ class JointReader:
             velocity_rad_s=numbers[count : 2 * count],
             torque_nm=numbers[2 * count :],
             valid=self._all_valid,
-            age_ns=[timestamp_ns - taken_ns] * count,
+            age_ns=[timestamp_ns - sampled_ns] * count,
         )

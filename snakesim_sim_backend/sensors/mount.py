@@ -1,4 +1,4 @@
-"""Where a sensor sits on its link."""
+"""The place of a sensor on its link."""
 
 import math
 from typing import Any
@@ -18,17 +18,18 @@ class Mount:
         self.body = scope.sim.first_link_body + self.link
         nose_m = robot.link_lengths_m[self.link] + robot.module.radius_m
         self.position_l: Vector = sensor.position_m or (nose_m, 0.0, 0.0)
-        self.orientation_l_wxyz = _turned(sensor.yaw_rad, sensor.pitch_rad)
+        self.orientation_l_wxyz = _orientation(sensor.yaw_rad, sensor.pitch_rad)
         self.link_from_sensor: Floats = rotation_from_quaternion(self.orientation_l_wxyz)
-        self._origin, self._rotation = scope.data.xpos[self.body], scope.data.xmat[self.body]
+        self._origin = scope.data.xpos[self.body]
+        self._rotation = scope.data.xmat[self.body]
 
     def place(self) -> tuple[Floats, Floats]:
-        """Position of the sensor, (3,), and world_from_sensor, (3, 3)."""
+        """Return the position of the sensor in m, (3,), and world_from_sensor, (3, 3)."""
         rotation = self._rotation.reshape(3, 3)
         return self._origin + rotation @ self.position_l, rotation @ self.link_from_sensor
 
-    def seen_by(self, camera: DepthCamera) -> dict[str, Any]:
-        """The fields of a CameraImage that do not change with time."""
+    def camera_fields(self, camera: DepthCamera) -> dict[str, Any]:
+        """Return the fields of a camera's image that do not change with time."""
         return {
             "link": self.link,
             "position_l": self.position_l,
@@ -42,8 +43,10 @@ class Mount:
         }
 
 
-def _turned(yaw_rad: float, pitch_rad: float) -> Quaternion:
-    """Yaw about z, then pitch about the new y."""
-    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
-    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+def _orientation(yaw_rad: float, pitch_rad: float) -> Quaternion:
+    """Return the orientation after a yaw about z and then a pitch about the new y."""
+    cy = math.cos(yaw_rad / 2)
+    sy = math.sin(yaw_rad / 2)
+    cp = math.cos(pitch_rad / 2)
+    sp = math.sin(pitch_rad / 2)
     return (cy * cp, -sy * sp, cy * sp, sy * cp)

@@ -7,6 +7,7 @@ import numpy as np
 
 from snakesim_hal.model.sensors import PoseSensor
 from snakesim_hal.wire.messages import Pose
+from snakesim_hal.wire.quantities import Quaternion
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
 from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.scope import Normal
@@ -16,32 +17,40 @@ class PoseReader:
     """Pose and velocity of the base."""
 
     def __init__(self, data: mujoco.MjData, sensor: PoseSensor, noise: Normal) -> None:
-        self._qpos, self._qvel = data.qpos[:FREE_QPOS], data.qvel[:FREE_DOFS]
-        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion turns by half an angle
+        self._qpos = data.qpos[:FREE_QPOS]
+        self._qvel = data.qvel[:FREE_DOFS]
+        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
         self._sigma = np.repeat(sigma, 3)
         self._noise = noise if any(sigma) else None
 
     def read(self, tick: int, timestamp_ns: int) -> Pose:
-        """The base, as from motion capture. Velocities have no noise of their own."""
+        """Return the pose of the base, as motion capture measures it. Velocities have no noise of their own."""
         px, py, pz, w, x, y, z = self._qpos.tolist()
         vx, vy, vz, ox, oy, oz = self._qvel.tolist()
-        spin_w = rotate((w, x, y, z), (ox, oy, oz))  # MuJoCo gives a free joint's turning in its own frame
+        # MuJoCo gives a free joint's angular velocity in its own frame.
+        angular_velocity_w = rotate((w, x, y, z), (ox, oy, oz))
         if self._noise is not None:
             ex, ey, ez, a, b, c = (self._sigma * self._noise(6)).tolist()
             px, py, pz = px + ex, py + ey, pz + ez
-            w, x, y, z = (
-                w - a * x - b * y - c * z,
-                x + a * w + b * z - c * y,
-                y + b * w + c * x - a * z,
-                z + c * w + a * y - b * x,
-            )
-            norm = math.sqrt(w * w + x * x + y * y + z * z)
-            w, x, y, z = w / norm, x / norm, y / norm, z / norm
+            w, x, y, z = _add_rotation((w, x, y, z), a, b, c)
         return Pose(
             tick=tick,
             timestamp_ns=timestamp_ns,
             position_w=(px, py, pz),
             orientation_wxyz=(w, x, y, z),
             velocity_w=(vx, vy, vz),
-            angular_velocity_w=spin_w,
+            angular_velocity_w=angular_velocity_w,
         )
+
+
+def _add_rotation(wxyz: Quaternion, a: float, b: float, c: float) -> Quaternion:
+    """Return the unit quaternion along wxyz * (1, a, b, c): a small rotation about axes of the base is added."""
+    w, x, y, z = wxyz
+    w, x, y, z = (
+        w - a * x - b * y - c * z,
+        x + a * w + b * z - c * y,
+        y + b * w + c * x - a * z,
+        z + c * w + a * y - b * x,
+    )
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    return w / norm, x / norm, y / norm, z / norm

@@ -13,22 +13,24 @@ from snakesim_sim_backend.model import of_joints
 
 
 class PowerReader:
-    """Supply, current and temperatures of the joints' modules. No noise, and never a leak."""
+    """Supply, current and temperatures of the joint modules, without noise and without a leak."""
 
     def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, joints: Sequence[Joint]) -> None:
-        (_, self._velocities), self._torques = of_joints(data, motors.count), motors.applied_nm()
-        self._windings, self._count = windings, len(joints)
+        _, self._velocities = of_joints(data, motors.count)
+        self._torques = motors.applied_nm()
+        self._windings = windings
+        self._count = len(joints)
         self._supply_v = np.array([joint.supply.voltage_v for joint in joints])
         self._idle_a = np.array([joint.supply.idle_a for joint in joints])
 
     def read(self, tick: int, timestamp_ns: int) -> Power:
-        """The modules' present values."""
-        watts = self._windings.power_w(self._torques, self._velocities)
+        """Return the present values of the joint modules."""
+        power_w = self._windings.power_w(self._torques, self._velocities)
         return Power(
             tick=tick,
             timestamp_ns=timestamp_ns,
             voltage_v=self._supply_v.tolist(),
-            current_a=(self._idle_a + watts / self._supply_v).tolist(),
+            current_a=(self._idle_a + power_w / self._supply_v).tolist(),
             motor_c=self._windings.winding_c.tolist(),
             board_c=self._windings.board_c().tolist(),
             leak=[False] * self._count,

@@ -12,10 +12,12 @@ from snakesim_sim_backend.sensors.scope import NoSettings, Scope
 class RayBeams:
     """Distances along beams without width, all measured at once."""
 
-    Settings, message = NoSettings, Ranges
+    Settings = NoSettings
+    message = Ranges
 
     def __init__(self, sensor: RangeSensor, scope: Scope, _settings: NoSettings) -> None:
-        self._sensor, self._noise = sensor, scope.noise
+        self._sensor = sensor
+        self._noise = scope.noise
         self._mount = Mount(sensor, scope)
         self._first_rad = -sensor.fov_rad / 2
         self._step_rad = sensor.fov_rad / max(sensor.beams - 1, 1)
@@ -24,14 +26,17 @@ class RayBeams:
         self._rays = Rays(self._mount, scope, rays_s, sensor.range_max_m)
 
     def read(self, tick: int, timestamp_ns: int) -> Ranges:
-        """A scan from where the link is now."""
+        """Return a scan from the present place of the link."""
         sensor = self._sensor
-        found_m = self._rays.cast()
-        seen = (found_m >= sensor.range_min_m) & (found_m <= sensor.range_max_m)
+        distances_m = self._rays.cast()
+        measured = (distances_m >= sensor.range_min_m) & (distances_m <= sensor.range_max_m)
         if sensor.noise_m:
-            found_m = np.maximum(found_m + sensor.noise_m * self._noise.standard_normal(sensor.beams), 0.0)
+            distances_m = np.maximum(distances_m + sensor.noise_m * self._noise.standard_normal(sensor.beams), 0.0)
         if sensor.dropout:
-            seen &= self._noise.random(sensor.beams) >= sensor.dropout
+            measured &= self._noise.random(sensor.beams) >= sensor.dropout
+        ranges_m = [
+            distance_m if hit else None for distance_m, hit in zip(distances_m.tolist(), measured.tolist(), strict=True)
+        ]
         return Ranges(
             tick=tick,
             timestamp_ns=timestamp_ns,
@@ -42,7 +47,5 @@ class RayBeams:
             angle_step_rad=self._step_rad,
             range_min_m=sensor.range_min_m,
             range_max_m=sensor.range_max_m,
-            range_m=[
-                distance_m if hit else None for distance_m, hit in zip(found_m.tolist(), seen.tolist(), strict=True)
-            ],
+            range_m=ranges_m,
         )

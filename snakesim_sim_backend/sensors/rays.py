@@ -1,6 +1,6 @@
 """Ray casting with MuJoCo: needs no OpenGL, and is exact.
 
-MuJoCo gives the interpreter free meanwhile, so that a tick of the robot goes on beside it.
+MuJoCo releases the interpreter lock meanwhile, so that a tick of the robot runs in parallel.
 """
 
 import mujoco
@@ -19,20 +19,29 @@ SEEN[PLANE_GROUP] = 0  # mj_multiRay of MuJoCo 4.0.0 overlooks it where rays lea
 class Rays:
     """A bundle of rays from one place, cast together.
 
-    They meet everything visible but the link that carries the sensor: the robot sees the rest of its own body.
+    They hit everything visible but the link that carries the sensor: the robot sees the rest of its own body.
     """
 
-    def __init__(self, mount: Mount, scope: Scope, rays_s: Floats, most: float) -> None:
-        """rays_s: (n, 3) in the sensor's frame, of any length; most: lengths of a ray after which nothing is sought."""
-        self._model, self._data, self._mount = scope.sim.model, scope.data, mount
+    def __init__(self, mount: Mount, scope: Scope, rays_s: Floats, max_lengths: float) -> None:
+        """Prepare a bundle of rays.
+
+        Args:
+            mount: where the rays begin.
+            scope: the model and its state.
+            rays_s: (n, 3), directions in the sensor's frame, of any length.
+            max_lengths: how far to look for a surface, in lengths of a ray.
+        """
+        self._model = scope.sim.model
+        self._data = scope.data
+        self._mount = mount
         self._rays_s = rays_s
         self._ground_z_m = float(scope.sim.model.geom(GROUND).pos[2])
-        self._cutoff_m = most * float(np.linalg.norm(rays_s, axis=1).max())
-        self._met = np.zeros(len(rays_s), np.int32)
-        self._shares = np.zeros(len(rays_s))
+        self._cutoff_m = max_lengths * float(np.linalg.norm(rays_s, axis=1).max())
+        self._hit_geoms = np.zeros(len(rays_s), np.int32)
+        self._lengths = np.zeros(len(rays_s))
 
     def cast(self) -> Floats:
-        """How far along each ray the nearest surface is, in lengths of the ray, (n,); infinite where there is none."""
+        """Return the distance of the nearest surface along each ray, in lengths of the ray, (n,); inf without one."""
         origin_w, world_from_sensor = self._mount.place()
         rays_w = self._rays_s @ world_from_sensor.T
         below_m = origin_w[2] - self._ground_z_m
@@ -46,10 +55,10 @@ class Rays:
             SEEN,
             True,
             self._mount.body,
-            self._met,
-            self._shares,
+            self._hit_geoms,
+            self._lengths,
             None,
             len(rays_w),
             self._cutoff_m,
         )
-        return np.where(self._shares < 0, to_ground, np.minimum(self._shares, to_ground))
+        return np.where(self._lengths < 0, to_ground, np.minimum(self._lengths, to_ground))

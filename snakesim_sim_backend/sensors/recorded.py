@@ -1,4 +1,4 @@
-"""Depth images from a file, again and again: lines as `snakesim echo sensor/depth/head > head.jsonl` prints them."""
+"""Replays depth images from a file, whose lines are as `snakesim echo sensor/depth/head > head.jsonl` prints them."""
 
 import bisect
 from itertools import pairwise
@@ -23,43 +23,62 @@ class Line(msgspec.Struct, frozen=True):
 
 
 class RecordedDepth:
-    """The image that was measured as long after the first one as the robot's time is; from the start at the end."""
+    """Plays a recording by the robot's time, and begins again at its end."""
 
     class Settings(FileStruct, frozen=True):
-        """Which file."""
+        """The recording."""
 
         file: Annotated[str, Meta(min_length=1)]
 
     message = DepthImage
 
     def __init__(self, camera: DepthCamera, scope: Scope, settings: Settings) -> None:
-        """Raises ConfigError."""
-        self._images = _read(settings.file, camera)
+        """Read the recording.
+
+        Raises:
+            ConfigError: the file cannot be read, or cannot be played.
+        """
+        self._images = _read_images(settings.file, camera)
         self._link = scope.config.robot.link_index(camera.link)
-        self._after_ns = [image.timestamp_ns - self._images[0].timestamp_ns for image in self._images]
-        steps = len(self._after_ns) - 1
-        self._lasts_ns = self._after_ns[-1] + (self._after_ns[-1] // steps if steps else 1)
+        first_ns = self._images[0].timestamp_ns
+        self._times_ns = [image.timestamp_ns - first_ns for image in self._images]
+        # The last image lasts as long as the others do on average.
+        steps = len(self._times_ns) - 1
+        last_image_ns = self._times_ns[-1] // steps if steps else 1
+        self._duration_ns = self._times_ns[-1] + last_image_ns
 
     def read(self, tick: int, timestamp_ns: int) -> DepthImage:
-        """An image, as if measured now, on the link of the robot file."""
-        i = bisect.bisect_right(self._after_ns, timestamp_ns % self._lasts_ns) - 1
+        """Return the image of this time, as if measured now, on the link of the robot file."""
+        i = bisect.bisect_right(self._times_ns, timestamp_ns % self._duration_ns) - 1
         return msgspec.structs.replace(self._images[i], tick=tick, timestamp_ns=timestamp_ns, link=self._link)
 
 
-def _read(file: str, camera: DepthCamera) -> list[DepthImage]:
-    path, decoder = expanded(file), msgspec.json.Decoder(Line)
+def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
+    """Read the images of a recording. Raises ConfigError."""
+    path = expanded(file)
+    decoder = msgspec.json.Decoder(Line)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(f"{file}: {path.stat().st_size} bytes, at most {MAX_BYTES}; record for a shorter time")
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise ConfigError(f"{file}: {size} bytes, at most {MAX_BYTES}; record for a shorter time")
         images = [decoder.decode(line).message for line in path.read_bytes().splitlines()]
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
             f"the recording of camera {camera.name!r}, {file}, cannot be read: {error}; "
             f"make one with `snakesim echo sensor/depth/{camera.name} > {file}`"
         ) from error
-    flawed = any(2 * image.width * image.height != len(image.depth) for image in images)
-    in_order = all(image.timestamp_ns < later.timestamp_ns for image, later in pairwise(images))
-    if not images or flawed or not in_order:
-        why = "some images are not whole" if flawed else "its stamps do not increase" if images else "it is empty"
-        raise ConfigError(f"the recording of camera {camera.name!r}, {file}, cannot be used: {why}")
+    flaw = _find_flaw(images)
+    if flaw is not None:
+        raise ConfigError(f"the recording of camera {camera.name!r}, {file}, cannot be used: {flaw}")
     return images
+
+
+def _find_flaw(images: list[DepthImage]) -> str | None:
+    """Return why images cannot be played; None if they can."""
+    if any(2 * image.width * image.height != len(image.depth) for image in images):
+        return "some images are not whole"
+    if not all(image.timestamp_ns < later.timestamp_ns for image, later in pairwise(images)):
+        return "its stamps do not increase"
+    if not images:
+        return "it is empty"
+    return None

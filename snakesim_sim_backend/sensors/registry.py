@@ -1,4 +1,4 @@
-"""Which reader makes which message. A new type of sensor is a file with a reader, and a line here or an entry point.
+"""Finds the reader of each sensor. A new type of sensor is a file with a reader, and a line here or an entry point.
 
 Sensors that look around may have several models, of which the robot file chooses one: `model = "rays"`, the name of an
 entry point in the group `snakesim.sensors`, or `./sonar.py:Sonar`. See docs/sensors.md.
@@ -26,48 +26,86 @@ from snakesim_sim_backend.sensors.recorded import RecordedDepth
 from snakesim_sim_backend.sensors.rendered import RenderedColor, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
-SYNCHRONOUS: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
-    Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal, at.physics),
-    Imu: lambda sensor, at: ImuReader(at.data, sensor, at.config.robot.chain.modules + 1, at.noise.standard_normal),
-    Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
-    Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.joint_table),
+# Sensors that look around: the model's name in the robot file -> its classes, each with a message of its own.
+MODELS = {
+    "rays": (RayCamera, RayBeams),
+    "rendered": (RenderedDepth,),
+    "recorded": (RecordedDepth,),
 }
-MODELS = {"rays": (RayCamera, RayBeams), "rendered": (RenderedDepth,), "recorded": (RecordedDepth,)}
-THREADED: dict[tuple[type[Message], str], Any] = {
-    (model.message, name): model for name, models in MODELS.items() for model in models
+
+
+def _contact_reader(sensor: Any, scope: BodyScope) -> Reader:
+    return ContactReader(scope.sim, scope.data, sensor, scope.noise.standard_normal, scope.physics)
+
+
+def _imu_reader(sensor: Any, scope: BodyScope) -> Reader:
+    links = scope.config.robot.chain.modules + 1
+    return ImuReader(scope.data, sensor, links, scope.noise.standard_normal)
+
+
+def _pose_reader(sensor: Any, scope: BodyScope) -> Reader:
+    return PoseReader(scope.data, sensor, scope.noise.standard_normal)
+
+
+def _power_reader(_sensor: Any, scope: BodyScope) -> Reader:
+    return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
+
+
+# Sensors of the body: message -> function that makes the reader.
+SYNCHRONOUS: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
+    Contacts: _contact_reader,
+    Imu: _imu_reader,
+    Pose: _pose_reader,
+    Power: _power_reader,
 }
 
 
 def own_noise(key: str, seed: int) -> np.random.Generator:
-    """The noise of one sensor that looks around."""
+    """Return the noise generator of one sensor that looks around. Its numbers depend on its key and the seed alone."""
     return np.random.default_rng((seed, crc32(key.encode())))
 
 
 def check_models(robot: RobotFile) -> None:
-    """Whether all sensors at places on links can be made. Runs no file of a plugin. Raises ConfigError."""
+    """Check that all sensors that are mounted on links can be made, without running the file of a plugin.
+
+    Raises:
+        ConfigError: a model is unknown, makes another message, or has wrong settings.
+    """
     for key, sensor in robot.sensors.mounted():
-        _model(key, sensor, find_installed)
+        _find_model(key, sensor, find_installed)
 
 
 def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
-    """The reader of a sensor at a place on a link. Raises ConfigError."""
-    model, settings = _model(key, sensor, find_plugin)
+    """Make the reader of a sensor that is mounted on a link.
+
+    Raises:
+        ConfigError: its model is unknown, makes another message, or has wrong settings.
+    """
+    model, settings = _find_model(key, sensor, find_plugin)
     return model(sensor, scope, settings)
 
 
-def _model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
-    """Its class, and its settings, which are checked; None where `find` finds none."""
+def _find_model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
+    """Return a sensor's class and its checked settings; None for both if `find` does not know the model."""
     message = keys.message_at(key)
     if message is ColorImage:
         return RenderedColor, RenderedColor.Settings()
     assert message is not None
-    model = THREADED.get((message, sensor.model)) or find(SENSORS, sensor.model)
+    model = _find_shipped_model(message, sensor.model) or find(SENSORS, sensor.model)
     if model is None:
         return None, None
-    # Of a sensor with a message of its own the schema is checked.
+    # A sensor with a message of its own has a schema, which is checked instead.
     if message is not OwnSample and getattr(model, "message", None) is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
             f"carries; its class says in `message` what it makes"
         )
     return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
+
+
+def _find_shipped_model(message: type[Message], name: str) -> Any:
+    """Return the class of this package that makes a message by the model of this name; None without one."""
+    for model in MODELS.get(name, ()):
+        if model.message is message:
+            return model
+    return None

@@ -17,101 +17,141 @@ from snakesim_sim_backend.sensors.rays import SEEN
 from snakesim_sim_backend.sensors.scope import NoSettings, Scope
 
 PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}  # of Debian
-NEAREST_M, FURTHEST_M = 0.01, 100.0  # of what is drawn
+NEAR_M = 0.01  # distances between which things are drawn
+FAR_M = 100.0
 AMBIENT = 0.4  # light
-SAMPLES = 4  # a pixel
+SAMPLES_PER_PIXEL = 4  # of a smooth picture
 SPARE_GEOMS = 50  # lights and the like
 
 
 class RenderedDepth:
     """Depth from the renderer's buffer, with its resolution."""
 
-    Settings, message = NoSettings, DepthImage
+    Settings = NoSettings
+    message = DepthImage
 
     def __init__(self, camera: DepthCamera, scope: Scope, _settings: NoSettings) -> None:
-        self._camera, self._noise = camera, scope.noise
-        self._view = View(camera, scope, smooth=False)
+        self._camera = camera
+        self._noise = scope.noise
+        self._renderer = CameraRenderer(camera, scope, smooth=False)
 
     def read(self, tick: int, timestamp_ns: int) -> DepthImage:
-        """An image from where the link is now."""
-        depth_m = self._view.draw()[1].ravel().astype(np.float64)
-        return depth_image(self._camera, self._view.mount, tick, timestamp_ns, depth_m, self._noise)
+        """Return an image from the present place of the link."""
+        _, depth_m = self._renderer.draw()
+        flat_depth_m = depth_m.ravel().astype(np.float64)
+        return depth_image(self._camera, self._renderer.mount, tick, timestamp_ns, flat_depth_m, self._noise)
 
 
 class RenderedColor:
     """A color image, without noise, dropouts and range."""
 
-    Settings, message = NoSettings, ColorImage
+    Settings = NoSettings
+    message = ColorImage
 
     def __init__(self, camera: DepthCamera, scope: Scope, _settings: NoSettings) -> None:
         self._camera = camera
-        self._view = View(camera, scope, smooth=True)
+        self._renderer = CameraRenderer(camera, scope, smooth=True)
 
     def read(self, tick: int, timestamp_ns: int) -> ColorImage:
-        """An image from where the link is now."""
-        fixed = self._view.mount.seen_by(self._camera)
-        return ColorImage(**fixed, tick=tick, timestamp_ns=timestamp_ns, rgb=self._view.draw()[0].tobytes())
+        """Return an image from the present place of the link."""
+        constant_fields = self._renderer.mount.camera_fields(self._camera)
+        rgb, _ = self._renderer.draw()
+        return ColorImage(**constant_fields, tick=tick, timestamp_ns=timestamp_ns, rgb=rgb.tobytes())
 
 
-class View:
-    """What a camera sees. It must be made and used in one thread."""
+class CameraRenderer:
+    """Draws what a camera sees. It must be made and used in one thread."""
 
     def __init__(self, camera: DepthCamera, scope: Scope, *, smooth: bool) -> None:
-        """Raises ConfigError when there is no OpenGL.
+        """Prepare a renderer for a camera.
 
-        smooth: several samples a pixel; then depth is that of one of them, up to 0.4 pixels from the middle.
+        Args:
+            camera: the entry of the robot file.
+            scope: the model and the state that is drawn.
+            smooth: several samples a pixel. Depth is then that of one of them, up to 0.4 pixels from the middle.
+
+        Raises:
+            ConfigError: there is no OpenGL.
         """
+        model = scope.sim.model
         self.mount = Mount(camera, scope)
-        model, self._data = scope.sim.model, scope.data
-        self._model, self._focal_px = model, camera.focal_px
-        self._own = frozenset(np.flatnonzero(model.geom_bodyid == self.mount.body).tolist())
+        self._model = model
+        self._data = scope.data
+        self._focal_px = camera.focal_px
+        self._hidden_geoms = frozenset(np.flatnonzero(model.geom_bodyid == self.mount.body).tolist())
+
+        # Quality of the pictures.
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, camera.width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, camera.height)
         model.vis.headlight.ambient[:] = AMBIENT
-        model.vis.quality.offsamples = SAMPLES if smooth else 0
+        model.vis.quality.offsamples = SAMPLES_PER_PIXEL if smooth else 0
+
+        # Renderer.
         self._gl = opened_context(camera.width, camera.height, f"camera {camera.name!r}")
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, model.ngeom + SPARE_GEOMS)
-        self._option, self._free = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._free_camera = mujoco.MjvCamera()
+        self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = SEEN
         self._option.geomgroup[PLANE_GROUP] = 1
+
+        # Buffers.
         self._frame = mujoco.MjrRect(0, 0, camera.width, camera.height)
         self._rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
-        self._buffer = np.zeros((camera.height, camera.width), np.float32)
+        self._depth = np.zeros((camera.height, camera.width), np.float32)
 
     def draw(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colours, (height, width, 3), and distances along the optical axis, (height, width), from the top."""
+        """Draw the scene as the camera sees it now.
+
+        Returns:
+            Colors, (height, width, 3), and distances along the optical axis in m, (height, width), rows from the top.
+        """
         self._gl.make_current()
-        every = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._free, every, self._scene)
-        self._look()
-        for geom in self._scene.geoms[: self._scene.ngeom]:
-            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._own:
-                geom.size[:] = 0.0  # the camera is not in its own way
+        categories = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._free_camera, categories, self._scene)
+        self._place_cameras()
+        self._hide_link()
         mujoco.mjr_render(self._frame, self._scene, self._context)
-        mujoco.mjr_readPixels(self._rgb, self._buffer, self._frame, self._context)
-        near, far = NEAREST_M, FURTHEST_M
-        depth_m = near * far / (near + self._buffer * (far - near))  # the buffer goes from 0, far, to 1, near
+        mujoco.mjr_readPixels(self._rgb, self._depth, self._frame, self._context)
+        # The buffer holds values from 0, far, to 1, near, that are linear in 1 / depth.
+        depth_m = NEAR_M * FAR_M / (NEAR_M + self._depth * (FAR_M - NEAR_M))
         return np.flipud(self._rgb), np.flipud(depth_m)
 
-    def _look(self) -> None:
-        """Put the eyes of the scene where the camera is."""
+    def _place_cameras(self) -> None:
+        """Put both cameras of the scene, one for each eye, where the sensor is."""
         position_w, world_from_camera = self.mount.place()
-        half = NEAREST_M / self._focal_px / 2
-        for eye in self._scene.camera:
-            eye.pos, eye.forward, eye.up = position_w, world_from_camera[:, 0], world_from_camera[:, 2]
-            eye.frustum_center, eye.frustum_width = 0.0, half * self._frame.width
-            eye.frustum_bottom, eye.frustum_top = -half * self._frame.height, half * self._frame.height
-            eye.frustum_near, eye.frustum_far = NEAREST_M, FURTHEST_M
+        half_pixel_m = NEAR_M / self._focal_px / 2  # half a pixel's size at the near plane
+        for camera in self._scene.camera:
+            camera.pos = position_w
+            camera.forward = world_from_camera[:, 0]
+            camera.up = world_from_camera[:, 2]
+            camera.frustum_center = 0.0
+            camera.frustum_width = half_pixel_m * self._frame.width
+            camera.frustum_bottom = -half_pixel_m * self._frame.height
+            camera.frustum_top = half_pixel_m * self._frame.height
+            camera.frustum_near = NEAR_M
+            camera.frustum_far = FAR_M
+
+    def _hide_link(self) -> None:
+        """Hide the link that carries the camera, which would be in its way."""
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._hidden_geoms:
+                geom.size[:] = 0.0
 
 
 def opened_context(width: int, height: int, what: str) -> Any:
-    """An OpenGL context without a screen: EGL, or OSMesa if the environment says MUJOCO_GL=osmesa.
+    """Open an OpenGL context without a screen: EGL, or OSMesa if the environment has MUJOCO_GL=osmesa.
 
-    what: is drawn with it, for the ConfigError that is raised when there is no OpenGL.
+    Args:
+        width: of the pictures, in pixels.
+        height: of the pictures, in pixels.
+        what: what is drawn with it, for the error message.
+
+    Raises:
+        ConfigError: there is no OpenGL.
     """
     kind = "osmesa" if os.environ.get("MUJOCO_GL") == "osmesa" else "egl"
     try:

@@ -1,4 +1,4 @@
-"""What a sensor's reader gets, and what it must do."""
+"""The interface of a sensor's reader, and what it may use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
 
 @dataclass(frozen=True)
 class Scope:
-    """What a sensor that looks around gets."""
+    """The model and the state that a sensor that looks around may use."""
 
     config: RunConfig
     sim: SimModel
-    data: mujoco.MjData  # a copy of the state, with the places of all bodies and no more
-    noise: np.random.Generator  # of its own
+    data: mujoco.MjData  # a copy of the state, in which only the places of bodies are computed
+    noise: np.random.Generator  # of this sensor alone
 
 
 @dataclass(frozen=True)
 class BodyScope(Scope):
-    """What a sensor of the body gets: the state itself, and the noise that they all share."""
+    """The state itself, for a sensor of the body, and the noise generator that these sensors share."""
 
     motors: Motors
     physics: Physics
@@ -42,9 +42,9 @@ class Reader(Protocol):
     """Makes the samples of one sensor."""
 
     def read(self, tick: int, timestamp_ns: int) -> Message:
-        """The sample of this tick, without rate and delay."""
+        """Return the sample of this tick; rate and delay are applied by the caller."""
         ...
 
 
 class NoSettings(FileStruct, frozen=True):
-    """For a model of a sensor that has none."""
+    """The settings of a sensor model that has none."""

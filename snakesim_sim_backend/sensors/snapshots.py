@@ -17,24 +17,24 @@ class Snapshots:
     """One thread, and the state that it works on."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """The thread is started here: one that a host starts later would have the host's real-time priority."""
+        """Start the thread now: one that a host starts later would have the host's real-time priority."""
         self.data = mujoco.MjData(model)
         self._model = model
         self._thread = ThreadPoolExecutor(1, "sensors")
-        self.do(lambda: None)
+        self.run(lambda: None)
 
-    def do(self, work: Callable[[], ResultT]) -> ResultT:
-        """Have the thread do something, and wait for it. What belongs to OpenGL must all be done in one thread."""
+    def run(self, work: Callable[[], ResultT]) -> ResultT:
+        """Run a function in the thread, and wait for its result. All that uses OpenGL must run in one thread."""
         return self._thread.submit(work).result()
 
     def begin(
         self, read: Callable[[int, int], Message], tick: int, timestamp_ns: int, qpos: NDArray[np.float64]
     ) -> Future[Message]:
-        """Make a sample of the state `qpos`, which is copied, in the order of these calls."""
+        """Begin a sample of the state `qpos`, which is copied. Samples are made in the order of these calls."""
         return self._thread.submit(self._read, read, tick, timestamp_ns, qpos.copy())
 
     def close(self) -> None:
-        """Begin nothing more."""
+        """Cancel what has not begun, and end the thread."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _read(

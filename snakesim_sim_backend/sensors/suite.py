@@ -20,7 +20,7 @@ from snakesim_sim_backend.sensors.joints import JointReader
 from snakesim_sim_backend.sensors.registry import SYNCHRONOUS, mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
-from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, ticks_of
+from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, round_to_ticks
 
 
 class Sensors:
@@ -39,34 +39,43 @@ class Sensors:
         physics: Physics,
         windings: Thermal,
     ) -> None:
-        """Raises ConfigError when a sensor cannot be made."""
+        """Make the readers of all sensors in the robot file.
+
+        Raises:
+            ConfigError: a sensor cannot be made.
+        """
+        sensors = config.robot.sensors
         scope = BodyScope(config, sim, data, np.random.default_rng(config.seed), motors, physics, windings)
-        has = config.robot.sensors
-        self._joints = JointReader(data, has.joints, motors, scope.noise.standard_normal, config.period_ns)
-        self.late: Counter[str] = Counter()  # samples that were dropped because they were not ready in time, by key
-        self._reported: Counter[str] = Counter()  # how many of them have been reported
-        self._others: list[tuple[str, SynchronousSensor | ThreadedSensor]] = []
-        self._snapshots = Snapshots(sim.model) if next(has.mounted(), None) else None
-        for key, sensor in has.published():
+        self._joints = JointReader(data, sensors.joints, motors, scope.noise.standard_normal, config.period_ns)
+        self._channels: list[tuple[str, SynchronousSensor | ThreadedSensor]] = []
+
+        # Samples that were dropped because they were not ready in time, and how many of them were reported, by key.
+        self.late: Counter[str] = Counter()
+        self._reported: Counter[str] = Counter()
+
+        self._snapshots: Snapshots | None = None
+        if any(True for _ in sensors.mounted()):
+            self._snapshots = Snapshots(sim.model)
+        for key, sensor in sensors.published():
             if isinstance(sensor, Mounted):
-                channel = self._threaded(key, sensor, scope)
+                channel = self._make_threaded(key, sensor, scope)
             else:
                 message = keys.message_at(key)
                 assert message is not None, key
                 channel = SynchronousSensor(SYNCHRONOUS[message](sensor, scope), sensor, config)
-            self._others.append((key, channel))
+            self._channels.append((key, channel))
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """Every sensor that is due. Ticks must come in order, each once."""
+        """Return the samples that are delivered at this tick. Ticks must come in order, each once."""
         others: dict[str, Message] = {}
-        for key, channel in self._others:
-            arrived = channel.arriving(tick, timestamp_ns)
-            if arrived is not None:
-                others[key] = arrived
+        for key, channel in self._channels:
+            sample = channel.sample(tick, timestamp_ns)
+            if sample is not None:
+                others[key] = sample
         return Samples(self._joints.read(tick, timestamp_ns), others)
 
     def lateness(self) -> list[str]:
-        """What to report of dropped samples since the last call: the first one, and each doubling."""
+        """Return what to report of dropped samples since the last call: the first one, and each doubling."""
         lines: list[str] = []
         for key, count in self.late.items():
             if count >= max(2 * self._reported[key], 1):
@@ -75,60 +84,69 @@ class Sensors:
         return lines
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop the thread that makes samples."""
         if self._snapshots is not None:
             self._snapshots.close()
 
-    def _threaded(self, key: str, sensor: AnyMounted, scope: Scope) -> "ThreadedSensor":
+    def _make_threaded(self, key: str, sensor: AnyMounted, scope: Scope) -> "ThreadedSensor":
+        """Make a sensor whose samples another thread makes. Its reader is made in that thread, too, for OpenGL."""
         snapshots = self._snapshots
         assert snapshots is not None
-        own = Scope(scope.config, scope.sim, snapshots.data, own_noise(key, scope.config.seed))
-        reader = snapshots.do(lambda: mounted_reader(key, sensor, own))
+        own_scope = Scope(scope.config, scope.sim, snapshots.data, own_noise(key, scope.config.seed))
+        reader = snapshots.run(lambda: mounted_reader(key, sensor, own_scope))
         return ThreadedSensor(key, reader, sensor, scope, snapshots, self.late)
 
 
 class SynchronousSensor:
-    """A sensor that is read at once."""
+    """A sensor that is read within the tick."""
 
     def __init__(self, reader: Reader, sensor: AnySensor, config: RunConfig) -> None:
         self._read = reader.read
-        self._due = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
-        self._line = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
+        self._schedule = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
+        self._delay_line = DelayLine(round_to_ticks(sensor.delay_s, config.period_ns))
 
-    def arriving(self, tick: int, timestamp_ns: int) -> Message | None:
-        """Take a sample if due, and return the one that arrives at this tick."""
-        taken = self._read(tick, timestamp_ns) if self._due.at(timestamp_ns) else None
-        return self._line.pass_on(tick, taken)
+    def sample(self, tick: int, timestamp_ns: int) -> Message | None:
+        """Make a sample if one is due, and return the one that is delivered at this tick."""
+        sample = None
+        if self._schedule.is_due(timestamp_ns):
+            sample = self._read(tick, timestamp_ns)
+        return self._delay_line.delay(tick, sample)
 
 
 class ThreadedSensor:
-    """A sensor that takes long: its samples are made in another thread, and arrive a tick later at the earliest.
+    """A slow sensor: another thread makes its samples, and they are delivered a tick later at the earliest.
 
-    In real time a sample that is not ready when it should arrive is dropped and counted. Otherwise it is waited for,
-    so that every run of a seed gets the same.
+    In real time a sample that is not ready at its delivery is dropped and counted. In the other clock modes the tick
+    waits for it, so that every run of a seed gets the same samples.
     """
 
     def __init__(
         self, key: str, reader: Reader, sensor: Mounted, scope: Scope, snapshots: Snapshots, late: Counter[str]
     ) -> None:
         config = scope.config
-        self._key, self._read, self._snapshots, self._late = key, reader.read, snapshots, late
+        self._key = key
+        self._read = reader.read
+        self._snapshots = snapshots
+        self._late = late
         self._qpos = scope.data.qpos
         self._waits = config.clock_mode != "realtime"
-        self._due = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
-        self._delay_ticks = max(ticks_of(sensor.delay_s, config.period_ns), 1)
-        self._under_way: deque[tuple[int, Future[Message]]] = deque()  # with the tick of arrival
+        self._schedule = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
+        self._delay_ticks = max(round_to_ticks(sensor.delay_s, config.period_ns), 1)
+        self._waiting: deque[tuple[int, Future[Message]]] = deque()  # with the tick of delivery
 
-    def arriving(self, tick: int, timestamp_ns: int) -> Message | None:
-        """Take a sample if due, and return the one that arrives at this tick."""
-        if self._due.at(timestamp_ns):
-            sample = self._snapshots.begin(self._read, tick, timestamp_ns, self._qpos)
-            self._under_way.append((tick + self._delay_ticks, sample))
-        if not self._under_way or self._under_way[0][0] > tick:
+    def sample(self, tick: int, timestamp_ns: int) -> Message | None:
+        """Begin a sample if one is due, and return the one that is delivered at this tick."""
+        if self._schedule.is_due(timestamp_ns):
+            begun = self._snapshots.begin(self._read, tick, timestamp_ns, self._qpos)
+            self._waiting.append((tick + self._delay_ticks, begun))
+        if not self._waiting:
             return None
-        _, sample = self._under_way.popleft()
-        if self._waits or sample.done():
-            return msgspec.structs.replace(sample.result(), tick=tick)
-        sample.cancel()
+        delivery_tick, oldest = self._waiting[0]
+        if delivery_tick > tick:
+            return None
+        self._waiting.popleft()
+        if self._waits or oldest.done():
+            return msgspec.structs.replace(oldest.result(), tick=tick)
+        oldest.cancel()
         self._late[self._key] += 1
         return None

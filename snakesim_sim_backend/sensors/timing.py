@@ -8,40 +8,49 @@ from snakesim_hal.wire.messages import Message
 
 
 class SamplingSchedule:
-    """Which ticks a sensor of a given rate samples: those at which floor(stamp * rate) advances, computed exactly."""
+    """The ticks at which a sensor of a given rate samples: those at which floor(timestamp * rate) increases.
+
+    It is computed in integers, so that no tick depends on rounding.
+    """
 
     def __init__(self, sensor_hz: float, tick_hz: float, period_ns: int) -> None:
-        self._always = sensor_hz >= tick_hz
-        top, bottom = sensor_hz.as_integer_ratio()
-        self._top, self._bottom = top, bottom * 10**9
+        self._samples_always = sensor_hz >= tick_hz
+        numerator, denominator = sensor_hz.as_integer_ratio()
+        self._numerator = numerator
+        self._denominator = denominator * 10**9  # timestamps are in ns
         self._period_ns = period_ns
 
-    def at(self, timestamp_ns: int) -> bool:
-        """Whether the sensor samples at the tick of this stamp."""
-        if self._always or timestamp_ns == 0:
+    def is_due(self, timestamp_ns: int) -> bool:
+        """Return whether the sensor samples at the tick with this timestamp."""
+        if self._samples_always or timestamp_ns == 0:
             return True
-        before = (timestamp_ns - self._period_ns) * self._top // self._bottom
-        return timestamp_ns * self._top // self._bottom > before
+        samples_before = (timestamp_ns - self._period_ns) * self._numerator // self._denominator
+        samples_now = timestamp_ns * self._numerator // self._denominator
+        return samples_now > samples_before
 
 
-def ticks_of(delay_s: float, period_ns: int) -> int:
-    """A delay in whole ticks, to the nearest."""
+def round_to_ticks(delay_s: float, period_ns: int) -> int:
+    """Return a delay as a number of whole ticks, the nearest one."""
     return round(delay_s * 1e9 / period_ns)
 
 
 class DelayLine:
-    """Delays samples. Their stamp stays that of sampling; their tick becomes that of delivery."""
+    """Delays samples. They keep the timestamp of sampling, and get the tick of delivery."""
 
     def __init__(self, ticks: int) -> None:
         self._ticks = ticks
-        self._under_way: deque[tuple[int, Message]] = deque()  # with the tick of arrival
+        self._waiting: deque[tuple[int, Message]] = deque()  # with the tick of delivery
 
-    def pass_on(self, tick: int, taken: Message | None) -> Message | None:
-        """Put in the sample of this tick, if any; returns the one that arrives at it, if any."""
+    def delay(self, tick: int, sample: Message | None) -> Message | None:
+        """Take in the sample of this tick, if any, and return the one that is to be delivered now, if any."""
         if not self._ticks:
-            return taken
-        if taken is not None:
-            self._under_way.append((tick + self._ticks, taken))
-        if not self._under_way or self._under_way[0][0] > tick:
+            return sample
+        if sample is not None:
+            self._waiting.append((tick + self._ticks, sample))
+        if not self._waiting:
             return None
-        return msgspec.structs.replace(self._under_way.popleft()[1], tick=tick)
+        delivery_tick, oldest = self._waiting[0]
+        if delivery_tick > tick:
+            return None
+        self._waiting.popleft()
+        return msgspec.structs.replace(oldest, tick=tick)

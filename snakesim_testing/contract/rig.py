@@ -207,7 +207,7 @@ class Rig:
         return self.since(began)
 
     def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> RequestedSetpoints:
-        """Setpoints of all joints; those without a command hold the start pose.
+        """RequestedSetpoints of all joints; those without a command hold the start pose.
 
         A joint without a velocity mode gets the positions that lead along at that speed, one each time.
         """

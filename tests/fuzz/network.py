@@ -185,7 +185,7 @@ def _stranger(endpoint: str, request: Request) -> Iterator[subprocess.Popen[byte
 
 
 def _foreign(out: Path, record: HostRecord) -> list[str]:
-    """Setpoints that the holding controller did not ask for."""
+    """RequestedSetpoints that the holding controller did not ask for."""
     found = [f"fault {fault.what}: {fault.cause}" for fault in record.faults]
     _, box = read_black_box(out / BLACK_BOX)
     modes, targets = box["mode"], box["target"]

@@ -61,19 +61,19 @@ def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.R
 def recorded() -> Iterator[list[dict[str, float]]]:
     """Forces of the obstacles that the body touches, one dict a physics step of the run within."""
     steps: list[dict[str, float]] = []
-    feel = ContactReader._feel  # pyright: ignore[reportPrivateUsage] - called in every physics step
+    feel = ContactReader._measure_force  # pyright: ignore[reportPrivateUsage] - called in every physics step
 
     def felt(self: ContactReader) -> None:
         touches = self._touches  # pyright: ignore[reportPrivateUsage]
         found: dict[str, float] = {}
-        names = touches._obstacles  # pyright: ignore[reportPrivateUsage]
-        for pair, force_n in touches.sizes_n().items():
+        names = touches._obstacle_of_geom  # pyright: ignore[reportPrivateUsage]
+        for pair, force_n in touches.sum_forces_n().items():
             name = next(names[geom] for geom in pair if names[geom] is not None)  # pyright: ignore
             found[name] = found.get(name, 0.0) + force_n
         steps.append(found)
         feel(self)
 
-    with mock.patch.object(ContactReader, "_feel", felt):
+    with mock.patch.object(ContactReader, "_measure_force", felt):
         yield steps
 
 

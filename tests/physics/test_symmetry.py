@@ -80,7 +80,7 @@ def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0) -> Track:
     config = make_config(scene={"ground": {"friction": MU}})
     sim = build(config, SimSettings(timestep_s=step_s), motors=False)
     model, data = sim.model, mujoco.MjData(sim.model)
-    assert sim.soles is not None
+    assert sim.feet is not None
     count, (stiffness, damping) = model.nv - FREE_DOFS, SERVO
     model.dof_damping[FREE_DOFS:], model.dof_frictionloss[FREE_DOFS:] = damping, 0.0
     data.qpos[2] = config.robot.module.radius_m
@@ -89,7 +89,7 @@ def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0) -> Track:
     physics = Physics(sim, data)
     physics.begin()
     step_s, period_s = model.opt.timestep, 2 * np.pi / wave.rate
-    tail, head = sim.soles.geoms[[0, -1]]
+    tail, head = sim.feet.geoms[[0, -1]]
     steps = int(PERIODS * period_s / step_s) + 1
     center, axis = np.empty((steps, 2)), np.empty((steps, 2))
     for k in range(steps):

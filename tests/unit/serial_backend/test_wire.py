@@ -25,17 +25,17 @@ def test_a_port_is_for_one_alone_and_what_came_too_late_is_thrown_away(tmp_path:
         with pytest.raises(BackendError, match=r"cannot be opened: .*Is another program using it\?"):
             SerialWire(pty.path, 1_000_000)
         wire.send(b"first?")
-        pty.give(b"late")
+        pty.send(b"late")
         assert wire.receive(1.0) == b"late" and wire.receive(0.0) == b""
-        pty.give(b"later")
+        pty.send(b"later")
         assert wire.receive(1.0) == b"later"
         wire.cut(begins=True)
         wire.send(b"lost")
         assert wire.error() == "it is cut" and wire.receive(0.0) == b""
         wire.cut(begins=False)
         assert wire.error() == ""
-        pty.due = len(b"first?")
-        assert pty.take() == b"first?"
+        pty.expected_bytes = len(b"first?")
+        assert pty.receive() == b"first?"
         wire.close()
     lines = [line.split(maxsplit=3)[2:] for line in log.read_text().splitlines()]
     assert lines == [["out", b"first?".hex(" ")], ["in", b"late".hex(" ")], ["in", b"later".hex(" ")]]
@@ -73,7 +73,7 @@ def test_a_computer_that_pauses_in_a_write_has_not_lost_its_port(monkeypatch: py
     assert wire.error() == ""
     monkeypatch.undo()
     wire.send(b"again")
-    pty.due = len(b"hello?again")
-    assert pty.take() == b"hello?again"
+    pty.expected_bytes = len(b"hello?again")
+    assert pty.receive() == b"hello?again"
     wire.close()
     pty.close()

@@ -17,7 +17,7 @@ def loads_n(run: Run) -> NDArray[np.float64]:
     """On every foot."""
     ground = run.sim.physics.ground
     assert ground is not None
-    return ground.push_n
+    return ground.normal_force_n
 
 
 def kinetic_energy(run):

@@ -38,7 +38,7 @@ def pass_time(physics_model, torque_nm: ArrayLike = 0.0, seconds=0.0):
 
 def touches_of(physics_model):
     """Link -> (position, force) in the world's frame of every touch by an obstacle, pushed as MuJoCo says."""
-    model, data, rub_w = physics_model.sim.model, physics_model.data, physics_model.physics.contacts.rub_w
+    model, data, rub_w = physics_model.sim.model, physics_model.data, physics_model.physics.contacts.friction_force_w
     found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     wrench = np.zeros(6)
     for i in range(data.ncon):

@@ -162,8 +162,8 @@ def test_a_sensor_is_due_whenever_a_period_of_its_own_has_passed(tick_hz, sensor
 
 
 def test_over_a_long_run_the_number_of_samples_is_exact():
-    due = SamplingSchedule(70.0, 1000.0, 1_000_000)
-    assert sum(due.at(tick * 1_000_000) for tick in range(1, 10_001)) == 700
+    schedule = SamplingSchedule(70.0, 1000.0, 1_000_000)
+    assert sum(schedule.is_due(tick * 1_000_000) for tick in range(1, 10_001)) == 700
 
 
 def test_a_delayed_sensor_gives_what_was_there_before():

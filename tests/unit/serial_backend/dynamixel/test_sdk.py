@@ -36,12 +36,12 @@ class Port(PortHandler):
         assert self.setBaudRate(1_000_000)
 
     def clearPort(self) -> None:  # noqa: N802
-        while self._read < self._pty.given:
+        while self._read < self._pty.sent_bytes:
             self.readPort(1000)
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
         written = super().writePort(packet) or 0
-        self._pty.due = (self._pty.due or 0) + written
+        self._pty.expected_bytes = (self._pty.expected_bytes or 0) + written
         self._emulator()
         return written
 
@@ -51,7 +51,7 @@ class Port(PortHandler):
         return data
 
     def isPacketTimeout(self) -> bool:  # noqa: N802
-        return self._read >= self._pty.given
+        return self._read >= self._pty.sent_bytes
 
 
 class Bench:

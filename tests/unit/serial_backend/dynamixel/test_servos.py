@@ -67,7 +67,7 @@ def test_torque_mode_pushes_and_a_servo_that_is_left_alone_comes_to_a_stop_just_
     assert robot.joints is not None
     assert robot.joints.torque_nm == pytest.approx([-0.05] * JOINTS, abs=0.004)
     servo, emulator = drives_of(robot.backend).servos[0], robot.emulator.servos[0]
-    goal_rad = emulator.get("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
+    goal_rad = emulator.read_register("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
     assert servo.lower_rad - 0.5 < goal_rad < servo.lower_rad
 
 
@@ -93,9 +93,9 @@ def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_sta
         made(emulator, *rest)
         first, second, third, fourth = emulator.servos
         first.table[7] = 9
-        second.put("H", at.MODEL, 1060)
-        third.put("i", at.HOMING_OFFSET, -100)
-        fourth.put("H", at.CURRENT_LIMIT, 10)
+        second.write_register("H", at.MODEL, 1060)
+        third.write_register("i", at.HOMING_OFFSET, -100)
+        fourth.write_register("H", at.CURRENT_LIMIT, 10)
 
     monkeypatch.setattr(EmulatedDynamixel, "__init__", otherwise)
     with pytest.raises(BackendError) as raised:
