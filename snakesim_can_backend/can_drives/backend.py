@@ -12,13 +12,13 @@ from snakesim_can_backend.bus.load import mbit, worst_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.can_drives.drives import CanDrives
 from snakesim_can_backend.can_drives.emulator import CanEmulator
-from snakesim_can_backend.can_drives.traffic import Load, Traffic, load_of
+from snakesim_can_backend.can_drives.traffic import BusLoad, CycleTraffic, compute_load
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.buses import Bus
-from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, body_of, port_of, who
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, buses_of
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, assign_ports, joint_label, make_body
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import KINDS
 from snakesim_hal.model.joints import Joint
@@ -47,7 +47,7 @@ class CanDriveBackend(DriverTypeBackend):
     first_id: ClassVar[int] = 0
     last_id: ClassVar[int]
     reserved_ids: ClassVar[str]  # what the ids beyond these are, for a message
-    traffic: ClassVar[Traffic]
+    traffic: ClassVar[CycleTraffic]
     # (joints of the driver type, settings, joints of the bus, wire, readings, and the kit's arguments by name)
     drives: ClassVar[Callable[..., CanDrives]]
     emulator: ClassVar[Callable[..., CanEmulator]]  # (joints of the driver type, settings, body, wires, clock)
@@ -74,7 +74,7 @@ class CanDriveBackend(DriverTypeBackend):
         for joint in joints:
             if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
-                    f"{who(config, joint)}: `id` = {joint.id}, and {cls.a_drive} have ids of {cls.first_id} to "
+                    f"{joint_label(config, joint)}: `id` = {joint.id}, and {cls.a_drive} have ids of {cls.first_id} to "
                     f"{cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as `id` of the joint"
                 )
             cls.check_joint(config, settings, joint)
@@ -87,10 +87,12 @@ class CanDriveBackend(DriverTypeBackend):
         return not all(map(is_emulated, settings.channels))
 
     @classmethod
-    def load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> Load:
+    def load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> BusLoad:
         """Of the fullest bus."""
-        on = port_of(joints, settings.channels)
-        return load_of(cls.traffic, on, rate_hz, lambda length: worst_s(length, settings.bit_rate, settings.fd_rate))
+        on = assign_ports(joints, settings.channels)
+        return compute_load(
+            cls.traffic, on, rate_hz, lambda length: worst_s(length, settings.bit_rate, settings.fd_rate)
+        )
 
     @staticmethod
     def rates(settings: Any) -> str:
@@ -99,17 +101,22 @@ class CanDriveBackend(DriverTypeBackend):
 
     @classmethod
     def emulator_on(
-        cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: Clock, pose: str | None
+        cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: DriverClock, pose: str | None
     ) -> CanEmulator:
         """Emulated drives of a whole robot."""
-        body, joints = body_of(config, settings, cls.name, pose), config.robot.joint_table
+        body, joints = make_body(config, settings, cls.name, pose), config.robot.joint_table
         return cls.emulator(
-            joints, settings, body, [wires[bus] for bus in port_of(joints, settings.channels)], clock.ns
+            joints, settings, body, [wires[bus] for bus in assign_ports(joints, settings.channels)], clock.now_ns
         )
 
     @classmethod
     def buses(
-        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: EmulatedBody | None
+        cls,
+        config: RunConfig,
+        settings: Any,
+        joints: Mapping[int, Joint],
+        clock: DriverClock,
+        body: EmulatedBody | None,
     ) -> list[Bus]:
         """One for each channel, or one of emulated drives."""
         fd, everybody = settings.fd_rate is not None, list(joints.values())
@@ -118,11 +125,11 @@ class CanDriveBackend(DriverTypeBackend):
             says_every_ns = max(round(cls.says_every_s * 1e9), says_every_ns)
         log = open_log(Path(settings.log), cls.name) if settings.log else None
 
-        def open_drives(channel: str, mine: Sequence[int], readings: Readings) -> CanDrives:
+        def open_drives(channel: str, mine: Sequence[int], readings: DriveReadings) -> CanDrives:
             emulator = None
             if body is not None:
                 other_end = [VirtualWire(channel, fd=fd)] * len(everybody)
-                emulator = cls.emulator(everybody, settings, body, other_end, clock.ns)
+                emulator = cls.emulator(everybody, settings, body, other_end, clock.now_ns)
                 wire: Wire = VirtualWire(channel, emulator, fd=fd)
             else:
                 wire = open_wire(channel, None, settings.bit_rate, settings.fd_rate)
@@ -137,8 +144,8 @@ class CanDriveBackend(DriverTypeBackend):
                 answer_s=answer_limit_s(config, settings.decimation),
                 bring_up_s=settings.bring_up_limit_s,
                 says_every_ns=says_every_ns,
-                clock_ns=clock.ns,
+                clock_ns=clock.now_ns,
             )
 
         channels = [virtual_channel()] if body is not None else settings.channels
-        return buses_of(joints, settings, channels, open_drives)
+        return group_by_port(joints, settings, channels, open_drives)

@@ -12,7 +12,7 @@ from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_drivers.emulation.emulated_body import serve_until_stopped
-from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
 from snakesim_hal.base.terminal import exit_code, say
@@ -54,7 +54,7 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
     check_channels(settings.channels, fd=settings.fd_rate is not None)
     config = msgspec.structs.replace(config, clock_mode="realtime")
     wires = [open_wire(channel, None, settings.bit_rate, settings.fd_rate) for channel in settings.channels]
-    emulator = backend.emulator_on(config, settings, wires, Clock(config), arguments.pose)
+    emulator = backend.emulator_on(config, settings, wires, DriverClock(config), arguments.pose)
     ready = f"{backend.a_drive} ready: {len(emulator.wires)} on {', '.join(settings.channels)}"
     with contextlib.closing(emulator):
         serve_until_stopped(ready, emulator, partial(wait, wires))

@@ -14,8 +14,8 @@ from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.following import Following, Word
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.following import DriveCommand, DriveStates
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
@@ -37,7 +37,7 @@ class CanDrives(ABC):
         self,
         joints: Sequence[Joint],
         wire: Wire,
-        readings: Readings,
+        readings: DriveReadings,
         *,
         emulator: VirtualPeer | None,
         emulated: bool,
@@ -54,7 +54,7 @@ class CanDrives(ABC):
         self.wire, self.nodes = wire, [joint.id for joint in joints]
         self.readings, self.clock_ns = readings, clock_ns
         who = [f"{j.name} (node {j.id} on {wire.channel})" for j in joints]
-        self.following = Following(who, says_every_ns, clock_ns)
+        self.following = DriveStates(who, says_every_ns, clock_ns)
         self.firmware: list[tuple[int, ...]] = [()] * len(joints)  # as drives say in bring-up
         self._serials: list[list[str]] = [[] for _ in joints]  # that answer by a joint's id; the first is its own
         self._at = {node: i for i, node in enumerate(self.nodes)}
@@ -111,7 +111,7 @@ class CanDrives(ABC):
         """A setpoint, at the shaft."""
 
     @abstractmethod
-    def tell(self, i: int, word: Word) -> None:
+    def tell(self, i: int, word: DriveCommand) -> None:
         """Follow, be idle, or stop."""
 
     @abstractmethod
@@ -144,8 +144,8 @@ class CanDrives(ABC):
             self.tell(i, "idle")
             self.forgive(i)
             self.set_up(i)
-        self._await(self.readings.known, self.ask)
-        silent = [self.following.drives[i].who for i in everybody if not self.readings.known(i)]
+        self._await(self.readings.is_known, self.ask)
+        silent = [self.following.drives[i].who for i in everybody if not self.readings.is_known(i)]
         if silent:
             raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled")
         for i in everybody:
@@ -169,23 +169,23 @@ class CanDrives(ABC):
         """Remember a serial number that answers by the id of a joint: two are two drives with one id."""
         if serial not in self._serials[i]:
             self._serials[i].append(serial)
-        self.readings.identified(i, serial=self._serials[i][0])
+        self.readings.set_identity(i, serial=self._serials[i][0])
 
     def read(self) -> None:
         """Ask, and wait for those who answered lately."""
         self._receive()
         for i in range(len(self.nodes)):
             if not self.ask(i):
-                self.readings.not_asked(i)
+                self.readings.skip_request(i)
         self._turn = (self._turn + 1) % len(self.nodes)
         self.ask_health(self._turn)
         end = time.monotonic() + self._answer_s
-        while self.readings.incomplete() and (left_s := end - time.monotonic()) > 0:
+        while self.readings.is_incomplete() and (left_s := end - time.monotonic()) > 0:
             if not wait([self.wire], left_s):
                 break
             self._receive()
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """Receive."""
         wait([self.wire], 0.0)
         self._receive()
@@ -208,7 +208,7 @@ class CanDrives(ABC):
         for i, word in self.following.words(following, emergency=emergency):
             self.tell(i, word)
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """Errors, and what a restart has lost; what a drive says of errors from now on is of after the clear."""
         self.following.forgive(joints)
         self._serials = [serials[:1] for serials in self._serials]  # whether a second drive is still there

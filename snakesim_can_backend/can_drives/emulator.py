@@ -8,11 +8,11 @@ from typing import ClassVar
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.emulation.emulated_body import EmulatedBody, EmulatedDrive
+from snakesim_drivers.emulation.emulated_body import DriveEmulator, EmulatedBody
 from snakesim_drivers.kit.drive_settings import DriveSettings
 
 
-class CanEmulator(EmulatedDrive):
+class CanEmulator(DriveEmulator):
     """All drives of a driver type on CAN."""
 
     everybody: ClassVar[int] = -1  # the address of frames that every drive takes; -1: there is none
@@ -27,11 +27,11 @@ class CanEmulator(EmulatedDrive):
         super().__init__(body, wires, clock_ns)
 
     @abstractmethod
-    def addressee(self, frame: Frame) -> int:
+    def find_addressee(self, frame: Frame) -> int:
         """The node that a frame is for."""
 
     @abstractmethod
-    def take(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: Frame) -> None:
         """A frame to a drive. ValueError, LookupError, struct.error: malformed."""
 
     def __call__(self) -> float | None:
@@ -45,21 +45,21 @@ class CanEmulator(EmulatedDrive):
         for wire in self._ends:
             for frame in wire.receive():
                 for i in self._addressees(wire, frame):
-                    if self.body.deaf(i):
+                    if self.body.is_booting(i):
                         continue
                     with contextlib.suppress(ValueError, LookupError, struct.error):
-                        self.take(i, frame)
+                        self.handle_frame(i, frame)
         self.pass_time()
 
     @abstractmethod
-    def of_second(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: Frame) -> Frame:
         """What a second drive with the same id sends beside a frame of the first one.
 
         It gets the same commands, so only its serial number is its own.
         """
 
     def _addressees(self, wire: Wire, frame: Frame) -> list[int]:
-        node = self.addressee(frame)
+        node = self.find_addressee(frame)
         if node == self.everybody:
             return [i for i, one in enumerate(self.wires) if one is wire]
         i = self._at.get((id(wire), node))
@@ -67,8 +67,8 @@ class CanEmulator(EmulatedDrive):
 
     def say(self, i: int, frame: Frame) -> None:
         """A frame of a drive, unless it is silent."""
-        if self.body.silent(i):
+        if self.body.is_silent(i):
             return
         self.wires[i].send(frame)
         if self.body.is_doubled(i):
-            self.wires[i].send(self.of_second(frame))
+            self.wires[i].send(self.duplicate_frame(frame))

@@ -8,7 +8,7 @@ from snakesim_hal.base.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Traffic:
+class CycleTraffic:
     """Frames by their length in bytes."""
 
     each_drive: tuple[int, ...]  # of a tick
@@ -17,7 +17,7 @@ class Traffic:
 
 
 @dataclass(frozen=True)
-class Load:
+class BusLoad:
     """Of the fullest bus."""
 
     share: float  # of its time
@@ -33,9 +33,9 @@ class Load:
             )
 
 
-def load_of(traffic: Traffic, on: Sequence[int], rate_hz: float, frame_s: Callable[[int], float]) -> Load:
+def compute_load(traffic: CycleTraffic, on: Sequence[int], rate_hz: float, frame_s: Callable[[int], float]) -> BusLoad:
     """on: the number of every joint's bus; frame_s: time that a frame of so many bytes takes."""
     drives = max(on.count(bus) for bus in set(on))
     tick_s = drives * sum(map(frame_s, traffic.each_drive)) + sum(map(frame_s, traffic.one_drive))
     steady = drives * traffic.heartbeats_hz * frame_s(8) if traffic.heartbeats_hz else 0.0
-    return Load(tick_s * rate_hz + steady, int((MAX_LOAD - steady) / tick_s), drives)
+    return BusLoad(tick_s * rate_hz + steady, int((MAX_LOAD - steady) / tick_s), drives)

@@ -7,8 +7,8 @@ from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.can_drives.command import run
-from snakesim_can_backend.can_drives.traffic import Traffic
-from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
+from snakesim_can_backend.can_drives.traffic import CycleTraffic
+from snakesim_can_backend.moteus.controllers import Controllers, configured_gains, needed_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_hal.base.errors import ConfigError
@@ -41,13 +41,13 @@ class MoteusBackend(CanDriveBackend):
     reserved_ids = f"{HOST_ID} is the host's, {BROADCAST_ID} the broadcast address"
     says_every_s = 0.05  # it says so whenever it is asked; but it takes a while to get ready
     # Question, answer and command; of one controller two questions more: its health, and its serial number.
-    traffic = Traffic((5, 24, 48), (6, 24, 3, 16))
+    traffic = CycleTraffic((5, 24, 48), (6, 24, 3, 16))
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:
         """And gains that all controllers have alike."""
         super().check_drives(config, settings, joints)
-        most, have = needed(joints), configured(joints, settings)
+        most, have = needed_gains(joints), configured_gains(joints, settings)
         named = settings.kp_nm_per_turn is not None and settings.kd_nm_s_per_turn is not None
         if (cls.real(settings) and not named) or any(a > b * ROUNDING for a, b in zip(most, have, strict=True)):
             raise ConfigError(

@@ -21,30 +21,33 @@ from snakesim_can_backend.moteus.protocol import (
     RELATIVE,
     REPLY,
     WRITE,
-    Mode,
+    MoteusMode,
     Register,
-    addresses,
-    framed,
-    part,
-    parts,
+    decode_subframes,
+    encode_subframe,
+    make_frame,
+    split_addresses,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.following import Word
+from snakesim_drivers.kit.following import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode as JointMode
 
 TURN = 2 * math.pi
-OFF_BY_ITSELF = (Mode.FAULT, Mode.TIMEOUT)  # latched until a stop, which also clears the reason
+OFF_BY_ITSELF = (MoteusMode.FAULT, MoteusMode.TIMEOUT)  # latched until a stop, which also clears the reason
 NO_LIMIT = -1.0
-IDENTITY = part(READ, INT32, Register.MAP_VERSION, count=1), part(READ, INT8, Register.HOME_STATE, count=1)
-MOTION = part(READ, FLOAT, Register.MODE, count=4), part(READ, INT8, Register.FAULT, count=1)
+IDENTITY = (
+    encode_subframe(READ, INT32, Register.MAP_VERSION, count=1),
+    encode_subframe(READ, INT8, Register.HOME_STATE, count=1),
+)
+MOTION = encode_subframe(READ, FLOAT, Register.MODE, count=4), encode_subframe(READ, INT8, Register.FAULT, count=1)
 HEALTH = (
-    part(READ, FLOAT, Register.POWER, count=1),
-    part(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
-    part(READ, FLOAT, Register.VOLTAGE, count=2),
+    encode_subframe(READ, FLOAT, Register.POWER, count=1),
+    encode_subframe(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
+    encode_subframe(READ, FLOAT, Register.VOLTAGE, count=2),
 )
 SERIAL_WORDS = 3
-SERIAL = part(READ, INT32, Register.SERIAL, count=SERIAL_WORDS)
+SERIAL = encode_subframe(READ, INT32, Register.SERIAL, count=SERIAL_WORDS)
 
 _log = logging.getLogger("snakesim.moteus")
 
@@ -58,14 +61,14 @@ class Controllers(CanDrives):
         self, everybody: Sequence[Joint], settings: Any, joints: Sequence[Joint], *rest: Any, **kit: Any
     ) -> None:
         super().__init__(joints, *rest, **kit)
-        self._kp_nm_per_turn, kd = kp, kd = configured(everybody, settings)
-        self._gains = [tuple(a / b for a, b in zip(gains_of(j), (kp, kd, kd), strict=True)) for j in joints]
+        self._kp_nm_per_turn, kd = kp, kd = configured_gains(everybody, settings)
+        self._gains = [tuple(a / b for a, b in zip(shaft_gains(j), (kp, kd, kd), strict=True)) for j in joints]
         self._watchdog_s = settings.watchdog_s
         self._mode, self._home = [-1] * len(joints), [RELATIVE] * len(joints)
 
     def sender(self, frame: Frame) -> int | None:
         """Another host of our id is known by its writing."""
-        source, destination = addresses(frame)
+        source, destination = split_addresses(frame)
         if source == HOST_ID:
             return HOST if frame.data[:1] < bytes([READ]) else None
         return source if destination == HOST_ID else None
@@ -74,23 +77,23 @@ class Controllers(CanDrives):
         """One answer, to one of three questions."""
         said = {
             one.register + k: value
-            for one in parts(frame.data)
+            for one in decode_subframes(frame.data)
             if one.kind == REPLY
             for k, value in enumerate(one.values)
         }
         if Register.POSITION in said:
             mode, fault = int(said[Register.MODE]), int(said[Register.FAULT])
             self._mode[i] = mode
-            self.readings.state_was_read(i)
-            self.readings.moved(i, said[Register.POSITION] * TURN, said[Register.VELOCITY] * TURN)
-            self.readings.pushed(i, said[Register.TORQUE])
-            self.following.says(i, enabled=mode == Mode.POSITION, state=f"in mode {mode}")
-            named = f"fault {fault}, {FAULTS.get(fault, 'see its manual')}" if mode == Mode.FAULT else ""
-            self.following.drives[i].errors = "timeout: its watchdog expired" if mode == Mode.TIMEOUT else named
+            self.readings.mark_checked(i)
+            self.readings.set_motion(i, said[Register.POSITION] * TURN, said[Register.VELOCITY] * TURN)
+            self.readings.set_torque(i, said[Register.TORQUE])
+            self.following.says(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
+            named = f"fault {fault}, {FAULTS.get(fault, 'see its manual')}" if mode == MoteusMode.FAULT else ""
+            self.following.drives[i].errors = "timeout: its watchdog expired" if mode == MoteusMode.TIMEOUT else named
         if Register.VOLTAGE in said:
             voltage_v = said[Register.VOLTAGE]
-            self.readings.supplied(i, voltage_v, said[Register.POWER] / max(voltage_v, 1.0))
-            self.readings.warmed(i, said[Register.MOTOR_TEMPERATURE], said[Register.BOARD_TEMPERATURE])
+            self.readings.set_supply(i, voltage_v, said[Register.POWER] / max(voltage_v, 1.0))
+            self.readings.set_temperatures(i, said[Register.MOTOR_TEMPERATURE], said[Register.BOARD_TEMPERATURE])
         if Register.MAP_VERSION in said:
             self.firmware[i], self._home[i] = (int(said[Register.MAP_VERSION]),), int(said[Register.HOME_STATE])
         if Register.SERIAL in said:
@@ -122,8 +125,8 @@ class Controllers(CanDrives):
 
     def setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """A command, which would also start it: so none to one that was restarted, or may be restarting."""
-        restarted = self.following.drives[i].followed and self._mode[i] != Mode.POSITION
-        if restarted or self.readings.unanswered(i):
+        restarted = self.following.drives[i].followed and self._mode[i] != MoteusMode.POSITION
+        if restarted or self.readings.unanswered_requests(i):
             return
         stiffness, damping, velocity_gain = self._gains[i]
         position, velocity, torque, kp, kd = math.nan, 0.0, 0.0, 0.0, 0.0
@@ -136,12 +139,12 @@ class Controllers(CanDrives):
                 torque = target
         self._send(
             i,
-            part(WRITE, INT8, Register.MODE, Mode.POSITION),
-            part(WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm),
-            part(WRITE, FLOAT, Register.WATCHDOG, self._watchdog_s, NO_LIMIT, NO_LIMIT),
+            encode_subframe(WRITE, INT8, Register.MODE, MoteusMode.POSITION),
+            encode_subframe(WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm),
+            encode_subframe(WRITE, FLOAT, Register.WATCHDOG, self._watchdog_s, NO_LIMIT, NO_LIMIT),
         )
 
-    def tell(self, i: int, word: Word) -> None:
+    def tell(self, i: int, word: DriveCommand) -> None:
         """A setpoint is what makes it follow; a stop clears whatever has stopped a controller before."""
         if self._mode[i] in OFF_BY_ITSELF:
             return  # its reason is for the operator to reset
@@ -149,7 +152,7 @@ class Controllers(CanDrives):
             case "follow":
                 return
             case "idle":
-                if i not in self.readings.doubted:  # else it is told again, once it says that it is on
+                if i not in self.readings.drives_to_check:  # else it is told again, once it says that it is on
                     self._stop(i)
             case "stop":
                 self._stop(i)
@@ -159,7 +162,7 @@ class Controllers(CanDrives):
 
     def forgive(self, i: int) -> None:
         """An expired watchdog."""
-        if self._mode[i] == Mode.TIMEOUT:
+        if self._mode[i] == MoteusMode.TIMEOUT:
             _log.warning("%s: clearing an expired watchdog of an earlier run", self.following.drives[i].who)
             self._stop(i)
 
@@ -171,13 +174,13 @@ class Controllers(CanDrives):
         self._stop(i)
 
     def _stop(self, i: int) -> None:
-        self._send(i, part(WRITE, INT8, Register.MODE, Mode.STOPPED))
+        self._send(i, encode_subframe(WRITE, INT8, Register.MODE, MoteusMode.STOPPED))
 
     def _send(self, i: int, *content: bytes, reply: bool = False) -> bool:
-        return self.wire.send(framed(HOST_ID, self.nodes[i], *content, reply=reply))
+        return self.wire.send(make_frame(HOST_ID, self.nodes[i], *content, reply=reply))
 
 
-def gains_of(joint: Joint) -> tuple[float, float, float]:
+def shaft_gains(joint: Joint) -> tuple[float, float, float]:
     """Stiffness in N·m/turn, damping and gain of velocity mode in N·m/(turn/s), at the shaft."""
     motor, at_shaft = joint.motor, TURN / joint.drive.gear**2
     gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, motor.velocity_gain_nm_s_per_rad
@@ -185,13 +188,13 @@ def gains_of(joint: Joint) -> tuple[float, float, float]:
     return stiffness, damping, velocity_gain
 
 
-def needed(joints: Sequence[Joint]) -> tuple[float, float]:
+def needed_gains(joints: Sequence[Joint]) -> tuple[float, float]:
     """The gains that all joints' are shares of: `servo.pid_position.kp` and `kd`."""
-    gains = [gains_of(joint) for joint in joints]
+    gains = [shaft_gains(joint) for joint in joints]
     return max(kp for kp, _, _ in gains), max(max(damping, velocity) for _, damping, velocity in gains)
 
 
-def configured(joints: Sequence[Joint], settings: Any) -> tuple[float, float]:
+def configured_gains(joints: Sequence[Joint], settings: Any) -> tuple[float, float]:
     """Those that the controllers have. joints: all of them."""
-    kp, kd = needed(joints)
+    kp, kd = needed_gains(joints)
     return settings.kp_nm_per_turn or kp or 1.0, settings.kd_nm_s_per_turn or kd or 1.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator
-from snakesim_can_backend.moteus.controllers import SERIAL_WORDS, TURN, configured
+from snakesim_can_backend.moteus.controllers import SERIAL_WORDS, TURN, configured_gains
 from snakesim_can_backend.moteus.protocol import (
     BROADCAST_ID,
     FLOAT,
@@ -19,13 +19,13 @@ from snakesim_can_backend.moteus.protocol import (
     REPLY_WANTED,
     TYPES,
     WRITE,
-    Mode,
-    Part,
+    MoteusMode,
     Register,
-    addresses,
-    framed,
-    part,
-    parts,
+    Subframe,
+    decode_subframes,
+    encode_subframe,
+    make_frame,
+    split_addresses,
 )
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
@@ -49,11 +49,11 @@ STEPS = {  # an integer's unit, of 8, 16 and 32 bits; of the others 1
 
 
 @dataclass
-class Controller:
+class EmulatedController:
     """One controller."""
 
     id: int
-    mode: int = Mode.STOPPED
+    mode: int = MoteusMode.STOPPED
     fault: int = 0
     command: dict[int, float] = field(default_factory=lambda: dict(DEFAULTS))
     fed_us: float = 0.0
@@ -64,49 +64,49 @@ class EmulatedMoteus(CanEmulator):
 
     def __init__(self, everybody: Sequence[Joint], settings: Any, body: EmulatedBody, *ends: Any) -> None:
         super().__init__(settings, body, *ends)
-        self.controllers = [Controller(joint.id) for joint in body.joints]
-        self._kp, self._kd = configured(everybody, settings)
+        self.controllers = [EmulatedController(joint.id) for joint in body.joints]
+        self._kp, self._kd = configured_gains(everybody, settings)
 
     everybody = BROADCAST_ID
 
-    def addressee(self, frame: Frame) -> int:
+    def find_addressee(self, frame: Frame) -> int:
         """Its destination."""
-        return addresses(frame)[1]
+        return split_addresses(frame)[1]
 
-    def of_second(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: Frame) -> Frame:
         """Its own serial number, where the frame has one."""
         answers: list[bytes] = []
-        for said in parts(frame.data):
+        for said in decode_subframes(frame.data):
             values = list(said.values)
             if said.register == Register.SERIAL:
                 values[0] = int(values[0]) ^ OTHER_SERIAL
-            answers.append(part(said.kind, said.type, said.register, *values))
-        return framed(*addresses(frame), *answers)
+            answers.append(encode_subframe(said.kind, said.type, said.register, *values))
+        return make_frame(*split_addresses(frame), *answers)
 
     def restart(self, i: int) -> None:
         """Stopped, and without a command."""
-        self.controllers[i] = Controller(self.controllers[i].id)
+        self.controllers[i] = EmulatedController(self.controllers[i].id)
         self._drive(i)
 
-    def take(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: Frame) -> None:
         """Writes act together; then reads are answered, if the frame asks for it."""
-        found = list(parts(frame.data))
+        found = list(decode_subframes(frame.data))
         written = {one.register + k: v for one in found if one.kind == WRITE for k, v in enumerate(one.values)}
         if Register.MODE in written:
             self._obey(i, self.controllers[i], int(written.pop(Register.MODE)), written)
         if frame.id & REPLY_WANTED:
             answers = [self._answer(i, one) for one in found if one.kind not in (WRITE, REPLY)]
-            self.say(i, framed(self.controllers[i].id, addresses(frame)[0], *answers))
+            self.say(i, make_frame(self.controllers[i].id, split_addresses(frame)[0], *answers))
 
-    def _obey(self, i: int, controller: Controller, mode: int, written: dict[int, float]) -> None:
-        if mode == Mode.STOPPED:
-            controller.mode, controller.fault = Mode.STOPPED, 0
-        elif mode == Mode.POSITION and controller.mode in (Mode.STOPPED, Mode.POSITION):
-            controller.mode, controller.fed_us = Mode.POSITION, self.body.now_us
+    def _obey(self, i: int, controller: EmulatedController, mode: int, written: dict[int, float]) -> None:
+        if mode == MoteusMode.STOPPED:
+            controller.mode, controller.fault = MoteusMode.STOPPED, 0
+        elif mode == MoteusMode.POSITION and controller.mode in (MoteusMode.STOPPED, MoteusMode.POSITION):
+            controller.mode, controller.fed_us = MoteusMode.POSITION, self.body.now_us
             controller.command = DEFAULTS | written
         self._drive(i)
 
-    def _answer(self, i: int, asked: Part) -> bytes:
+    def _answer(self, i: int, asked: Subframe) -> bytes:
         values: list[float] = []
         for register in range(asked.register, asked.register + asked.length):
             value = self._value(i, register)
@@ -115,12 +115,12 @@ class EmulatedMoteus(CanEmulator):
                 most = (1 << 8 * TYPES[asked.type].size - 1) - 1
                 value = min(max(round(value / step), -most), most)
             values.append(value)
-        return part(REPLY, asked.type, asked.register, *values)
+        return encode_subframe(REPLY, asked.type, asked.register, *values)
 
     def _value(self, i: int, register: int) -> float:
-        angle, velocity, torque = self.body.shaft(i)
-        motor_c, board_c = self.body.temperatures(i)
-        voltage_v, current_a = self.body.supply(i)
+        angle, velocity, torque = self.body.read_shaft(i)
+        motor_c, board_c = self.body.read_temperatures(i)
+        voltage_v, current_a = self.body.read_supply(i)
         if register - Register.SERIAL in range(SERIAL_WORDS):
             return (i + 1, *OTHER_WORDS)[register - Register.SERIAL]
         known = {
@@ -142,10 +142,10 @@ class EmulatedMoteus(CanEmulator):
         controller, joint = self.controllers[i], self.body.joints[i]
         position, velocity, torque, kp, kd, limit_nm = (controller.command[0x20 + k] for k in range(6))
         stiffness, damping = kp * self._kp / TURN, kd * self._kd / TURN
-        if controller.mode != Mode.POSITION:
+        if controller.mode != MoteusMode.POSITION:
             mode, target = JointMode.PASSIVE, 0.0
         elif kp:
-            here = self.body.shaft(i)[0] if math.isnan(position) else position * TURN
+            here = self.body.read_shaft(i)[0] if math.isnan(position) else position * TURN
             mode, target = JointMode.POSITION, here
         elif kd:
             mode, target = JointMode.VELOCITY, velocity * TURN
@@ -153,16 +153,18 @@ class EmulatedMoteus(CanEmulator):
             mode, target = JointMode.TORQUE, torque
         own_nm = joint.limits.torque_nm / joint.drive.gear
         limit_nm = own_nm if math.isnan(limit_nm) else limit_nm
-        self.body.drive(i, mode, target, limit_nm, stiffness, damping, joint.limits.speed_rad_s * joint.drive.gear)
+        self.body.drive_motor(
+            i, mode, target, limit_nm, stiffness, damping, joint.limits.speed_rad_s * joint.drive.gear
+        )
 
-    def each_step(self, now_us: float) -> None:
+    def on_step(self, now_us: float) -> None:
         """Watchdogs and heat."""
         for i, controller in enumerate(self.controllers):
-            if controller.mode == Mode.POSITION:
+            if controller.mode == MoteusMode.POSITION:
                 limit_us = controller.command[0x27] * 1e6 or self.watchdog_us
                 if now_us - controller.fed_us > limit_us:  # never, of NaN
-                    controller.mode = Mode.TIMEOUT
+                    controller.mode = MoteusMode.TIMEOUT
                     self._drive(i)
-            if self.body.too_hot(i) and controller.mode != Mode.FAULT:
-                controller.mode, controller.fault = Mode.FAULT, OVER_TEMPERATURE
+            if self.body.is_too_hot(i) and controller.mode != MoteusMode.FAULT:
+                controller.mode, controller.fault = MoteusMode.FAULT, OVER_TEMPERATURE
                 self._drive(i)

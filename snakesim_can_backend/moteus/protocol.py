@@ -41,7 +41,7 @@ class Register(IntEnum):
     SERIAL = 0x120  # three words of 32 bits, the lowest one first
 
 
-class Mode(IntEnum):
+class MoteusMode(IntEnum):
     """What a controller does; those between FAULT and POSITION prepare it, or are of other uses."""
 
     STOPPED = 0
@@ -65,7 +65,7 @@ FAULTS = {
 }
 
 
-class Part(NamedTuple):
+class Subframe(NamedTuple):
     """Registers in a row; length: how many; values: () of a READ."""
 
     kind: int
@@ -75,14 +75,14 @@ class Part(NamedTuple):
     values: tuple[float, ...] = ()
 
 
-def part(kind: int, type_: int, register: int, *values: float, count: int = 0) -> bytes:
+def encode_subframe(kind: int, type_: int, register: int, *values: float, count: int = 0) -> bytes:
     """As bytes. count: of a READ."""
     count = count or len(values)
     head = bytes([kind | type_ << 2 | count]) if count <= 3 else bytes([kind | type_ << 2]) + _varuint(count)
     return head + _varuint(register) + b"".join(TYPES[type_].pack(value) for value in values)
 
 
-def parts(data: bytes) -> Iterator[Part]:
+def decode_subframes(data: bytes) -> Iterator[Subframe]:
     """Of a frame. ValueError, LookupError, struct.error: it is malformed, or has parts of another use."""
     at = 0
     while at < len(data):
@@ -99,17 +99,17 @@ def parts(data: bytes) -> Iterator[Part]:
         for _ in range(count if kind != READ else 0):
             values += TYPES[type_].unpack_from(data, at)
             at += TYPES[type_].size
-        yield Part(kind, type_, register, count, tuple(values))
+        yield Subframe(kind, type_, register, count, tuple(values))
 
 
-def framed(source: int, destination: int, *parts: bytes, reply: bool = False) -> Frame:
+def make_frame(source: int, destination: int, *parts: bytes, reply: bool = False) -> Frame:
     """A message, filled up to a length that CAN FD has."""
     data = b"".join(parts)
     length = next(length for length in LENGTHS if length >= len(data))
     return Frame((REPLY_WANTED if reply else 0) | source << 8 | destination, data.ljust(length, bytes([NOTHING])))
 
 
-def addresses(frame: Frame) -> tuple[int, int]:
+def split_addresses(frame: Frame) -> tuple[int, int]:
     """Source and destination."""
     return frame.id >> 8 & 0x7F, frame.id & 0x7F
 

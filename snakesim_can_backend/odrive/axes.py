@@ -11,26 +11,26 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_can_backend.can_drives.drives import HOST, CanDrives
-from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, Endpoints, Setting, read_all_endpoints
+from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, Endpoints, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
     FIRMWARE,
     FROM_HOST,
     PASSTHROUGH,
     PAYLOADS,
     WRITE_SETTING,
-    Control,
-    Error,
-    Message,
-    State,
-    ask,
-    names,
-    parted,
-    read_setting,
-    setting_of,
-    write,
+    AxisError,
+    AxisState,
+    ControlMode,
+    MessageId,
+    decode_setting_answer,
+    describe_errors,
+    encode_message,
+    encode_request,
+    encode_setting_request,
+    split_id,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.following import Word
+from snakesim_drivers.kit.following import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
@@ -40,12 +40,12 @@ TWIN_CONSTANT = 1.0  # N·m/A, of emulators whose robot file says none
 UNKNOWN_MAX_CURRENT_A = 1.0  # where it cannot be read what an axis is configured for: even a small motor stands it
 NO_LIMIT_SENT = -1.0
 READING = 1e-3  # relative: settings are single precision, and people round them
-LEFT_BEHIND = Error.WATCHDOG_TIMER_EXPIRED  # by a driver that was killed
+LEFT_BEHIND = AxisError.WATCHDOG_TIMER_EXPIRED  # by a driver that was killed
 CONTROLS = {
-    Mode.PASSIVE: Control.TORQUE,
-    Mode.TORQUE: Control.TORQUE,
-    Mode.VELOCITY: Control.VELOCITY,
-    Mode.POSITION: Control.POSITION,
+    Mode.PASSIVE: ControlMode.TORQUE,
+    Mode.TORQUE: ControlMode.TORQUE,
+    Mode.VELOCITY: ControlMode.VELOCITY,
+    Mode.POSITION: ControlMode.POSITION,
 }
 
 
@@ -60,7 +60,7 @@ class Axis:
     speed_limit: float  # turns/s
     torque_nm: float  # that the joint may ask for
     max_current_a: float  # never sends more
-    configured: dict[Setting, float] = field(default_factory=dict[Setting, float])  # as it says in the bring-up
+    configured: dict[AxisSetting, float] = field(default_factory=dict[AxisSetting, float])  # as it says in the bring-up
     errors: int = 0
     mode: Mode | None = None
     limit_nm: float = NO_LIMIT_SENT
@@ -91,52 +91,52 @@ class Axes(CanDrives):
 
     def sender(self, frame: Frame) -> int | None:
         """Questions have no data."""
-        node, message = parted(frame)
-        if not frame.data and message not in (Message.ESTOP, Message.CLEAR_ERRORS):
+        node, message = split_id(frame)
+        if not frame.data and message not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
             return None
-        if message == Message.RX_SDO:  # a question of another program disturbs nobody
+        if message == MessageId.RX_SDO:  # a question of another program disturbs nobody
             return HOST if frame.data[0] == WRITE_SETTING else None
         return HOST if message in FROM_HOST else node
 
     def hear(self, i: int, frame: Frame) -> None:
         """Answers and heartbeats."""
-        message, axis, readings = Message(parted(frame)[1]), self.axes[i], self.readings
-        if message == Message.TX_SDO:
+        message, axis, readings = MessageId(split_id(frame)[1]), self.axes[i], self.readings
+        if message == MessageId.TX_SDO:
             self._hear_setting(i, frame.data)
             return
         values = PAYLOADS[message].unpack(frame.data)
         match message:
-            case Message.MOTION:
-                readings.moved(i, values[0] * TURN, values[1] * TURN)
-            case Message.CURRENT:
-                readings.pushed(i, values[1] * axis.torque_constant)
-            case Message.SUPPLY:
-                readings.supplied(i, values[0], values[1])
-            case Message.TEMPERATURE:
-                readings.warmed(i, values[1], values[0])
-            case Message.HEARTBEAT:
-                self.following.says(i, enabled=values[1] == State.CLOSED_LOOP, state=f"in state {values[1]}")
+            case MessageId.MOTION:
+                readings.set_motion(i, values[0] * TURN, values[1] * TURN)
+            case MessageId.CURRENT:
+                readings.set_torque(i, values[1] * axis.torque_constant)
+            case MessageId.SUPPLY:
+                readings.set_supply(i, values[0], values[1])
+            case MessageId.TEMPERATURE:
+                readings.set_temperatures(i, values[1], values[0])
+            case MessageId.HEARTBEAT:
+                self.following.says(i, enabled=values[1] == AxisState.CLOSED_LOOP, state=f"in state {values[1]}")
                 self._errs(i, values[0])
-                if values[1] == State.IDLE and not self.following.drives[i].follows:
+                if values[1] == AxisState.IDLE and not self.following.drives[i].follows:
                     self.give_back(i)  # so that a driver that is killed while its motors are off leaves no lower limit
-            case Message.ERROR:
+            case MessageId.ERROR:
                 self._errs(i, values[0])
-            case Message.VERSION:
+            case MessageId.VERSION:
                 self.firmware[i] = values[4:7]
-                readings.identified(i, firmware=".".join(map(str, values[4:7])))
+                readings.set_identity(i, firmware=".".join(map(str, values[4:7])))
                 self._hardware[i] = ".".join(map(str, values[1:4]))
                 if values[4:6] == FIRMWARE:  # 0.5 would take the question for a new node id
-                    self._ask(i, Message.ADDRESS)
+                    self._ask(i, MessageId.ADDRESS)
                     self._ask_setting(i)
-            case Message.ADDRESS:
+            case MessageId.ADDRESS:
                 self.note_serial(i, f"{int.from_bytes(values[1], 'little'):012X}")
             case _:
                 pass
 
     def _errs(self, i: int, errors: int) -> None:
-        self.readings.state_was_read(i)
+        self.readings.mark_checked(i)
         drive, self.axes[i].errors = self.following.drives[i], errors
-        drive.errors = names(errors & ~Error.ESTOP_REQUESTED if drive.stopped else errors)
+        drive.errors = describe_errors(errors & ~AxisError.ESTOP_REQUESTED if drive.stopped else errors)
 
     # --- what an axis is configured for -------------------------------------------------------------------------
 
@@ -145,7 +145,7 @@ class Axes(CanDrives):
         if self.firmware[i]:
             self._ask_setting(i)
         else:
-            self._ask(i, Message.VERSION, Message.ERROR)
+            self._ask(i, MessageId.VERSION, MessageId.ERROR)
 
     def identified(self, i: int) -> bool:
         """Its firmware, and what it is configured for where that can be read."""
@@ -167,7 +167,7 @@ class Axes(CanDrives):
         if unread := self._unread(i):
             return f"does not say `{unread[0]}`: is `backends.odrive.endpoints` of its firmware?"
         axis = self.axes[i]
-        axis.max_current_a = min(axis.configured[Setting.CURRENT], self._allowed_a)
+        axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._allowed_a)
         return "; ".join(objections(axis, self._watchdog_s))
 
     def _firmware_name(self, i: int) -> str:
@@ -178,18 +178,18 @@ class Axes(CanDrives):
         version = self._firmware_name(i), self._hardware[i]
         return next((file for file in self._files if (file.firmware, file.hardware) == version), None)
 
-    def _unread(self, i: int) -> list[Setting]:
-        return [setting for setting in Setting if setting not in self.axes[i].configured]
+    def _unread(self, i: int) -> list[AxisSetting]:
+        return [setting for setting in AxisSetting if setting not in self.axes[i].configured]
 
     def _ask_setting(self, i: int) -> None:
         """Ask for the next setting that is not known yet; one at a time, so that queues do not fill."""
         endpoints, unread = self._endpoints(i), self._unread(i)
         if endpoints is not None and unread:
-            self.wire.send(read_setting(self.nodes[i], endpoints.ids[unread[0]]))
+            self.wire.send(encode_setting_request(self.nodes[i], endpoints.ids[unread[0]]))
 
     def _hear_setting(self, i: int, data: bytes) -> None:
         endpoints = self._endpoints(i)
-        endpoint, value = setting_of(data)
+        endpoint, value = decode_setting_answer(data)
         setting = None if endpoints is None else endpoints.setting_at(endpoint)
         if setting is None or setting not in self._unread(i):  # later the driver has lowered limits
             return
@@ -207,21 +207,21 @@ class Axes(CanDrives):
         axis = self.axes[i]
         if axis.limit_nm < 0 or self._unread(i):
             return
-        limits = axis.configured[Setting.SPEED], axis.configured[Setting.CURRENT]
-        if self._send(i, Message.SET_LIMITS, *limits):
+        limits = axis.configured[AxisSetting.SPEED], axis.configured[AxisSetting.CURRENT]
+        if self._send(i, MessageId.SET_LIMITS, *limits):
             axis.limit_nm = NO_LIMIT_SENT
 
     # --- a tick -------------------------------------------------------------------------------------------------
 
     def ask(self, i: int) -> bool:
         """Encoder estimates and current; before them errors, of an axis that may have stopped by itself."""
-        if i in self.readings.doubted:
-            self._ask(i, Message.ERROR)
-        return self._ask(i, Message.MOTION, Message.CURRENT)
+        if i in self.readings.drives_to_check:
+            self._ask(i, MessageId.ERROR)
+        return self._ask(i, MessageId.MOTION, MessageId.CURRENT)
 
     def ask_health(self, i: int) -> None:
         """Supply, temperatures and errors; and the serial number, to notice a second axis of its id."""
-        self._ask(i, Message.SUPPLY, Message.TEMPERATURE, Message.ERROR, Message.ADDRESS)
+        self._ask(i, MessageId.SUPPLY, MessageId.TEMPERATURE, MessageId.ERROR, MessageId.ADDRESS)
 
     def setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
         """An input; before it limits, after it gains and mode, if they change."""
@@ -229,27 +229,27 @@ class Axes(CanDrives):
         if limit_nm != axis.limit_nm:
             # This assigns `current_soft_max`, so it must never be more than the axis was configured for.
             current_a = min(limit_nm / axis.torque_constant, axis.max_current_a)
-            if self._send(i, Message.SET_LIMITS, axis.speed_limit, current_a):
+            if self._send(i, MessageId.SET_LIMITS, axis.speed_limit, current_a):
                 axis.limit_nm = limit_nm
         match mode:
             case Mode.POSITION:
-                self._send(i, Message.SET_POSITION, target / TURN, 0, 0)
+                self._send(i, MessageId.SET_POSITION, target / TURN, 0, 0)
             case Mode.VELOCITY:
-                self._send(i, Message.SET_VELOCITY, target / TURN, 0.0)
+                self._send(i, MessageId.SET_VELOCITY, target / TURN, 0.0)
             case Mode.TORQUE | Mode.PASSIVE:
-                self._send(i, Message.SET_TORQUE, target)
+                self._send(i, MessageId.SET_TORQUE, target)
         if mode != axis.mode:
             gain = axis.damping if mode == Mode.POSITION else axis.velocity_gain
-            sent = self._send(i, Message.SET_VELOCITY_GAINS, gain, 0.0)
-            if self._send(i, Message.SET_MODE, CONTROLS[mode], PASSTHROUGH) and sent:
+            sent = self._send(i, MessageId.SET_VELOCITY_GAINS, gain, 0.0)
+            if self._send(i, MessageId.SET_MODE, CONTROLS[mode], PASSTHROUGH) and sent:
                 axis.mode = mode
 
-    def tell(self, i: int, word: Word) -> None:
+    def tell(self, i: int, word: DriveCommand) -> None:
         """By its state; an emergency stop is an error that it keeps."""
         if word == "stop":
-            self._send(i, Message.ESTOP)
+            self._send(i, MessageId.ESTOP)
         else:
-            self._send(i, Message.SET_STATE, State.CLOSED_LOOP if word == "follow" else State.IDLE)
+            self._send(i, MessageId.SET_STATE, AxisState.CLOSED_LOOP if word == "follow" else AxisState.IDLE)
         if word != "follow":
             self.axes[i].mode = None
 
@@ -257,23 +257,23 @@ class Axes(CanDrives):
         """Its gain; the rest is written when it follows."""
         axis = self.axes[i]
         axis.limit_nm, axis.mode = NO_LIMIT_SENT, None
-        self._send(i, Message.SET_POSITION_GAIN, axis.position_gain)
+        self._send(i, MessageId.SET_POSITION_GAIN, axis.position_gain)
 
     def forgive(self, i: int) -> None:
         """An expired watchdog."""
         if self.axes[i].errors and not self.axes[i].errors & ~LEFT_BEHIND:
-            self._send(i, Message.CLEAR_ERRORS)
+            self._send(i, MessageId.CLEAR_ERRORS)
 
     def clear_errors(self, i: int) -> None:
         """And ask what is left."""
-        self._send(i, Message.CLEAR_ERRORS)
-        self._ask(i, Message.ERROR)
+        self._send(i, MessageId.CLEAR_ERRORS)
+        self._ask(i, MessageId.ERROR)
 
-    def _send(self, i: int, message: Message, *values: float) -> bool:
-        return self.wire.send(write(self.nodes[i], message, *values))
+    def _send(self, i: int, message: MessageId, *values: float) -> bool:
+        return self.wire.send(encode_message(self.nodes[i], message, *values))
 
-    def _ask(self, i: int, *questions: Message) -> bool:
-        taken = [self.wire.send(ask(self.nodes[i], question)) for question in questions]
+    def _ask(self, i: int, *questions: MessageId) -> bool:
+        taken = [self.wire.send(encode_request(self.nodes[i], question)) for question in questions]
         return all(taken)
 
 
@@ -300,22 +300,22 @@ def needed_current_a(joint: Joint) -> float:
 def objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
     """Yield what in the configuration of an axis does not suit its joint. NaN suits nothing."""
     configured = axis.configured
-    timeout_s = configured[Setting.WATCHDOG_TIMEOUT]
-    if not configured[Setting.WATCHDOG_ENABLED]:
+    timeout_s = configured[AxisSetting.WATCHDOG_TIMEOUT]
+    if not configured[AxisSetting.WATCHDOG_ENABLED]:
         yield f"has its watchdog off: set `enable_watchdog` = True and `watchdog_timeout` = {watchdog_s:g}, and save"
     elif not abs(timeout_s - watchdog_s) <= READING * watchdog_s:
         yield (
             f"has a watchdog of {timeout_s:g} s, and `backends.odrive.watchdog_s` says {watchdog_s:g} s: correct "
             f"`watchdog_timeout` and save, or correct the scenario"
         )
-    current_a = configured[Setting.CURRENT]
+    current_a = configured[AxisSetting.CURRENT]
     if not axis.torque_nm / axis.torque_constant <= current_a * (1 + READING):
         yield (
             f"has a current limit (`current_soft_max`) of {current_a:.4g} A, which is "
             f"{current_a * axis.torque_constant:.3g} N·m, and its joint may ask for {axis.torque_nm:.3g} N·m: raise "
             f"the one, or lower `torque_nm`. If a driver was killed, it may have left a lower limit: restart the axis"
         )
-    speed = configured[Setting.SPEED]
+    speed = configured[AxisSetting.SPEED]
     if not axis.speed_limit <= speed * (1 + READING):
         yield (
             f"has a speed limit (`vel_limit`) of {speed:.4g} turns/s, and its joint may turn at "

@@ -8,13 +8,13 @@ from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.can_drives.command import run
-from snakesim_can_backend.can_drives.traffic import Traffic
+from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.odrive.axes import READING, TWIN_CONSTANT, UNKNOWN_MAX_CURRENT_A, Axes, needed_current_a
 from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_drivers.emulation.mounted import Mounted
-from snakesim_drivers.kit.drive_settings import who
+from snakesim_drivers.kit.drive_settings import joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -50,12 +50,12 @@ class OdriveBackend(CanDriveBackend):
     name, a_drive, last_id, says_every_s = "odrive", "axes", LAST_NODE, HEARTBEAT_US * 1e-6
     reserved_ids = "63 is the broadcast address"
     # A tick is two questions, two answers and an input; of one axis four questions more. Then heartbeats.
-    traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 0, 8, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
+    traffic = CycleTraffic((0, 0, 8, 8, 8), (0, 0, 0, 0, 8, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
 
     @classmethod
     def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
         """Raise ConfigError for joints that no axis can be."""
-        where = who(config, joint)
+        where = joint_label(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
             raise ConfigError(f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it")
         if joint.motor.torque_constant_nm_per_a is None and cls.real(settings):
@@ -83,8 +83,8 @@ class OdriveBackend(CanDriveBackend):
                 "reads what each axis is configured for; or say it in `backends.odrive.max_current_a`"
             )
         raise ConfigError(
-            f"{who(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A at "
-            f"{constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`"
+            f"{joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A "
+            f"at {constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`"
         )
 
     @classmethod

@@ -11,19 +11,19 @@ from typing import Any
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator
 from snakesim_can_backend.odrive.axes import TURN, TWIN_CONSTANT, needed_current_a
-from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, Setting, read_all_endpoints
+from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
     PAYLOADS,
     READ_SETTING,
     SDO_HEAD,
-    Control,
-    Error,
-    Message,
-    State,
-    ask,
-    parted,
-    say_setting,
-    write,
+    AxisError,
+    AxisState,
+    ControlMode,
+    MessageId,
+    encode_message,
+    encode_request,
+    encode_setting_answer,
+    split_id,
 )
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
@@ -35,11 +35,11 @@ COUNTS = 16384  # of the encoder, a turn
 VERSION = (2, 4, 4, 58, 0, 6, 11, 0)
 FIRST_SERIAL = 0x3855_0000_0001
 OTHER_SERIAL = 0x0000_0100_0000  # the difference of a second axis with the same id
-MODES = {Control.TORQUE: Mode.TORQUE, Control.VELOCITY: Mode.VELOCITY, Control.POSITION: Mode.POSITION}
+MODES = {ControlMode.TORQUE: Mode.TORQUE, ControlMode.VELOCITY: Mode.VELOCITY, ControlMode.POSITION: Mode.POSITION}
 
 
 @dataclass(frozen=True)
-class Configuration:
+class AxisConfiguration:
     """What an axis has in its memory without power, and begins with."""
 
     watchdog_enabled: bool
@@ -49,16 +49,16 @@ class Configuration:
 
 
 @dataclass
-class Axis:
+class EmulatedAxis:
     """One axis: settings, inputs, state."""
 
     node: int
     torque_constant: float
-    saved: Configuration
-    state: int = State.IDLE
+    saved: AxisConfiguration
+    state: int = AxisState.IDLE
     errors: int = 0
     disarm_reason: int = 0
-    control: int = Control.POSITION
+    control: int = ControlMode.POSITION
     inputs: tuple[float, ...] = (0.0, 0.0, 0.0)  # by `Control`, from torque on: N·m, turns/s, turns
     position_gain: float = 20.0
     velocity_gain: float = 0.16
@@ -70,16 +70,16 @@ class Axis:
         self.current_soft_max_a = self.saved.current_soft_max_a
         self.vel_limit_turns_s = self.saved.vel_limit_turns_s
 
-    def setting(self, setting: Setting) -> float:
+    def setting(self, setting: AxisSetting) -> float:
         """A setting in force."""
         match setting:
-            case Setting.WATCHDOG_ENABLED:
+            case AxisSetting.WATCHDOG_ENABLED:
                 return self.saved.watchdog_enabled
-            case Setting.WATCHDOG_TIMEOUT:
+            case AxisSetting.WATCHDOG_TIMEOUT:
                 return self.saved.watchdog_timeout_s
-            case Setting.CURRENT:
+            case AxisSetting.CURRENT:
                 return self.current_soft_max_a
-            case Setting.SPEED:
+            case AxisSetting.SPEED:
                 return self.vel_limit_turns_s
 
 
@@ -92,7 +92,7 @@ class EmulatedOdrive(CanEmulator):
         version = EMULATED.firmware, EMULATED.hardware
         self._endpoints = next((file for file in files if (file.firmware, file.hardware) == version), EMULATED)
         self.axes = [
-            Axis(
+            EmulatedAxis(
                 node=built.id,
                 torque_constant=built.motor.torque_constant_nm_per_a or TWIN_CONSTANT,
                 saved=configuration_of(joint, settings),
@@ -100,59 +100,59 @@ class EmulatedOdrive(CanEmulator):
             for joint, built in zip(everybody, body.joints, strict=True)
         ]
         self._heartbeat_us = -math.inf
-        self.each_step(0.0)
+        self.on_step(0.0)
 
-    def addressee(self, frame: Frame) -> int:
+    def find_addressee(self, frame: Frame) -> int:
         """Its node."""
-        return parted(frame)[0]
+        return split_id(frame)[0]
 
-    def of_second(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: Frame) -> Frame:
         """Its own serial number in the address."""
-        if parted(frame)[1] != Message.ADDRESS or not frame.data:
+        if split_id(frame)[1] != MessageId.ADDRESS or not frame.data:
             return frame
-        node, serial, connection = PAYLOADS[Message.ADDRESS].unpack(frame.data)
+        node, serial, connection = PAYLOADS[MessageId.ADDRESS].unpack(frame.data)
         other = int.from_bytes(serial, "little") ^ OTHER_SERIAL
-        return write(node, Message.ADDRESS, node, other.to_bytes(6, "little"), connection)
+        return encode_message(node, MessageId.ADDRESS, node, other.to_bytes(6, "little"), connection)
 
     def restart(self, i: int) -> None:
         """Settings that were not saved are lost."""
-        self.axes[i] = Axis(self.axes[i].node, self.axes[i].torque_constant, self.axes[i].saved)
+        self.axes[i] = EmulatedAxis(self.axes[i].node, self.axes[i].torque_constant, self.axes[i].saved)
         self._drive(i, self.axes[i])
 
-    def take(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: Frame) -> None:
         """Questions have no data, but for those for settings."""
-        known, axis = Message(parted(frame)[1]), self.axes[i]
-        if known == Message.RX_SDO:
+        known, axis = MessageId(split_id(frame)[1]), self.axes[i]
+        if known == MessageId.RX_SDO:
             self._answer_setting(i, frame.data)
             return
         values = PAYLOADS[known].unpack(frame.data) if frame.data else ()
-        if not values and known not in (Message.ESTOP, Message.CLEAR_ERRORS):
+        if not values and known not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
             self.say(i, self._message(i, axis, known))
         else:
             self._obey(i, axis, known, values)
 
-    def _obey(self, i: int, axis: Axis, message: Message, values: tuple[float, ...]) -> None:
+    def _obey(self, i: int, axis: EmulatedAxis, message: MessageId, values: tuple[float, ...]) -> None:
         match message:
-            case Message.ESTOP:
-                self._fail(i, axis, Error.ESTOP_REQUESTED)
-            case Message.CLEAR_ERRORS:
+            case MessageId.ESTOP:
+                self._fail(i, axis, AxisError.ESTOP_REQUESTED)
+            case MessageId.CLEAR_ERRORS:
                 axis.errors = 0
-            case Message.SET_STATE if values[0] == State.CLOSED_LOOP and not axis.errors:
+            case MessageId.SET_STATE if values[0] == AxisState.CLOSED_LOOP and not axis.errors:
                 axis.fed_us = self.body.now_us
-                axis.state = State.CLOSED_LOOP
-            case Message.SET_STATE:
-                axis.state = State.IDLE
-            case Message.SET_MODE:
+                axis.state = AxisState.CLOSED_LOOP
+            case MessageId.SET_STATE:
+                axis.state = AxisState.IDLE
+            case MessageId.SET_MODE:
                 axis.control = int(values[0])
-            case Message.SET_POSITION | Message.SET_VELOCITY | Message.SET_TORQUE:
+            case MessageId.SET_POSITION | MessageId.SET_VELOCITY | MessageId.SET_TORQUE:
                 axis.fed_us = self.body.now_us
-                at = {Message.SET_TORQUE: 0, Message.SET_VELOCITY: 1, Message.SET_POSITION: 2}[message]
+                at = {MessageId.SET_TORQUE: 0, MessageId.SET_VELOCITY: 1, MessageId.SET_POSITION: 2}[message]
                 axis.inputs = (*axis.inputs[:at], values[0], *axis.inputs[at + 1 :])
-            case Message.SET_LIMITS:
+            case MessageId.SET_LIMITS:
                 axis.vel_limit_turns_s, axis.current_soft_max_a = values
-            case Message.SET_POSITION_GAIN:
+            case MessageId.SET_POSITION_GAIN:
                 axis.position_gain = values[0]
-            case Message.SET_VELOCITY_GAINS:
+            case MessageId.SET_VELOCITY_GAINS:
                 axis.velocity_gain = values[0]
             case _:
                 return
@@ -164,66 +164,68 @@ class EmulatedOdrive(CanEmulator):
         setting, axis = self._endpoints.setting_at(endpoint), self.axes[i]
         if setting is not None and opcode == READ_SETTING:
             value = FORMATS[TYPES[setting]].pack(axis.setting(setting))
-            self.say(i, say_setting(axis.node, endpoint, value))
+            self.say(i, encode_setting_answer(axis.node, endpoint, value))
 
-    def _message(self, i: int, axis: Axis, message: Message) -> Frame:
-        angle, velocity, torque = self.body.shaft(i)
+    def _message(self, i: int, axis: EmulatedAxis, message: MessageId) -> Frame:
+        angle, velocity, torque = self.body.read_shaft(i)
         values: tuple[Any, ...]
         match message:
-            case Message.VERSION:
+            case MessageId.VERSION:
                 values = VERSION
-            case Message.ADDRESS:
+            case MessageId.ADDRESS:
                 values = axis.node, (FIRST_SERIAL + i).to_bytes(6, "little"), 0
-            case Message.HEARTBEAT:
+            case MessageId.HEARTBEAT:
                 values = axis.errors, axis.state, 0, 0
-            case Message.ERROR:
+            case MessageId.ERROR:
                 values = axis.errors, axis.disarm_reason
-            case Message.MOTION:
+            case MessageId.MOTION:
                 values = round(angle / TURN * COUNTS) / COUNTS, velocity / TURN
-            case Message.CURRENT:
+            case MessageId.CURRENT:
                 values = torque / axis.torque_constant, torque / axis.torque_constant
-            case Message.TEMPERATURE:
-                motor_c, board_c = self.body.temperatures(i)
+            case MessageId.TEMPERATURE:
+                motor_c, board_c = self.body.read_temperatures(i)
                 values = board_c, motor_c
-            case Message.SUPPLY:
-                values = self.body.supply(i)
+            case MessageId.SUPPLY:
+                values = self.body.read_supply(i)
             case _:
-                return ask(axis.node, message)
-        return write(axis.node, message, *values)
+                return encode_request(axis.node, message)
+        return encode_message(axis.node, message, *values)
 
-    def _drive(self, i: int, axis: Axis) -> None:
-        control = Control(axis.control) if axis.control in list(Control) else Control.TORQUE
-        mode = MODES[control] if axis.state == State.CLOSED_LOOP else Mode.PASSIVE
-        target = axis.inputs[control - 1] * (1.0 if control == Control.TORQUE else TURN)
+    def _drive(self, i: int, axis: EmulatedAxis) -> None:
+        control = ControlMode(axis.control) if axis.control in list(ControlMode) else ControlMode.TORQUE
+        mode = MODES[control] if axis.state == AxisState.CLOSED_LOOP else Mode.PASSIVE
+        target = axis.inputs[control - 1] * (1.0 if control == ControlMode.TORQUE else TURN)
         damping = axis.velocity_gain / TURN
         limit_nm = axis.current_soft_max_a * axis.torque_constant
         speed_rad_s = axis.vel_limit_turns_s * TURN
-        self.body.drive(i, mode, target if mode else 0.0, limit_nm, axis.position_gain * damping, damping, speed_rad_s)
+        self.body.drive_motor(
+            i, mode, target if mode else 0.0, limit_nm, axis.position_gain * damping, damping, speed_rad_s
+        )
 
-    def _fail(self, i: int, axis: Axis, error: Error) -> None:
+    def _fail(self, i: int, axis: EmulatedAxis, error: AxisError) -> None:
         axis.errors |= error
-        axis.disarm_reason, axis.state = error, State.IDLE
+        axis.disarm_reason, axis.state = error, AxisState.IDLE
         self._drive(i, axis)
 
-    def each_step(self, now_us: float) -> None:
+    def on_step(self, now_us: float) -> None:
         """Watchdogs, heat, heartbeats."""
         for i, axis in enumerate(self.axes):
-            if axis.state == State.CLOSED_LOOP and now_us - axis.fed_us > axis.watchdog_us:
-                self._fail(i, axis, Error.WATCHDOG_TIMER_EXPIRED)
+            if axis.state == AxisState.CLOSED_LOOP and now_us - axis.fed_us > axis.watchdog_us:
+                self._fail(i, axis, AxisError.WATCHDOG_TIMER_EXPIRED)
         if now_us - self._heartbeat_us < HEARTBEAT_US:
             return
         self._heartbeat_us = now_us
         for i, axis in enumerate(self.axes):
-            if self.body.too_hot(i):
-                self._fail(i, axis, Error.MOTOR_OVER_TEMP)
-            self.say(i, self._message(i, axis, Message.HEARTBEAT))
+            if self.body.is_too_hot(i):
+                self._fail(i, axis, AxisError.MOTOR_OVER_TEMP)
+            self.say(i, self._message(i, axis, MessageId.HEARTBEAT))
 
 
-def configuration_of(joint: Joint, settings: Any) -> Configuration:
+def configuration_of(joint: Joint, settings: Any) -> AxisConfiguration:
     """Return what an axis is configured for: what its joint in the robot file needs, unless the scenario differs."""
     mounted = settings.mounted.get(joint.name)
     watchdog_s, current_a, speed = settings.watchdog_s, needed_current_a(joint), joint.limits.speed_rad_s
-    return Configuration(
+    return AxisConfiguration(
         watchdog_enabled=_said(mounted, "watchdog_timeout_s", watchdog_s) > 0,
         watchdog_timeout_s=_said(mounted, "watchdog_timeout_s", watchdog_s),
         current_soft_max_a=_said(mounted, "current_soft_max_a", current_a),

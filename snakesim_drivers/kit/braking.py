@@ -27,7 +27,7 @@ class Braking:
         self._began_ns = None
         self._done.clear()
 
-    def joints(
+    def select_braking_joints(
         self, following: frozenset[int], modes: Sequence[Mode], velocity_rad_s: Floats, now_ns: int
     ) -> frozenset[int]:
         """Return those of the following joints that go on in this period of a fault.

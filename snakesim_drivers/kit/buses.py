@@ -25,7 +25,7 @@ from snakesim_drivers.kit.drive_backend import CLEAR_GRACE, Drives
 from snakesim_drivers.kit.drive_guard import DriveGuard
 from snakesim_drivers.kit.drive_settings import answer_limit_s
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import Injection
@@ -48,12 +48,12 @@ class Bus:
 
     name: str  # such as can0
     joints: tuple[int, ...]  # numbers in the robot
-    open: Callable[[Readings], Drives]  # with readings of these drives alone. Raises ConfigError and BackendError
+    open: Callable[[DriveReadings], Drives]  # with readings of these drives alone. Raises ConfigError and BackendError
     decimation: int = 1
     watchdog_s: float = 0.1  # of its drives
 
 
-class Told(NamedTuple):
+class BusCommand(NamedTuple):
     """Setpoints of the drives of a bus, at their shafts."""
 
     following: frozenset[int]
@@ -64,13 +64,13 @@ class Told(NamedTuple):
     emergency: bool
 
 
-class BusInTurn:
+class InlineBus:
     """One bus. Numbers of joints are those on it."""
 
     def __init__(self, bus: Bus, joints: Sequence[Joint], clock_ns: Callable[[], int], period_ns: int) -> None:
         """joints: of the robot; period_ns: of its ticks."""
         self.bus = bus
-        self.readings = Readings([joints[j] for j in bus.joints], clock_ns)
+        self.readings = DriveReadings([joints[j] for j in bus.joints], clock_ns)
         self.drives = bus.open(self.readings)
         self.last: tuple[frozenset[int], bool, bool] | None = None  # who was told to follow, or to stop
         self.slower_s = 0.0  # an injected fault, of a bus in a thread
@@ -92,11 +92,11 @@ class BusInTurn:
         """Until it has answered; not for one that was slow. Returns how many slices of time are left."""
         return slices
 
-    def say(self, readings: Readings) -> None:
+    def say(self, readings: DriveReadings) -> None:
         """What its drives have said, into those of the robot. Raises what has gone wrong on it."""
-        readings.take(self.readings, self.bus.joints)
+        readings.copy_from(self.readings, self.bus.joints)
 
-    def tell(self, told: Told) -> None:
+    def tell(self, told: BusCommand) -> None:
         """Setpoints; any earlier ones need not be sent any more."""
         self._read_states_after_a_pause()
         self.drives.command(
@@ -108,15 +108,15 @@ class BusInTurn:
             emergency=told.emergency,
         )
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """Errors of these drives."""
         self._read_states_after_a_pause()
         self._guard.reset(joints)
-        self.drives.clear(joints)
+        self.drives.reset_faults(joints)
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """Receive."""
-        self.drives.let_run()
+        self.drives.poll()
 
     def findings(self) -> list[Finding]:
         """What is wrong."""
@@ -141,9 +141,9 @@ class BusInTurn:
         if not self._guard.was_away:
             return False
         for _ in range(MAX_READINGS_AFTER_PAUSE):
-            self._guard.states_were_read()
-            self.drives.let_run()  # receives what drives sent before the pause, which says nothing of their state now
-            self.readings.doubt(range(len(self.bus.joints)))
+            self._guard.mark_states_read()
+            self.drives.poll()  # receives what drives sent before the pause, which says nothing of their state now
+            self.readings.require_check(range(len(self.bus.joints)))
             self._read_drives()
             self._guard.mark_active()
             if not self._guard.was_away:
@@ -154,8 +154,8 @@ class BusInTurn:
     def _read_drives(self) -> None:
         """Ask all drives. Those that have been silent for long are asked for their state, too."""
         silent = [i for i in range(len(self.bus.joints)) if self.readings.age_ns(i) > self._gap_ns]
-        self.readings.doubt(silent)
-        self.readings.ask()
+        self.readings.require_check(silent)
+        self.readings.count_request()
         self.drives.read()
         self._guard.mark_active()
 
@@ -166,7 +166,7 @@ class BusInTurn:
         return found
 
 
-class BusInThread(BusInTurn):
+class ThreadedBus(InlineBus):
     """The same in a thread, which alone uses the drives from `begin` on."""
 
     def __init__(
@@ -182,13 +182,13 @@ class BusInThread(BusInTurn):
         super().__init__(bus, joints, clock_ns, period_ns)
         self._lease_s, self._slice_s = lease_ns * 1e-9, waits_s / SLICES
         self._took_s, self._slow = 0.0, False
-        self._said = Readings([joints[j] for j in bus.joints], clock_ns)
+        self._said = DriveReadings([joints[j] for j in bus.joints], clock_ns)
         self._thread: threading.Thread | None = None
         self._has = threading.Condition()  # guards all below
         self._closing = False
         self._asked_s: float | None = None  # when it was asked, until it has answered
         self._again = False  # asked since then: it reads again at once, at its own rate
-        self._told: tuple[Told, float] | None = None  # and when, until it is sent
+        self._told: tuple[BusCommand, float] | None = None  # and when, until it is sent
         self._to_clear: frozenset[int] = frozenset()
         self._fed_s: float | None = None  # when the setpoints that its drives follow were told; None: none follows
         self._found: list[Finding] = []
@@ -221,26 +221,26 @@ class BusInThread(BusInTurn):
             self._slow = self._asked_s is not None
         return slices
 
-    def say(self, readings: Readings) -> None:
+    def say(self, readings: DriveReadings) -> None:
         """As of its last answer."""
         with self._has:
             self._raise()
-            readings.take(self._said, self.bus.joints)
+            readings.copy_from(self._said, self.bus.joints)
 
-    def tell(self, told: Told) -> None:
+    def tell(self, told: BusCommand) -> None:
         """To be sent as soon as it is free."""
         with self._has:
             self._told = told, time.monotonic()
             self._has.notify_all()
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """Before the next setpoints."""
         with self._has:
             self._to_clear |= joints
             self._found = of_buses(self._found)  # of drives it is of before the clear
             self._has.notify_all()
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """It does by itself."""
 
     def findings(self) -> list[Finding]:
@@ -301,7 +301,7 @@ class BusInThread(BusInTurn):
             moves = told is not None and bool(told[0].following)
             may_move = told is not None and time.monotonic() - told[1] <= self._lease_s and self._failed is None
         if clears:
-            super().clear(clears)
+            super().reset_faults(clears)
         if told is not None and (may_move or not moves):
             self._send(*told)
         elif told is not None or self._left_s() == 0:
@@ -316,21 +316,21 @@ class BusInThread(BusInTurn):
         """Until the drives have to be let go."""
         return None if self._fed_s is None else max(self._fed_s + self._lease_s - time.monotonic(), 0.0)
 
-    def _send(self, told: Told, at_s: float) -> None:
+    def _send(self, told: BusCommand, at_s: float) -> None:
         super().tell(told)
         self._fed_s = at_s if told.following else None
-        self.drives.let_run()
+        self.drives.poll()
         self._report_findings()
 
     def _let_go(self) -> None:
         """Switch all drives off; they stay off until the operator resets the fault that this is."""
         self._fed_s, count = None, len(self.bus.joints)
         self._read_states_after_a_pause()
-        if self._guard.let_go():
+        if self._guard.release_drives():
             self._found_early.append(Finding("no_setpoints", self._starved()))
         none = np.zeros(count)
-        super().tell(Told(frozenset(), [Mode.PASSIVE] * count, none, none, may_enable=False, emergency=False))
-        self.drives.let_run()
+        super().tell(BusCommand(frozenset(), [Mode.PASSIVE] * count, none, none, may_enable=False, emergency=False))
+        self.drives.poll()
         self._report_findings()
 
     def _starved(self) -> str:
@@ -346,7 +346,7 @@ class BusInThread(BusInTurn):
         time.sleep(self.slower_s)
         super().ask()
         with self._has:
-            self._said.take(self.readings, range(len(self.bus.joints)))
+            self._said.copy_from(self.readings, range(len(self.bus.joints)))
             if self._asked_s is not None:
                 now_s = time.monotonic()
                 self._took_s, self._asked_s, self._again = now_s - self._asked_s, now_s if self._again else None, False
@@ -362,19 +362,19 @@ class Buses:
     """All buses of a robot, as one `Drives`."""
 
     def __init__(
-        self, config: RunConfig, readings: Readings, buses: Sequence[Bus], clock_ns: Callable[[], int]
+        self, config: RunConfig, readings: DriveReadings, buses: Sequence[Bus], clock_ns: Callable[[], int]
     ) -> None:
         """readings: of the robot. Raises ConfigError and BackendError."""
         self._readings, self._ticks = readings, 0
         waits_s = WAITS_FOR * answer_limit_s(config)
-        self.lines: list[BusInTurn] = []
+        self.lines: list[InlineBus] = []
         joints = config.robot.joint_table
         try:
             for bus in buses:
                 if config.clock_mode == "lockstep":
-                    self.lines.append(BusInTurn(bus, joints, clock_ns, config.period_ns))
+                    self.lines.append(InlineBus(bus, joints, clock_ns, config.period_ns))
                 else:
-                    self.lines.append(BusInThread(bus, joints, clock_ns, config.period_ns, config.lease_ns, waits_s))
+                    self.lines.append(ThreadedBus(bus, joints, clock_ns, config.period_ns, config.lease_ns, waits_s))
         except BaseException:
             self.close()
             raise
@@ -391,11 +391,11 @@ class Buses:
         if wrong:
             raise BackendError(*dict.fromkeys(text for error in wrong for text in error.lines))
         for line in self.lines:
-            self._readings.take(line.readings, line.bus.joints)
+            self._readings.copy_from(line.readings, line.bus.joints)
 
     def read(self) -> None:
         """Ask all whose turn it is, and wait for those that are quick."""
-        asked: list[BusInTurn] = []
+        asked: list[InlineBus] = []
         for line in self.lines:
             line.begin()
             if self._is_turn(line) and line.ask():
@@ -423,14 +423,14 @@ class Buses:
             now = mine, may_enable, emergency
             if self._is_turn(line) or line.last != now:
                 line.last = now
-                line.tell(Told(mine, [modes[j] for j in at], targets[at], limits_nm[at], may_enable, emergency))
+                line.tell(BusCommand(mine, [modes[j] for j in at], targets[at], limits_nm[at], may_enable, emergency))
         self._ticks += 1
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """Of each bus those on it."""
         for line in self.lines:
             if mine := frozenset(i for i, j in enumerate(line.bus.joints) if j in joints):
-                line.clear(mine)
+                line.reset_faults(mine)
 
     def findings(self) -> list[Finding]:
         """Of all."""
@@ -440,10 +440,10 @@ class Buses:
             for finding in line.findings()
         ]
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """All."""
         for line in self.lines:
-            line.let_run()
+            line.poll()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """A fault of a bus, by its number here, or of a drive on one."""
@@ -470,5 +470,5 @@ class Buses:
             for line in self.lines:
                 everyone.callback(line.close, until_s)
 
-    def _is_turn(self, line: BusInTurn) -> bool:
+    def _is_turn(self, line: InlineBus) -> bool:
         return self._ticks % line.bus.decimation == 0

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from snakesim_drivers.kit.braking import Braking
-from snakesim_drivers.kit.findings import Finding, Told
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.findings import Finding, ReportedFindings
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_hal.backend import Samples, Setpoints
 from snakesim_hal.base.arrays import Floats
@@ -60,7 +60,7 @@ class Drives(Protocol):
         """
         ...
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """The fault was cleared: clear errors of these drives, and write settings that a restart may have lost."""
         ...
 
@@ -68,7 +68,7 @@ class Drives(Protocol):
         """What is wrong now with drives and buses; a silent drive need not be among it."""
         ...
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """Receive; drives that are emulated in this process run, up to the present time."""
         ...
 
@@ -81,13 +81,13 @@ class Drives(Protocol):
         ...
 
 
-class Clock:
+class DriverClock:
     """The time of a driver: a steady clock, or in lockstep the robot's own time, which `sample` sets."""
 
     def __init__(self, config: RunConfig) -> None:
         self._lockstep, self.robot_ns = config.clock_mode == "lockstep", 0
 
-    def ns(self) -> int:
+    def now_ns(self) -> int:
         """Now."""
         return self.robot_ns if self._lockstep else time.monotonic_ns()
 
@@ -102,9 +102,9 @@ class DriveBackend:
         config: RunConfig,
         name: str,
         hardware: str,
-        clock: Clock,
+        clock: DriverClock,
         mocap: MocapReceiver | None,
-        make_drives: Callable[[Readings], Drives],
+        make_drives: Callable[[DriveReadings], Drives],
         watchdogs_s: Sequence[float],
         decimation: int = 1,
     ) -> None:
@@ -116,10 +116,10 @@ class DriveBackend:
         self._clock, self._mocap, self._open = clock, mocap, True
         self._period_ns, self._lease_ns, self._every = config.period_ns, config.lease_ns, decimation
         self._names = [joint.name for joint in joints]
-        self._readings = Readings(joints, clock.ns)
+        self._readings = DriveReadings(joints, clock.now_ns)
         self._mounting = self._readings.mounting
         self._max_isolated = config.robot.safety.max_isolated_joints
-        self._told = Told()
+        self._told = ReportedFindings()
         self._braking = Braking(
             [round(watchdog_s * 1e9) for watchdog_s in watchdogs_s], holds=config.robot.safety.action == "hold"
         )
@@ -150,21 +150,21 @@ class DriveBackend:
         """Ask all drives."""
         self._must_be_open()
         self._tick, self._clock.robot_ns, self._quiet = tick, timestamp_ns, self._quiet - 1
-        self._readings.ask()
+        self._readings.count_request()
         self._drives.read()
-        return self._samples(tick, timestamp_ns)
+        return self._make_samples(tick, timestamp_ns)
 
     def enact(self, setpoints: Setpoints, lifecycle: LifecycleState) -> None:
         """Armed: all that are not isolated follow. At fault those go on that did, while they brake."""
         if not self._open:
             return
-        self._announce(lifecycle, setpoints.isolated)
+        self._send_lifecycle(lifecycle, setpoints.isolated)
         back = (self._isolated | self._pending) - setpoints.isolated
         self._isolated, self._pending = setpoints.isolated, frozenset()
         everybody = frozenset(range(len(self._names))) - self._isolated
         if lifecycle not in LATCHED and (back or self._lifecycle in LATCHED):
-            self._told.forget()
-            self._drives.clear(everybody if self._lifecycle in LATCHED else back)
+            self._told.reset()
+            self._drives.reset_faults(everybody if self._lifecycle in LATCHED else back)
             self._quiet = self.clear_grace * self._every
         self._following = self._joints_to_drive(lifecycle, everybody, setpoints.mode)
         self._lifecycle = lifecycle
@@ -181,28 +181,28 @@ class DriveBackend:
         """Time passes by itself; in lockstep, by a period."""
         self._must_be_open()
         self._clock.robot_ns += self._period_ns
-        self._drives.let_run()
+        self._drives.poll()
 
     def faults(self) -> list[Fault]:
         """New ones since the last call."""
         if not self._open:
             return []
-        found = [*self._drives.findings(), *self._silent()]
+        found = [*self._drives.findings(), *self._find_silent_drives()]
         found = [finding for finding in found if not (finding.alone and finding.joint in self._isolated)]
         if self._quiet > 0:
             found = [finding for finding in found if finding.joint is None]
-        fresh = self._told.fresh(found)
+        fresh = self._told.filter_new(found)
         failed = frozenset(finding.joint for finding in fresh if finding.joint is not None)
         few = len(self._isolated | failed) <= self._max_isolated
         if self._lifecycle == "armed" and few and all(finding.alone for finding in fresh):
             self._pending |= failed  # the HAL isolates them
         elif fresh and self._lifecycle not in LATCHED:
             try:
-                self._announce("fault", self._isolated)
+                self._send_lifecycle("fault", self._isolated)
             except BackendError as error:  # the faults are reported all the same; the failing bus raises again
                 fresh.append(Finding("stop_not_sent", str(error)))
             self._lifecycle = "fault"  # from now on only a clear ends it, also one before the next period
-        return [finding.fault(self._tick, self._names) for finding in fresh]
+        return [finding.to_fault(self._tick, self._names) for finding in fresh]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Injects faults of buses and of drives emulated here. Raises ConfigError."""
@@ -230,7 +230,9 @@ class DriveBackend:
                 return connected
             case "fault":
                 speeds = self._mounting.joint_velocity_rad_s(self._readings.velocity_rad_s)
-                return self._braking.joints(connected & self._following, modes, speeds, self._clock.ns())
+                return self._braking.select_braking_joints(
+                    connected & self._following, modes, speeds, self._clock.now_ns()
+                )
             case _:
                 return frozenset()
 
@@ -242,34 +244,34 @@ class DriveBackend:
         plain = description_of(config, name, emulated=self._drives.emulated)
         camera = config.robot.sensors.pose
         delay_s = camera.delay_s if self._mocap is not None and camera is not None else None
-        return msgspec.structs.replace(plain, sensors=self._described(config, delay_s), hardware=hardware)
+        return msgspec.structs.replace(plain, sensors=self._describe_sensors(config, delay_s), hardware=hardware)
 
     # --- what a driver type may replace ------------------------------------------------------------------------------
 
-    def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+    def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         """Before anything else of a tick, and at once for a fault: for drives that know the robot's lifecycle."""
 
-    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
+    def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
         """Joints and other sensors, from what was read."""
         others: dict[str, Message] = {}
         if tick % len(self._names) == 0:
             lasts_ns = HEALTH_ROUNDS * len(self._names) * self._every * self._period_ns
             others[keys.POWER] = self._readings.power(tick, timestamp_ns, lasts_ns)
-        if self._mocap is not None and (pose := self._mocap.newest(tick, timestamp_ns)) is not None:
+        if self._mocap is not None and (pose := self._mocap.read_newest(tick, timestamp_ns)) is not None:
             others[keys.POSE] = pose
-        return Samples(self._readings.joints(tick, timestamp_ns, self._lease_ns), others)
+        return Samples(self._readings.joint_state(tick, timestamp_ns, self._lease_ns), others)
 
-    def _silent(self) -> list[Finding]:
+    def _find_silent_drives(self) -> list[Finding]:
         """Drives that do not answer."""
         found: list[Finding] = []
         for i, name in enumerate(self._names):
-            if self._readings.unanswered(i) >= SILENT_AFTER:
+            if self._readings.unanswered_requests(i) >= SILENT_AFTER:
                 silent_ms = self._readings.age_ns(i) * 1e-6
                 cause = f"{name}: its drive has not answered for {silent_ms:.0f} ms: power, cable, id or a restart"
                 found.append(Finding("drive_silent", cause, i, alone=True))
         return found
 
-    def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
         """The sensors; pose_delay_s: of motion capture, None without it."""
         rate_hz = config.rate_hz
         delay_s = (self._every - 1) / rate_hz

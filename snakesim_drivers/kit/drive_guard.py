@@ -48,7 +48,7 @@ class DriveGuard:
         """Whether watchdogs of drives may have expired since their states were read last."""
         return self._away
 
-    def states_were_read(self) -> None:
+    def mark_states_read(self) -> None:
         """Note that the driver has asked every drive for its state after the pause."""
         self._away = False
 
@@ -67,7 +67,7 @@ class DriveGuard:
             self._driven &= wanted - self._stopped
         return self._driven
 
-    def let_go(self) -> bool:
+    def release_drives(self) -> bool:
         """Note that the bus lets its drives go by itself; whether any was driven. None is driven before a reset."""
         had_driven = bool(self._driven)
         self._driven = NO_DRIVES

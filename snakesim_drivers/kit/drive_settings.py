@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, Motion, make_physics_model
+from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, SharedPhysics, make_physics_model
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_drivers.motion_capture.mocap import check_pose
@@ -38,10 +38,10 @@ class DriveSettings(BodySettings, frozen=True, kw_only=True):
     decimation: Annotated[int, Meta(ge=1, le=100)] = 1  # of the run: how often its buses ask and tell
 
 
-def body_of(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> EmulatedBody:
+def make_body(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> EmulatedBody:
     """What emulated drives move. pose: where its motion capture sends, HOST:PORT. Raises ConfigError."""
     physics_model = make_physics_model(config, settings, backend)
-    motion = Motion(config, physics_model, settings.mounted, PoseSender(pose) if pose else None)
+    motion = SharedPhysics(config, physics_model, settings.mounted, PoseSender(pose) if pose else None)
     return EmulatedBody(motion, range(config.robot.chain.modules))
 
 
@@ -75,7 +75,7 @@ def check_buses(
     for joint in joints:
         if joint.drive.port and joint.drive.port not in ports:
             raise ConfigError(
-                f"{who(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
+                f"{joint_label(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
                 f"`{section}`: {', '.join(ports) or 'none'}"
             )
     every, min_s = settings.decimation, MIN_PERIODS * settings.decimation / config.rate_hz
@@ -101,13 +101,13 @@ def answer_limit_s(config: RunConfig, decimation: int = 1) -> float:
     return ANSWERS_WITHIN * decimation * config.period_ns * 1e-9
 
 
-def port_of(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
+def assign_ports(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
     """Number of every joint's bus: its `port`, or an even share of these joints from the tail; 0 without ports."""
     numbers = {port: i for i, port in enumerate(ports)}
     each = -(-len(joints) // max(len(ports), 1))
     return [numbers.get(joint.drive.port, i // each) for i, joint in enumerate(joints)]
 
 
-def who(config: RunConfig, joint: Joint) -> str:
+def joint_label(config: RunConfig, joint: Joint) -> str:
     """A joint, as messages name it."""
     return f"robot {config.robot.name!r}, {joint.name}"

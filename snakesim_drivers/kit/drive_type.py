@@ -11,10 +11,17 @@ from typing import Any, ClassVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.buses import Bus, Buses
-from snakesim_drivers.kit.drive_backend import Clock, DriveBackend, Drives
-from snakesim_drivers.kit.drive_settings import DriveSettings, body_of, check_body, check_buses, port_of, who
-from snakesim_drivers.kit.readings import Readings
-from snakesim_drivers.motion_capture.mocap import receiver
+from snakesim_drivers.kit.drive_backend import DriveBackend, DriverClock, Drives
+from snakesim_drivers.kit.drive_settings import (
+    DriveSettings,
+    assign_ports,
+    check_body,
+    check_buses,
+    joint_label,
+    make_body,
+)
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_drivers.motion_capture.mocap import make_receiver
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -23,7 +30,7 @@ from snakesim_hal.wire.messages import ClockMode
 
 
 @dataclass(frozen=True)
-class Part:
+class DriverTypePart:
     """The joints of a robot that are of one driver type."""
 
     driver_type: "type[DriverTypeBackend]"
@@ -60,7 +67,12 @@ class DriverTypeBackend(DriveBackend):
 
     @classmethod
     def buses(
-        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: EmulatedBody | None
+        cls,
+        config: RunConfig,
+        settings: Any,
+        joints: Mapping[int, Joint],
+        clock: DriverClock,
+        body: EmulatedBody | None,
     ) -> list[Bus]:
         """Each bus that has some of the joints. body: of these joints, if their drives are emulated here."""
         raise NotImplementedError
@@ -68,22 +80,22 @@ class DriverTypeBackend(DriveBackend):
     # --- of all driver types ----------------------------------------------------------------------------------------
 
     @classmethod
-    def parts(cls, config: RunConfig, settings: Any) -> list[Part]:
+    def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
         """The robot, by driver types. Raises ConfigError."""
         joints = dict(enumerate(config.robot.joint_table))
         for joint in joints.values():
             if joint.drive.driver not in ("", cls.name):
                 raise ConfigError(
-                    f"{who(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
+                    f"{joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
                     f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
                 )
-        return [Part(cls, settings, config.backend_section, joints)]
+        return [DriverTypePart(cls, settings, config.backend_section, joints)]
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
         """Drives on a bus support real time only; emulated ones in this process lockstep, too. Raises ConfigError."""
         check_gains(config.robot)
-        parts = cls.parts(config, settings)
+        parts = cls.split_by_driver_type(config, settings)
         here = not any(part.ports for part in parts)
         bus_faults = set[str].intersection(*({*part.driver_type.bus_faults(part.settings)} for part in parts))
         buses = sum(max(len(part.ports), 1) for part in parts)
@@ -97,18 +109,18 @@ class DriverTypeBackend(DriveBackend):
     def __init__(self, config: RunConfig, settings: Any) -> None:
         """Open the buses and find every drive; nothing is enabled. Raises ConfigError and BackendError."""
         self.check(config, settings)
-        parts, clock = self.parts(config, settings), Clock(config)
+        parts, clock = self.split_by_driver_type(config, settings), DriverClock(config)
         here = not any(part.ports for part in parts)
-        mocap = receiver(config, settings.pose_listen, emulators=here, clock=lambda _timestamp_ns: clock.ns())
+        mocap = make_receiver(config, settings.pose_listen, emulators=here, clock=lambda _timestamp_ns: clock.now_ns())
 
-        def open_buses(readings: Readings) -> Buses:
+        def open_buses(readings: DriveReadings) -> Buses:
             pose = mocap.address if mocap is not None else None
-            whole = body_of(config, settings, self.name, pose) if here else None
+            whole = make_body(config, settings, self.name, pose) if here else None
             buses: list[Bus] = []
             for part in parts:
-                body = whole.part(list(part.joints)) if whole is not None else None
+                body = whole.select(list(part.joints)) if whole is not None else None
                 buses += part.driver_type.buses(config, part.settings, part.joints, clock, body)
-            return Buses(config, readings, buses, clock.ns)
+            return Buses(config, readings, buses, clock.now_ns)
 
         hardware = "+".join(port for part in parts for port in part.ports)
         slowest = max(self.decimation(part.settings) for part in parts)
@@ -122,14 +134,14 @@ class DriverTypeBackend(DriveBackend):
         return settings.decimation
 
 
-def buses_of(
+def group_by_port(
     joints: Mapping[int, Joint],
     settings: DriveSettings,
     ports: Sequence[str],
-    open_drives: Callable[[str, Sequence[int], Readings], Drives],
+    open_drives: Callable[[str, Sequence[int], DriveReadings], Drives],
 ) -> list[Bus]:
     """A bus for each port that has some of the joints, which a driver type opens by its name."""
-    on = port_of(list(joints.values()), ports)
+    on = assign_ports(list(joints.values()), ports)
     found: list[Bus] = []
     for number, port in enumerate(ports):
         mine = tuple(j for j, bus in zip(joints, on, strict=True) if bus == number)

@@ -20,7 +20,7 @@ class Finding:
         """Findings with the same subject are reported once."""
         return self.what, self.cause if self.joint is None else self.joint, self.alone
 
-    def fault(self, tick: int, joints: Sequence[str]) -> Fault:
+    def to_fault(self, tick: int, joints: Sequence[str]) -> Fault:
         """As the contract has it. joints: names, tail to head."""
         return Fault(
             tick=tick,
@@ -31,18 +31,18 @@ class Finding:
         )
 
 
-class Told:
+class ReportedFindings:
     """Remembers which findings have been reported."""
 
     def __init__(self) -> None:
         self._told: set[tuple[str, int | str, bool]] = set()
 
-    def fresh(self, found: Iterable[Finding]) -> list[Finding]:
+    def filter_new(self, found: Iterable[Finding]) -> list[Finding]:
         """Those that are new; from now on they are not."""
         fresh = [finding for finding in found if finding.subject not in self._told]
         self._told.update(finding.subject for finding in fresh)
         return fresh
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The fault was cleared: what persists is reported again."""
         self._told.clear()

@@ -9,14 +9,14 @@ from typing import Literal
 
 from snakesim_drivers.kit.findings import Finding
 
-Word = Literal["follow", "idle", "stop"]  # stop: the drive's own emergency stop
+DriveCommand = Literal["follow", "idle", "stop"]  # stop: the drive's own emergency stop
 
 HEARD_AGAIN = 1.5  # reports after a word, before what a drive says of itself is of after it
 FOLLOWS_WITHIN = 5  # reports
 
 
 @dataclass
-class Follower:
+class DriveState:
     """One drive: what it was told, and what it said last."""
 
     who: str  # such as "joint_2 (node 2 on can0)"
@@ -30,12 +30,12 @@ class Follower:
     errors: str = ""  # in words; empty: none
 
 
-class Following:
+class DriveStates:
     """All drives of a robot, tail to head."""
 
     def __init__(self, who: Sequence[str], says_every_ns: int, clock_ns: Callable[[], int]) -> None:
         """who: names for messages; says_every_ns: how often a drive reports its state."""
-        self.drives = [Follower(name) for name in who]
+        self.drives = [DriveState(name) for name in who]
         self._again_ns, self._within_ns = round(HEARD_AGAIN * says_every_ns), FOLLOWS_WITHIN * says_every_ns
         self._clock_ns = clock_ns
 
@@ -45,9 +45,9 @@ class Following:
         drive.enabled, drive.state, drive.said_ns = enabled, state, self._clock_ns()
         drive.followed |= drive.follows and enabled and self._heard(drive)
 
-    def words(self, following: frozenset[int], *, emergency: bool) -> list[tuple[int, Word]]:
+    def words(self, following: frozenset[int], *, emergency: bool) -> list[tuple[int, DriveCommand]]:
         """Who is to be told what now: those that change, and those that did not hear it."""
-        told: list[tuple[int, Word]] = []
+        told: list[tuple[int, DriveCommand]] = []
         for i, drive in enumerate(self.drives):
             changes = drive.follows != (i in following)
             if changes:
@@ -79,8 +79,8 @@ class Following:
                 found.append(Finding("drive_not_armed", cause, i, alone=drive.followed))
         return found
 
-    def _heard(self, drive: Follower) -> bool:
+    def _heard(self, drive: DriveState) -> bool:
         return drive.said_ns - drive.told_ns > self._again_ns
 
-    def _late(self, drive: Follower) -> bool:
+    def _late(self, drive: DriveState) -> bool:
         return drive.followed or self._clock_ns() - drive.told_ns > self._within_ns

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from snakesim_drivers.kit.drive_settings import BodySettings
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, Part
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
@@ -28,10 +28,10 @@ class MixedBackend(DriverTypeBackend):
     Settings, name = MixedSettings, "mixed"
 
     @classmethod
-    def parts(cls, config: RunConfig, settings: MixedSettings) -> list[Part]:
+    def split_by_driver_type(cls, config: RunConfig, settings: MixedSettings) -> list[DriverTypePart]:
         """The joints of each driver type, with the settings of its section."""
-        driver_types = {joint.drive.driver: driver_type_of(config.robot, joint) for joint in config.robot.joint_table}
-        parts: list[Part] = []
+        driver_types = {joint.drive.driver: find_driver_type(config.robot, joint) for joint in config.robot.joint_table}
+        parts: list[DriverTypePart] = []
         for driver_type_name, driver_type in driver_types.items():
             name = driver_type_name.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
             section, given = f"backends.{name}", config.backends.get(name, {})
@@ -42,7 +42,7 @@ class MixedBackend(DriverTypeBackend):
                     f"say `backends.mixed.{others[0]}`"
                 )
             own = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
-            parts.append(Part(driver_type, own, section, joints))
+            parts.append(DriverTypePart(driver_type, own, section, joints))
         real = [part for part in parts if part.ports]
         if real and len(real) < len(parts):
             without = next(part for part in parts if not part.ports)
@@ -57,14 +57,14 @@ class MixedBackend(DriverTypeBackend):
         """The robot with the modes that each joint has in its driver type, whatever else its file says."""
         joints = dict(robot.joints)
         for joint in robot.joint_table:
-            known: Collection[str] | None = getattr(driver_type_of(robot, joint), "MODES", None)
+            known: Collection[str] | None = getattr(find_driver_type(robot, joint), "MODES", None)
             if known is not None:
                 modes = [mode for mode in joint.drive.modes if mode in known]
                 joints[joint.name] = msgspec.structs.replace(joints.get(joint.name, JointExceptions()), modes=modes)
         return msgspec.structs.replace(robot, joints=joints)
 
 
-def driver_type_of(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
+def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     """Of a joint. Raises ConfigError."""
     name = joint.drive.driver
     where = f"robot {robot.name!r}, {joint.name}: `driver`"

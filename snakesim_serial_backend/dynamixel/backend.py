@@ -6,10 +6,10 @@ from typing import TextIO
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.buses import Bus
-from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_drivers.kit.drive_settings import answer_limit_s, body_of, port_of, who
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, buses_of
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, joint_label, make_body
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -53,14 +53,14 @@ class DynamixelBackend(DriverTypeBackend):
         config: RunConfig,
         settings: DynamixelSettings,
         joints: Mapping[int, Joint],
-        clock: Clock,
+        clock: DriverClock,
         body: EmulatedBody | None,
     ) -> list[Bus]:
         """One for each port, or one of emulated servos."""
         gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
         log = _log(settings.log)
 
-        def open_servos(port: str, mine: Sequence[int], readings: Readings) -> Servos:
+        def open_servos(port: str, mine: Sequence[int], readings: DriveReadings) -> Servos:
             emulator = None
             if body is not None:
                 pty = Pty()
@@ -71,9 +71,9 @@ class DynamixelBackend(DriverTypeBackend):
             on_it = Port(wire, gap_s)
             servos = [servo_of(joints[j], on_it) for j in mine]
             answer_s = answer_limit_s(config, settings.decimation)
-            return Servos(servos, on_it, readings, settings, clock.ns, answer_s, emulator)
+            return Servos(servos, on_it, readings, settings, clock.now_ns, answer_s, emulator)
 
-        return buses_of(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
+        return group_by_port(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
 
 
 def servo_of(joint: Joint, port: Port) -> Servo:
@@ -107,23 +107,25 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
     for joint in joints:
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
-            raise ConfigError(f"{who(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}")
+            raise ConfigError(
+                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}"
+            )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
-                f"{who(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when it is "
-                f"off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
+                f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when "
+                f"it is off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
                 f"{TURN - 2 * SLACK_RAD:.2f} rad"
             )
         if joint.motor.torque_constant_nm_per_a is None and real:
             raise ConfigError(
-                f"{who(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit amperes: "
-                f"take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
+                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
             )
 
 
 def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError when a port cannot carry its servos."""
-    on = port_of(joints, settings.ports)
+    on = assign_ports(joints, settings.ports)
     fullest = max(on.count(bus) for bus in set(on))
     busy_s = cycle_s(fullest, settings.baud)
     if busy_s * rate_hz > MAX_LOAD:
@@ -136,19 +138,19 @@ def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joi
 
 
 def emulator_on(
-    config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: Clock, pose: str | None
+    config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: DriverClock, pose: str | None
 ) -> EmulatedDynamixel:
     """Emulated servos of a whole robot."""
     joints = config.robot.joint_table
-    each = [ptys[bus] for bus in port_of(joints, settings.ports)]
-    return emulator_of(joints, settings, body_of(config, settings, NAME, pose), each, clock)
+    each = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
+    return emulator_of(joints, settings, make_body(config, settings, NAME, pose), each, clock)
 
 
 def emulator_of(
-    joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: Clock
+    joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: DriverClock
 ) -> EmulatedDynamixel:
     """Emulated servos. ptys: of every joint."""
-    return EmulatedDynamixel(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.ns)
+    return EmulatedDynamixel(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.now_ns)
 
 
 def _log(path: str) -> TextIO | None:

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from snakesim_drivers.emulation.emulated_body import EmulatedBody, EmulatedDrive
+from snakesim_drivers.emulation.emulated_body import DriveEmulator, EmulatedBody
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import (
@@ -64,7 +64,7 @@ class Servo:
         return self.table[at.TORQUE_ENABLE] == 1
 
 
-class EmulatedDynamixel(EmulatedDrive):
+class EmulatedDynamixel(DriveEmulator):
     """All servos of a robot, at the other end of their ports."""
 
     def __init__(
@@ -108,7 +108,7 @@ class EmulatedDynamixel(EmulatedDrive):
     # --- packets ----------------------------------------------------------------------------------------------
 
     def _take(self, port: Pty, packet: Packet) -> None:
-        mine = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.deaf(i)]
+        mine = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)]
         by_id = {self.servos[i].id: i for i in mine}
         for i in mine:
             self.servos[i].fed_us = self.body.now_us
@@ -141,7 +141,7 @@ class EmulatedDynamixel(EmulatedDrive):
                 self._answer(i, b"", self._write(i, struct.unpack_from("<H", given)[0], given[2:]))
             case Instruction.REBOOT:
                 self._answer(i, b"")
-                self.body.boot(i)
+                self.body.start_boot(i)
                 self.restart(i)
             case _:
                 self._answer(i, b"", Refusal.INSTRUCTION)
@@ -151,7 +151,7 @@ class EmulatedDynamixel(EmulatedDrive):
         parts: list[tuple[int, int, bytes]] = []
         seconds: list[tuple[int, int, bytes]] = []  # the same, with what a second servo of an id puts there
         for i in asked:
-            if i is None or self.body.silent(i):
+            if i is None or self.body.is_silent(i):
                 break
             data, refusal = self._read(i, what)
             second = self._read_second(i, what)
@@ -165,7 +165,7 @@ class EmulatedDynamixel(EmulatedDrive):
 
     def _answer(self, i: int, data: bytes, refusal: int = 0, second: bytes | None = None) -> None:
         """Give a servo's status. second: the data of a second servo with its id, where they differ."""
-        if self.body.silent(i):
+        if self.body.is_silent(i):
             return
         servo, error = self.servos[i], bytes([refusal | self._alert(i)])
         status = encoded(servo.id, Instruction.STATUS, error + data)
@@ -198,12 +198,12 @@ class EmulatedDynamixel(EmulatedDrive):
         return bytes(table[address : address + size])
 
     def _measure(self, i: int) -> None:
-        servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self.body.shaft(i)
+        servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self.body.read_shaft(i)
         servo.put("h", at.PRESENT, max(min(round(torque_nm / servo.unit_nm), 32767), -32768))
         servo.put("i", at.PRESENT + 2, round(velocity_rad_s / at.SPEED))
         servo.put("i", at.PRESENT + 6, round(angle_rad / at.RAD) - servo.from_counts)
-        servo.put("H", at.VOLTAGE, round(self.body.supply(i)[0] / at.VOLTS))
-        servo.table[at.TEMPERATURE] = min(max(round(self.body.temperatures(i)[0]), 0), 255)
+        servo.put("H", at.VOLTAGE, round(self.body.read_supply(i)[0] / at.VOLTS))
+        servo.table[at.TEMPERATURE] = min(max(round(self.body.read_temperatures(i)[0]), 0), 255)
 
     def _write(self, i: int, address: int, data: bytes) -> int:
         """Set registers, all of them or none; why not."""
@@ -248,7 +248,7 @@ class EmulatedDynamixel(EmulatedDrive):
         servo.table[at.STATUS_LEVEL], servo.held_counts = 2, None
         servo.put("H", at.GAINS + 4, 800)
         servo.put("h", at.GOALS, servo.get("H", at.CURRENT_LIMIT))
-        servo.from_counts = round(self.body.shaft(i)[0] / at.RAD) // at.COUNTS * at.COUNTS
+        servo.from_counts = round(self.body.read_shaft(i)[0] / at.RAD) // at.COUNTS * at.COUNTS
         self._measure(i)
         servo.put("i", at.GOAL_POSITION, servo.get("i", at.PRESENT + 6))
         self._drive(i)
@@ -263,22 +263,22 @@ class EmulatedDynamixel(EmulatedDrive):
         limit_nm, joint = abs(current) * servo.unit_nm, self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
         if servo.on and mode == at.CURRENT_BASED_POSITION:
-            self.body.drive(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
+            self.body.drive_motor(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
         elif servo.on and mode == 0:
-            self.body.drive(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
+            self.body.drive_motor(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
         else:
-            self.body.drive(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
+            self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
-    def each_step(self, now_us: float) -> None:
+    def on_step(self, now_us: float) -> None:
         """Watchdogs, heat and supply."""
         for i, servo in enumerate(self.servos):
             watchdog = servo.table[at.WATCHDOG]
             if servo.on and 0 < watchdog != at.TRIPPED and now_us - servo.fed_us > watchdog * at.WATCHDOG_S * 1e6:
                 servo.table[at.WATCHDOG] = at.TRIPPED
-                servo.held_counts = round(self.body.shaft(i)[0] / at.RAD)
+                servo.held_counts = round(self.body.read_shaft(i)[0] / at.RAD)
                 self._drive(i)
-            hot = at.HardwareError.OVERHEATING if self.body.too_hot(i) else 0
-            weak = self.body.supply(i)[0] < servo.get("H", at.LEAST_VOLTAGE) * at.VOLTS
+            hot = at.HardwareError.OVERHEATING if self.body.is_too_hot(i) else 0
+            weak = self.body.read_supply(i)[0] < servo.get("H", at.LEAST_VOLTAGE) * at.VOLTS
             found = hot | (at.HardwareError.INPUT_VOLTAGE if weak else 0)
             if found & ~servo.table[at.HARDWARE_ERROR]:
                 servo.table[at.HARDWARE_ERROR] |= found

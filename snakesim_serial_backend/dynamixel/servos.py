@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
@@ -39,7 +39,7 @@ class Servos:
         self,
         servos: Sequence[Servo],
         port: Port,
-        readings: Readings,
+        readings: DriveReadings,
         settings: DynamixelSettings,
         clock_ns: Callable[[], int],
         answer_s: float,
@@ -71,7 +71,7 @@ class Servos:
         self._turn += 1
         everybody = range(len(self.servos))
         steady, silent = [i for i in everybody if i not in self._lost], sorted(self._lost)
-        self._read_states([i for i in steady if i in self._readings.doubted])
+        self._read_states([i for i in steady if i in self._readings.drives_to_check])
         self._ask(steady)
         if silent:
             self._ask_lost(silent[self._turn % len(silent)])
@@ -80,7 +80,7 @@ class Servos:
             self._ask_health((alarmed or heard)[self._turn % len(alarmed or heard)])
         for i, servo in enumerate(self.servos):
             if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOTS_WITHIN_NS:
-                self._readings.not_asked(i)
+                self._readings.skip_request(i)
 
     def _ask(self, left: list[int]) -> None:
         """All of these; without whoever is the first that is silent, as often as time allows."""
@@ -112,8 +112,8 @@ class Servos:
         if not servo.follows:  # it may have restarted, and forgotten its turns
             turns = at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD)
             servo.turns = servo.turns if turns is None else turns
-        self._readings.moved(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
-        self._readings.pushed(i, current * servo.unit_nm)
+        self._readings.set_motion(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
+        self._readings.set_torque(i, current * servo.unit_nm)
         servo.current_a = abs(current) * servo.unit_nm / servo.constant
 
     def _read_states(self, which: Sequence[int]) -> None:
@@ -133,9 +133,9 @@ class Servos:
         servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
         self._take_state(i, said)
         volts = struct.unpack_from("<H", data, at.VOLTAGE - first)[0] * at.VOLTS
-        self._readings.supplied(i, volts, servo.current_a)
+        self._readings.set_supply(i, volts, servo.current_a)
         temperature_c = float(data[at.TEMPERATURE - first])
-        self._readings.warmed(i, temperature_c, temperature_c)
+        self._readings.set_temperatures(i, temperature_c, temperature_c)
 
     def _take_state(self, i: int, said: Packet) -> None:
         """Whether a servo's torque is on, and what has switched it off."""
@@ -144,9 +144,9 @@ class Servos:
         servo.errors = data[at.HARDWARE_ERROR - first]
         servo.watchdog = data[at.WATCHDOG - first]
         servo.health_ns = self._clock_ns()
-        self._readings.state_was_read(i)
+        self._readings.mark_checked(i)
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """Emulated servos."""
         self._port.wire.let_run()
 
@@ -193,7 +193,7 @@ class Servos:
     def _tell(self, address: int, who: Sequence[int], data: bytes) -> None:
         self._port.write_all(address, [(self.servos[i].id, data) for i in who])
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second.
 
         A watchdog that has stopped its servo is cleared by writing 0.

@@ -4,9 +4,9 @@ from contextlib import ExitStack
 from typing import Any
 
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
-from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
+from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.emulator import EmulatedOdrive
-from snakesim_can_backend.odrive.protocol import State
+from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
@@ -58,7 +58,7 @@ def enabled_drives(emulator: Any) -> list[bool]:
     """Of the emulated drives of one driver type, those that would follow a setpoint."""
     match emulator:
         case EmulatedOdrive():
-            return [axis.state == State.CLOSED_LOOP for axis in emulator.axes]
+            return [axis.state == AxisState.CLOSED_LOOP for axis in emulator.axes]
         case EmulatedMoteus():
             return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
         case EmulatedDynamixel():

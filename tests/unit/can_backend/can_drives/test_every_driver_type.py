@@ -12,9 +12,9 @@ import can
 import pytest
 
 from snakesim_can_backend.moteus.backend import MoteusBackend
-from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
+from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
-from snakesim_can_backend.odrive.protocol import State
+from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_serial_backend.dynamixel import registers as at
@@ -53,7 +53,7 @@ FAMILIES = {
     "odrive": Family(
         OdriveBackend,
         lambda emulator: emulator.axes,
-        lambda axis: axis.state == State.CLOSED_LOOP,
+        lambda axis: axis.state == AxisState.CLOSED_LOOP,
         law_of,
         "watchdog_timer_expired",
         "motor_over_temp",
