@@ -14,7 +14,7 @@ from snakesim_can_backend.can_drives.drives import CanDrives
 from snakesim_can_backend.can_drives.emulator import CanEmulator
 from snakesim_can_backend.can_drives.traffic import BusLoad, CycleTraffic, compute_load
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.kit.buses import Bus
+from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, assign_ports, joint_label, make_body
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
@@ -117,7 +117,7 @@ class CanDriveBackend(DriverTypeBackend):
         joints: Mapping[int, Joint],
         clock: DriverClock,
         body: EmulatedBody | None,
-    ) -> list[Bus]:
+    ) -> list[BusSpec]:
         """One for each channel, or one of emulated drives."""
         fd, everybody = settings.fd_rate is not None, list(joints.values())
         says_every_ns = config.period_ns * settings.decimation

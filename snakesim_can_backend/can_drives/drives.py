@@ -1,4 +1,4 @@
-"""Drives on one CAN bus: a `snakesim_drivers.kit.drive_backend.Drives` without its protocol, which a driver type adds.
+"""Drives on one CAN bus: a `snakesim_drivers.kit.drives.Drives` without its protocol, which a driver type adds.
 
 Each tick every drive is asked for motion and torque, and one of them for its health.
 """
@@ -13,8 +13,8 @@ from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_int
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import FAULTS
+from snakesim_drivers.kit.drive_states import DriveCommand, DriveStates
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.following import DriveCommand, DriveStates
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
@@ -54,7 +54,7 @@ class CanDrives(ABC):
         self.wire, self.nodes = wire, [joint.id for joint in joints]
         self.readings, self.clock_ns = readings, clock_ns
         who = [f"{j.name} (node {j.id} on {wire.channel})" for j in joints]
-        self.following = DriveStates(who, says_every_ns, clock_ns)
+        self.states = DriveStates(who, says_every_ns, clock_ns)
         self.firmware: list[tuple[int, ...]] = [()] * len(joints)  # as drives say in bring-up
         self._serials: list[list[str]] = [[] for _ in joints]  # that answer by a joint's id; the first is its own
         self._at = {node: i for i, node in enumerate(self.nodes)}
@@ -134,7 +134,7 @@ class CanDrives(ABC):
         self.begin_anew()
         self._await(self.identified, self.identify)
         self._listen_on()
-        wrong = [f"  {self.following.drives[i].who} {why}" for i in everybody for why in self._objections(i)]
+        wrong = [f"  {self.states.drives[i].label} {why}" for i in everybody for why in self._objections(i)]
         if self._others:
             raise BackendError("another program commands drives on this bus; end it first. Nothing was sent")
         if wrong:
@@ -145,7 +145,7 @@ class CanDrives(ABC):
             self.forgive(i)
             self.set_up(i)
         self._await(self.readings.is_known, self.ask)
-        silent = [self.following.drives[i].who for i in everybody if not self.readings.is_known(i)]
+        silent = [self.states.drives[i].label for i in everybody if not self.readings.is_known(i)]
         if silent:
             raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled")
         for i in everybody:
@@ -202,15 +202,15 @@ class CanDrives(ABC):
     ) -> None:
         """Setpoints; enable, let go, remind."""
         if not may_enable:
-            following &= self.following.enabled()
+            following &= self.states.following_drives()
         for i in sorted(following):
             self.setpoint(i, modes[i], float(targets[i]), float(limits_nm[i]))
-        for i, word in self.following.words(following, emergency=emergency):
+        for i, word in self.states.next_commands(following, emergency=emergency):
             self.tell(i, word)
 
     def reset_faults(self, joints: frozenset[int]) -> None:
         """Errors, and what a restart has lost; what a drive says of errors from now on is of after the clear."""
-        self.following.forgive(joints)
+        self.states.reset_errors(joints)
         self._serials = [serials[:1] for serials in self._serials]  # whether a second drive is still there
         for i in sorted(joints):
             self.clear_errors(i)
@@ -253,9 +253,9 @@ class CanDrives(ABC):
                 found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
         for i, serials in enumerate(self._serials):
             if len(serials) > 1:  # it concerns all: nothing is known of where which of the two is
-                cause = f"{self.following.drives[i].who} is duplicated: serial numbers {self._both(i)} answer; "
+                cause = f"{self.states.drives[i].label} is duplicated: serial numbers {self._both(i)} answer; "
                 found.append(Finding("duplicate_node", cause + "give each drive its own id", i))
-        return [*found, *self.following.findings()]
+        return [*found, *self.states.findings()]
 
     def take(self, frame: Frame) -> None:
         """One frame of the bus."""

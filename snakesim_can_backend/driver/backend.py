@@ -24,7 +24,7 @@ class CanBackend(DriveBackend):
     """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
 
     Settings = CanSettings
-    clear_grace = 0  # the monitor has its own, for what takes a while to be over
+    reset_grace_cycles = 0  # the monitor has its own grace for each kind of fault
     modules: Modules
     _sensors: Sensors
 

@@ -1,4 +1,4 @@
-"""Joint modules on their buses: a `snakesim_drivers.kit.drive_backend.Drives`. Thin: every task has its own file.
+"""Joint modules on their buses: a `snakesim_drivers.kit.drives.Drives`. Thin: every task has its own file.
 
 A tick: Sync is sent, every module answers with its samples of that instant, and enacts the setpoint that it received
 in the period before. So a command acts exactly one period after the state that it answers, whatever the load.

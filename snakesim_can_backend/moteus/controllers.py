@@ -29,7 +29,7 @@ from snakesim_can_backend.moteus.protocol import (
     split_addresses,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.following import DriveCommand
+from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode as JointMode
 
@@ -87,9 +87,9 @@ class Controllers(CanDrives):
             self.readings.mark_checked(i)
             self.readings.set_motion(i, said[Register.POSITION] * TURN, said[Register.VELOCITY] * TURN)
             self.readings.set_torque(i, said[Register.TORQUE])
-            self.following.says(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
+            self.states.note_report(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
             named = f"fault {fault}, {FAULTS.get(fault, 'see its manual')}" if mode == MoteusMode.FAULT else ""
-            self.following.drives[i].errors = "timeout: its watchdog expired" if mode == MoteusMode.TIMEOUT else named
+            self.states.drives[i].errors = "timeout: its watchdog expired" if mode == MoteusMode.TIMEOUT else named
         if Register.VOLTAGE in said:
             voltage_v = said[Register.VOLTAGE]
             self.readings.set_supply(i, voltage_v, said[Register.POWER] / max(voltage_v, 1.0))
@@ -125,7 +125,7 @@ class Controllers(CanDrives):
 
     def setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """A command, which would also start it: so none to one that was restarted, or may be restarting."""
-        restarted = self.following.drives[i].followed and self._mode[i] != MoteusMode.POSITION
+        restarted = self.states.drives[i].has_followed and self._mode[i] != MoteusMode.POSITION
         if restarted or self.readings.unanswered_requests(i):
             return
         stiffness, damping, velocity_gain = self._gains[i]
@@ -163,7 +163,7 @@ class Controllers(CanDrives):
     def forgive(self, i: int) -> None:
         """An expired watchdog."""
         if self._mode[i] == MoteusMode.TIMEOUT:
-            _log.warning("%s: clearing an expired watchdog of an earlier run", self.following.drives[i].who)
+            _log.warning("%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label)
             self._stop(i)
 
     def give_back(self, i: int) -> None:

@@ -30,7 +30,7 @@ from snakesim_can_backend.odrive.protocol import (
     split_id,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.following import DriveCommand
+from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
@@ -115,9 +115,9 @@ class Axes(CanDrives):
             case MessageId.TEMPERATURE:
                 readings.set_temperatures(i, values[1], values[0])
             case MessageId.HEARTBEAT:
-                self.following.says(i, enabled=values[1] == AxisState.CLOSED_LOOP, state=f"in state {values[1]}")
+                self.states.note_report(i, enabled=values[1] == AxisState.CLOSED_LOOP, state=f"in state {values[1]}")
                 self._errs(i, values[0])
-                if values[1] == AxisState.IDLE and not self.following.drives[i].follows:
+                if values[1] == AxisState.IDLE and not self.states.drives[i].should_follow:
                     self.give_back(i)  # so that a driver that is killed while its motors are off leaves no lower limit
             case MessageId.ERROR:
                 self._errs(i, values[0])
@@ -135,8 +135,8 @@ class Axes(CanDrives):
 
     def _errs(self, i: int, errors: int) -> None:
         self.readings.mark_checked(i)
-        drive, self.axes[i].errors = self.following.drives[i], errors
-        drive.errors = describe_errors(errors & ~AxisError.ESTOP_REQUESTED if drive.stopped else errors)
+        drive, self.axes[i].errors = self.states.drives[i], errors
+        drive.errors = describe_errors(errors & ~AxisError.ESTOP_REQUESTED if drive.emergency_stopped else errors)
 
     # --- what an axis is configured for -------------------------------------------------------------------------
 

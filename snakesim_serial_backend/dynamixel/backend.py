@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.kit.buses import Bus
+from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, joint_label, make_body
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
@@ -55,7 +55,7 @@ class DynamixelBackend(DriverTypeBackend):
         joints: Mapping[int, Joint],
         clock: DriverClock,
         body: EmulatedBody | None,
-    ) -> list[Bus]:
+    ) -> list[BusSpec]:
         """One for each port, or one of emulated servos."""
         gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
         log = _log(settings.log)

@@ -1,4 +1,4 @@
-"""Dynamixel X servos as a driver type of drives: a `snakesim_drivers.kit.drive_backend.Drives`.
+"""Dynamixel X servos as a driver type of drives: a `snakesim_drivers.kit.drives.Drives`.
 
 Every tick all servos say current, velocity and position in one fast sync read, one of them says its health,
 and all get goal current and goal position in one sync write. They stay in current-based position mode: a torque is that

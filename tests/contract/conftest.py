@@ -104,8 +104,8 @@ def cut_off(backend: Any, joint: int) -> None:
 
 def cut_drive_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's drive."""
-    line = next(line for line in backend._drives.lines if joint in line.bus.joints)
-    drives, silent = line.drives, line.bus.joints.index(joint)
+    bus = next(bus for bus in backend._drives.buses if joint in bus.spec.joints)
+    drives, silent = bus.drives, bus.spec.joints.index(joint)
     hear = drives.hear
 
     def heard(i: int, said: Any) -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from snakesim_can_backend.can_drives import backend as can_family
 from snakesim_can_backend.driver import modules
-from snakesim_drivers.kit.buses import Bus, Buses
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.buses import Buses
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
@@ -80,7 +81,7 @@ def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
     config = configured(backend, **sections)
     factory = find_plugin(BACKENDS, backend)
     clock = DriverClock(config)
-    opened_buses: list[Bus] = []
+    opened_buses: list[BusSpec] = []
     for part in factory.split_by_driver_type(config, backend_settings(config, factory)):
         opened_buses += part.driver_type.buses(config, part.settings, part.joints, clock, None)
     in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads

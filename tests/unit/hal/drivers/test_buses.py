@@ -65,7 +65,7 @@ class Robot(DriveRig):
                 self.run(1, "disarmed")
                 time.sleep(0.05)
                 return False
-            return all(self.enabled()) and self.backend._quiet <= 0
+            return all(self.enabled()) and self.backend._grace_cycles <= 0
 
         wait_until(is_armed, "arms", 20.0)
 
