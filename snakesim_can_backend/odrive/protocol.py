@@ -1,4 +1,6 @@
-"""CANSimple: an id is node << 5 | message, all numbers little-endian, a question is the message without data.
+"""CANSimple: messages of ODrive axes as bytes.
+
+An id is node << 5 | message. All numbers are little-endian. A request is the message without data.
 
 Written from ODrive's public documentation; tests hold it against the database that ODrive publishes.
 """
@@ -20,7 +22,7 @@ class MessageId(IntEnum):
     HEARTBEAT = 0x01
     ESTOP = 0x02
     ERROR = 0x03
-    RX_SDO = 0x04  # a question for a setting, or a new value of one
+    RX_SDO = 0x04  # request for a setting, or a new value of one
     TX_SDO = 0x05  # the answer
     ADDRESS = 0x06
     SET_STATE = 0x07
@@ -39,7 +41,7 @@ class MessageId(IntEnum):
 
 
 class AxisState(IntEnum):
-    """Of an axis; others are calibrations."""
+    """The states of an axis that are used here; others are calibrations."""
 
     IDLE = 1
     CLOSED_LOOP = 8
@@ -97,53 +99,58 @@ PAYLOADS = {
     MessageId.SET_VELOCITY: Struct("<ff"),  # turns/s, feed-forward of torque, N·m
     MessageId.SET_TORQUE: Struct("<f"),  # N·m
     MessageId.SET_LIMITS: Struct("<ff"),  # turns/s, A
-    MessageId.CURRENT: Struct("<ff"),  # Iq asked for and measured, A
+    MessageId.CURRENT: Struct("<ff"),  # Iq: setpoint and measured, A
     MessageId.TEMPERATURE: Struct("<ff"),  # of the power stage and of the motor, °C
     MessageId.SUPPLY: Struct("<ff"),  # V, A
     MessageId.CLEAR_ERRORS: Struct(""),
     MessageId.SET_POSITION_GAIN: Struct("<f"),  # (turns/s) / turn
     MessageId.SET_VELOCITY_GAINS: Struct("<ff"),  # N·m / (turn/s), and of the integral
 }
-READ_SETTING, WRITE_SETTING = 0, 1  # first byte of RxSdo
+READ_SETTING = 0  # first byte of RxSdo
+WRITE_SETTING = 1
 SDO_HEAD = Struct("<BHB")  # opcode, or reserved in an answer; endpoint id; reserved. The value follows
-FROM_HOST = frozenset(message for message in MessageId if message.name.startswith("SET_")) | {
-    MessageId.ESTOP,
-    MessageId.CLEAR_ERRORS,
-}
+SETTERS = frozenset(message for message in MessageId if message.name.startswith("SET_"))
+FROM_HOST = SETTERS | {MessageId.ESTOP, MessageId.CLEAR_ERRORS}  # messages that only a host sends
 
 
 def encode_message(node: int, message: MessageId, *values: float | bytes) -> Frame:
-    """A message of, or to, an axis."""
+    """Return a message of, or to, an axis."""
     return Frame(node << NODE_BITS | message, PAYLOADS[message].pack(*values))
 
 
 def encode_request(node: int, message: MessageId) -> Frame:
-    """The question for a message."""
+    """Return the request for a message: the message without data."""
     return Frame(node << NODE_BITS | message, b"")
 
 
 def encode_setting_request(node: int, endpoint: int) -> Frame:
-    """Return the question for the setting with an endpoint id."""
+    """Return the request for the setting with an endpoint id."""
     return Frame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEAD.pack(READ_SETTING, endpoint, 0))
 
 
 def encode_setting_answer(node: int, endpoint: int, value: bytes) -> Frame:
-    """Return an axis' answer to that question."""
+    """Return an axis' answer to the request for a setting."""
     return Frame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEAD.pack(0, endpoint, 0) + value)
 
 
 def decode_setting_answer(data: bytes) -> tuple[int, bytes]:
-    """Return endpoint id and value of the answer. Raises struct.error."""
+    """Return endpoint id and value of an answer with a setting.
+
+    Raises:
+        struct.error: the answer is too short.
+    """
     _, endpoint, _ = SDO_HEAD.unpack_from(data)
     return endpoint, data[SDO_HEAD.size :]
 
 
 def split_id(frame: Frame) -> tuple[int, int]:
-    """Node and message of a frame."""
+    """Return node and message number of a frame."""
     return frame.id >> NODE_BITS, frame.id & ((1 << NODE_BITS) - 1)
 
 
 def describe_errors(errors: int) -> str:
-    """Error bits in words; empty for none."""
-    said = [error.name.lower() for error in AxisError if errors & error and error.name]
-    return ", ".join(said) or (f"0x{errors:x}" if errors else "")
+    """Return the error bits in words; empty if there are none."""
+    known = [error.name.lower() for error in AxisError if errors & error and error.name]
+    if known:
+        return ", ".join(known)
+    return f"0x{errors:x}" if errors else ""

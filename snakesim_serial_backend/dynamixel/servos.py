@@ -60,7 +60,7 @@ class Servos:
         found = bring_up(self.servos, self._port, self._settings)
         self._ours = True
         for i, (present, health) in enumerate(found):
-            self.hear(i, present)
+            self.handle_answer(i, present)
             self._check(i, health)
 
     # --- a tick -----------------------------------------------------------------------------------------------
@@ -88,7 +88,7 @@ class Servos:
             answers = self._port.read_all([self.servos[i].id for i in left], at.PRESENT, at.present_form.size)
             for i in left:
                 if (answer := answers.get(self.servos[i].id)) is not None:
-                    self.hear(i, answer)
+                    self.handle_answer(i, answer)
             left = [i for i in left if self.servos[i].id not in answers]
             if left:
                 self._lost.add(left.pop(0))
@@ -100,9 +100,9 @@ class Servos:
         servo.garbled = servo.garbled + 1 if answers.garbled and not answers.statuses else 0
         if len(answers.statuses) == 1:
             self._lost.clear()  # perhaps others are back, too
-            self.hear(i, answers.statuses[0])
+            self.handle_answer(i, answers.statuses[0])
 
-    def hear(self, i: int, said: Packet) -> None:
+    def handle_answer(self, i: int, said: Packet) -> None:
         """What a servo measures."""
         servo = self.servos[i]
         current, velocity, position = at.present_form.unpack(said.data)

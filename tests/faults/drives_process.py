@@ -106,7 +106,7 @@ def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, open
     if issubclass(driver_type, CanDriveBackend):
         wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
         return opened.enter_context(
-            closing(driver_type.emulator(joints, part.settings, body, [wire] * len(joints), clock.now_ns))
+            closing(driver_type.emulator_class(joints, part.settings, body, [wire] * len(joints), clock.now_ns))
         )
     ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
     return emulator_of(joints, part.settings, body, ptys * len(joints), clock)

@@ -254,7 +254,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 
     def elsewhere(emulator: Any, *rest: Any) -> None:
         made(emulator, *rest)
-        emulator._at.pop((id(emulator.wires[1]), 2))
+        emulator._index_of_node.pop((id(emulator.wires[1]), 2))
 
     monkeypatch.setattr(twin_class, "__init__", elsewhere)
     with pytest.raises(BackendError, match=rf"joint_2 \(node 2 on .*\) {robot.driver_type.unheard}"):

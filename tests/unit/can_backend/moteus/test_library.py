@@ -11,7 +11,7 @@ from moteus.protocol import parse_message, parse_registers
 from snakesim_can_backend.bus.bus import VirtualWire, message_of
 from snakesim_can_backend.moteus import protocol
 from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
-from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION
+from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION, configured_gains
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import Setpoints
@@ -160,7 +160,7 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
     assert all(one.command or one.query for one in read) and not any(one.errors for one in read)
     command = next(one.command for one in read if len(one.command) > 2)
     motor = CONFIG.robot.joint_table[0].motor
-    kp = command[moteus.Register.COMMAND_KP_SCALE] * drives._kp_nm_per_turn
+    kp = command[moteus.Register.COMMAND_KP_SCALE] * configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
     assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
     assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
     assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5 and joints.valid == [True] * JOINTS

@@ -3,12 +3,13 @@
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from snakesim_can_backend.can_drives.drives import CanDrives
+from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
 from snakesim_can_backend.odrive.backend import MountedAxis, OdriveBackend, OdriveSettings
 from snakesim_can_backend.odrive.endpoints import EMULATED, AxisSetting, read_endpoints
 from snakesim_can_backend.odrive.protocol import MessageId, decode_setting_answer, encode_setting_request, split_id
@@ -137,8 +138,8 @@ def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are
 ) -> None:
     made = CanDrives.__init__
 
-    def as_if_real(drives: Any, *rest: Any, **kit: Any) -> None:
-        made(drives, *rest, **kit | {"emulated": False})
+    def as_if_real(drives: Any, context: CanDrivesContext) -> None:
+        made(drives, replace(context, emulated=False))
 
     monkeypatch.setattr(CanDrives, "__init__", as_if_real)
     monkeypatch.setattr(OdriveBackend, "check_current", lambda *_: None)
