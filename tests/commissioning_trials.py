@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from snakesim_drivers.emulation.emulated_body import EmulatedBody, Motion, make_physics_model
+from snakesim_drivers.emulation.emulated_body import EmulatedBody, SharedPhysics, make_physics_model
 from snakesim_drivers.emulation.mounted import Mounted
 from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_gnc.control.controller import View
@@ -230,7 +230,7 @@ def _shaken(
     )
     physics_model = make_physics_model(config, settings, "can")
     joints = config.robot.joint_table
-    body = EmulatedBody(Motion(config, physics_model, truth, None), range(len(joints)))
+    body = EmulatedBody(SharedPhysics(config, physics_model, truth, None), range(len(joints)))
     robot = describe(
         config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
     )
@@ -278,7 +278,7 @@ def _shaken(
             for i, target_rad in waiting.pop(step, ()):
                 motor, limits = joints[i].motor, joints[i].limits
                 gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, limits.speed_rad_s
-                body.drive(i, Mode.POSITION, target_rad, limits.torque_nm, *gains)
+                body.drive_motor(i, Mode.POSITION, target_rad, limits.torque_nm, *gains)
             body.advance_to((step + 1) * physics_model.step_s * 1e6)
     return {name: np.array(values) for name, values in rows.items()}, link_rates
 

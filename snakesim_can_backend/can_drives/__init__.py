@@ -1,6 +1,8 @@
-"""What every driver type of drives on CAN has besides its protocol. A driver type subclasses three classes.
+"""Everything that a driver type of drives on CAN needs besides its protocol. A driver type subclasses three classes.
 
-`drives`   the drives, as the kit of `snakesim_drivers.kit` has them: bring-up, questions, strangers, buses
-`backend`  settings and checks, and the buses that it opens      `traffic`  the load of a bus
-`emulator`     emulated drives at the other end                       `command`  runs them as a process
+`drives`    `CanDrives`: bring-up, requests, unknown nodes and commands on one bus
+`emulator`  `CanEmulator`: emulated drives at the other end of the bus
+`backend`   `CanDriveBackend`: settings, checks, and the buses that it opens
+
+`traffic`   the load of a bus            `command`  runs emulated drives as a process
 """

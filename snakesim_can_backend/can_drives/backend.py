@@ -10,15 +10,15 @@ from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_w
 from snakesim_can_backend.bus.bus import VirtualWire, Wire, virtual_channel
 from snakesim_can_backend.bus.load import mbit, worst_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
-from snakesim_can_backend.can_drives.drives import CanDrives
+from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
 from snakesim_can_backend.can_drives.emulator import CanEmulator
-from snakesim_can_backend.can_drives.traffic import Load, Traffic, load_of
+from snakesim_can_backend.can_drives.traffic import BusLoad, CycleTraffic, compute_load
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.kit.buses import Bus
-from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, body_of, port_of, who
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, buses_of
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, assign_ports, joint_label, make_body
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import KINDS
 from snakesim_hal.model.joints import Joint
@@ -26,7 +26,7 @@ from snakesim_hal.model.scenario import RunConfig
 
 
 class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
-    """Fields that the settings of every driver type on CAN have."""
+    """Settings that every driver type on CAN has."""
 
     # Buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: emulated drives, here.
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
@@ -40,105 +40,142 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
 
 
 class CanDriveBackend(DriverTypeBackend):
-    """A backend for drives on CAN, real or emulated. A driver type adds what is declared here."""
+    """A backend for drives on CAN, real or emulated. A driver type sets the class variables and adds `check_joint`."""
 
-    Settings: ClassVar[type[Any]]  # `CanDriveSettings`
-    a_drive: ClassVar[str]  # what the driver type calls one, in the plural
+    Settings: ClassVar[type[Any]]  # a subclass of `CanDriveSettings`
+    drives_class: ClassVar[Callable[[CanDrivesContext], CanDrives]]
+    # (joints of the driver type, settings, body, bus of every joint, clock in ns)
+    emulator_class: ClassVar[
+        Callable[[Sequence[Joint], Any, EmulatedBody, Sequence[Wire], Callable[[], int]], CanEmulator]
+    ]
+    plural_noun: ClassVar[str]  # what the driver type calls its drives in messages, such as "axes"
     first_id: ClassVar[int] = 0
     last_id: ClassVar[int]
     reserved_ids: ClassVar[str]  # what the ids beyond these are, for a message
-    traffic: ClassVar[Traffic]
-    # (joints of the driver type, settings, joints of the bus, wire, readings, and the kit's arguments by name)
-    drives: ClassVar[Callable[..., CanDrives]]
-    emulator: ClassVar[Callable[..., CanEmulator]]  # (joints of the driver type, settings, body, wires, clock)
-    says_every_s: ClassVar[float | None] = None  # how often a drive reports its state; None: when it is asked
+    traffic: ClassVar[CycleTraffic]
+    report_period_s: ClassVar[float | None] = None  # of a drive's state; None: a drive reports it when requested
 
     @classmethod
     def check_joint(cls, config: RunConfig, settings: Any, joint: Joint) -> None:
-        """Raise ConfigError for a joint that no drive of this driver type can be."""
+        """Check that a drive of this type suits a joint.
+
+        Raises:
+            ConfigError: it does not.
+        """
 
     @classmethod
     def ports(cls, settings: Any) -> Sequence[str]:
-        """Its channels."""
         return settings.channels
 
     @classmethod
     def bus_faults(cls, settings: Any) -> Collection[str]:
-        """A full queue is that of a kernel's interface."""
-        return {*KINDS["bus"]} - {"slow", "full" if settings.channels else ""}
+        """Return the kinds of faults that can be injected. A full queue is one of the kernel, which a real bus has."""
+        impossible = {"slow"}
+        if settings.channels:
+            impossible.add("full")
+        return {*KINDS["bus"]} - impossible
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
-        """Channels, ids, load, and what the driver type adds."""
+        """Check channels, ids, joints and bus load.
+
+        Raises:
+            ConfigError: one of them does not suit this driver type.
+        """
         check_channels(settings.channels, fd=settings.fd_rate is not None)
         for joint in joints:
             if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
-                    f"{who(config, joint)}: `id` = {joint.id}, and {cls.a_drive} have ids of {cls.first_id} to "
-                    f"{cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as `id` of the joint"
+                    f"{joint_label(config, joint)}: `id` = {joint.id}, and {cls.plural_noun} have ids of "
+                    f"{cls.first_id} to {cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as "
+                    f"`id` of the joint"
                 )
             cls.check_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.decimation
-        cls.load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.rates(settings))
+        cls.compute_load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.describe_rates(settings))
 
     @staticmethod
-    def real(settings: Any) -> bool:
-        """Whether something on a bus may really move."""
+    def has_real_bus(settings: Any) -> bool:
+        """Return whether real motors may be on one of the buses."""
         return not all(map(is_emulated, settings.channels))
 
     @classmethod
-    def load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> Load:
-        """Of the fullest bus."""
-        on = port_of(joints, settings.channels)
-        return load_of(cls.traffic, on, rate_hz, lambda length: worst_s(length, settings.bit_rate, settings.fd_rate))
+    def compute_load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> BusLoad:
+        """Return the load of the fullest bus."""
+
+        def frame_s(length: int) -> float:
+            return worst_s(length, settings.bit_rate, settings.fd_rate)
+
+        return compute_load(cls.traffic, assign_ports(joints, settings.channels), rate_hz, frame_s)
 
     @staticmethod
-    def rates(settings: Any) -> str:
-        """Bit rates, in words."""
-        return mbit(settings.bit_rate) + (f" with data at {mbit(settings.fd_rate)}" if settings.fd_rate else "")
+    def describe_rates(settings: Any) -> str:
+        """Return the bit rates in words."""
+        rates = mbit(settings.bit_rate)
+        if settings.fd_rate:
+            rates += f" with data at {mbit(settings.fd_rate)}"
+        return rates
 
     @classmethod
     def emulator_on(
-        cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: Clock, pose: str | None
+        cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: DriverClock, pose_address: str | None
     ) -> CanEmulator:
-        """Emulated drives of a whole robot."""
-        body, joints = body_of(config, settings, cls.name, pose), config.robot.joint_table
-        return cls.emulator(
-            joints, settings, body, [wires[bus] for bus in port_of(joints, settings.channels)], clock.ns
-        )
+        """Return the emulated drives of a whole robot.
+
+        Args:
+            config: The run.
+            settings: The settings of the driver type.
+            wires: The open buses, in the order of the channels.
+            clock: The time of the drives.
+            pose_address: HOST:PORT to which its emulated motion capture sends; None: it does not send.
+        """
+        body = make_body(config, settings, cls.name, pose_address)
+        joints = config.robot.joint_table
+        wire_of_joint = [wires[bus] for bus in assign_ports(joints, settings.channels)]
+        return cls.emulator_class(joints, settings, body, wire_of_joint, clock.now_ns)
 
     @classmethod
     def buses(
-        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: EmulatedBody | None
-    ) -> list[Bus]:
-        """One for each channel, or one of emulated drives."""
-        fd, everybody = settings.fd_rate is not None, list(joints.values())
-        says_every_ns = config.period_ns * settings.decimation
-        if cls.says_every_s is not None:
-            says_every_ns = max(round(cls.says_every_s * 1e9), says_every_ns)
+        cls,
+        config: RunConfig,
+        settings: Any,
+        joints: Mapping[int, Joint],
+        clock: DriverClock,
+        body: EmulatedBody | None,
+    ) -> list[BusSpec]:
+        """Return one bus for each channel, or a virtual one with emulated drives."""
+        all_joints = list(joints.values())
+        uses_fd = settings.fd_rate is not None
+        report_period_ns = config.period_ns * settings.decimation
+        if cls.report_period_s is not None:
+            report_period_ns = max(round(cls.report_period_s * 1e9), report_period_ns)
         log = open_log(Path(settings.log), cls.name) if settings.log else None
 
-        def open_drives(channel: str, mine: Sequence[int], readings: Readings) -> CanDrives:
+        def open_drives(channel: str, indices: Sequence[int], readings: DriveReadings) -> CanDrives:
             emulator = None
             if body is not None:
-                other_end = [VirtualWire(channel, fd=fd)] * len(everybody)
-                emulator = cls.emulator(everybody, settings, body, other_end, clock.ns)
-                wire: Wire = VirtualWire(channel, emulator, fd=fd)
+                other_end = VirtualWire(channel, fd=uses_fd)
+                wires = [other_end] * len(all_joints)
+                emulator = cls.emulator_class(all_joints, settings, body, wires, clock.now_ns)
+                wire: Wire = VirtualWire(channel, emulator, fd=uses_fd)
             else:
                 wire = open_wire(channel, None, settings.bit_rate, settings.fd_rate)
-            return cls.drives(
-                everybody,
-                settings,
-                [joints[j] for j in mine],
-                wire if log is None else LoggedWire(wire, log, fd=fd),
-                readings,
+            if log is not None:
+                wire = LoggedWire(wire, log, fd=uses_fd)
+            context = CanDrivesContext(
+                all_joints=all_joints,
+                joints=[joints[index] for index in indices],
+                settings=settings,
+                wire=wire,
+                readings=readings,
                 emulator=emulator,
                 emulated=body is not None or is_emulated(channel),
                 answer_s=answer_limit_s(config, settings.decimation),
                 bring_up_s=settings.bring_up_limit_s,
-                says_every_ns=says_every_ns,
-                clock_ns=clock.ns,
+                report_period_ns=report_period_ns,
+                clock_ns=clock.now_ns,
             )
+            return cls.drives_class(context)
 
-        channels = [virtual_channel()] if body is not None else settings.channels
-        return buses_of(joints, settings, channels, open_drives)
+        channels = settings.channels if body is None else [virtual_channel()]
+        return group_by_port(joints, settings, channels, open_drives)

@@ -1,194 +1,241 @@
-"""Drives on one CAN bus: a `snakesim_drivers.kit.drive_backend.Drives` without its protocol, which a driver type adds.
+"""Drives on one CAN bus: everything of `snakesim_drivers.kit.drives.Drives` except the protocol of a driver type.
 
-Each tick every drive is asked for motion and torque, and one of them for its health.
+A driver type subclasses `CanDrives` and implements its abstract methods. In every control cycle each drive is requested
+to send motion and torque, and one drive in turn to send its health.
 """
 
 import struct
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_into, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import FAULTS
+from snakesim_drivers.kit.drive_states import DriveCommand, DriveStates
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.following import Following, Word
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-ASK_EVERY_S = 0.1  # in bring-up
-LISTEN_ON_S = 0.06  # after the last drive has answered: a second one with its id may answer later
-STRANGER_FRAMES = 3
-HOST = -1  # sender of a frame that only a host sends
+REQUEST_PERIOD_S = 0.1  # between two requests to the same drive in bring-up
+DUPLICATE_WAIT_S = 0.06  # after the last drive has answered: a second drive with its id may answer later
+MIN_UNKNOWN_NODE_FRAMES = 3  # a single frame of an unknown node may be left in a queue from before
+HOST = -1  # the sender of a frame that only a host sends
+
+
+@dataclass(frozen=True)
+class CanDrivesContext:
+    """What a driver type gets to operate the drives of one bus."""
+
+    all_joints: Sequence[Joint]  # of the driver type, on all buses
+    joints: Sequence[Joint]  # of this bus, from tail to head
+    settings: Any  # the driver type's own `Settings`
+    wire: Wire
+    readings: DriveReadings
+    emulator: VirtualPeer | None  # the drives, if they are emulated in this process
+    emulated: bool  # True: no real motor moves
+    answer_s: float  # time that a reading waits for answers
+    bring_up_s: float  # time that drives have to answer in bring-up
+    report_period_ns: int  # from one report of a drive's state to the next
+    clock_ns: Callable[[], int]
 
 
 class CanDrives(ABC):
-    """All drives of a bus, tail to head. What a driver type adds are the abstract methods, and `unheard`."""
+    """All drives of a bus, from tail to head. In all methods `i` is the index of a drive on the bus.
 
-    unheard: str  # why a drive may not say who it is
+    The abstract methods are what a driver type implements. They are called in the thread of the bus, in this order:
 
-    def __init__(
-        self,
-        joints: Sequence[Joint],
-        wire: Wire,
-        readings: Readings,
-        *,
-        emulator: VirtualPeer | None,
-        emulated: bool,
-        answer_s: float,
-        bring_up_s: float,
-        says_every_ns: int,
-        clock_ns: Callable[[], int],
-    ) -> None:
-        """emulator: the drives, if they are emulated here.
+    * bring-up: `forget_identities`; `request_identity` until every drive `is_identified`; `find_mismatch`; for each
+      drive `send_command` with "idle", `clear_leftover_errors` and `write_settings`; then `request_motion` until motion
+      and torque of every drive are known
+    * a control cycle: `request_motion` to all, `request_health` to one; `send_setpoint` to the drives that follow, then
+      `send_command` to those that change
+    * the operator's reset of a fault: `clear_errors`, then `write_settings`
+    * the end: `send_command` with "idle", then `restore_settings`
 
-        answer_s: how long a tick waits for answers; says_every_ns: how often a drive reports its state.
+    `find_sender` and `handle_answer` are called for frames that arrive, at any time.
+    """
+
+    missing_identity_reason: str  # why a drive may not send its firmware version, for a message
+
+    def __init__(self, context: CanDrivesContext) -> None:
+        """Use an open bus; nothing is sent."""
+        self._context = context
+        self.emulated = context.emulated
+        self._emulator = context.emulator
+        # The bus and its drives.
+        self.wire = context.wire
+        self.nodes = [joint.id for joint in context.joints]
+        self._index_of_node = {node: i for i, node in enumerate(self.nodes)}
+        self._may_write = False  # True: bring-up has found every drive and no other program
+        # What drives report.
+        self.readings = context.readings
+        labels = [f"{joint.name} (node {joint.id} on {context.wire.channel})" for joint in context.joints]
+        self.states = DriveStates(labels, context.report_period_ns, context.clock_ns)
+        self.firmware: list[tuple[int, ...]] = [()] * len(self.nodes)  # (): not reported yet
+        self._serials: list[list[str]] = [[] for _ in self.nodes]  # that answer with a joint's id; the first is its own
+        self._health_turn = 0  # the drive whose health was requested last
+        # Others on the bus.
+        self._unknown_nodes: Counter[int] = Counter()  # frames, by node
+        self._second_host = False  # whether another program commands drives
+
+    # --- the protocol of a driver type: frames that arrive ----------------------------------------------------
+
+    @abstractmethod
+    def find_sender(self, frame: Frame) -> int | None:
+        """Return the node that sent a frame, `HOST` if only a host sends it, or None if the frame does not matter."""
+
+    @abstractmethod
+    def handle_answer(self, i: int, frame: Frame) -> None:
+        """Store what a drive reports in `readings`, `states` and `firmware`.
+
+        Raises:
+            ValueError, LookupError, struct.error: the frame is malformed, and is ignored.
         """
-        self.emulated, self._emulator = emulated, emulator
-        self.wire, self.nodes = wire, [joint.id for joint in joints]
-        self.readings, self.clock_ns = readings, clock_ns
-        who = [f"{j.name} (node {j.id} on {wire.channel})" for j in joints]
-        self.following = Following(who, says_every_ns, clock_ns)
-        self.firmware: list[tuple[int, ...]] = [()] * len(joints)  # as drives say in bring-up
-        self._serials: list[list[str]] = [[] for _ in joints]  # that answer by a joint's id; the first is its own
-        self._at = {node: i for i, node in enumerate(self.nodes)}
-        self._answer_s, self._bring_up_s = answer_s, bring_up_s
-        self._turn = 0  # whose health is asked for next
-        self._strangers: Counter[int] = Counter()
-        self._others = False  # whether somebody else commands drives
-        self._ours = False
 
-    # --- what a driver type adds; i: a joint, tail to head ----------------------------------------------------------
+    # --- the protocol of a driver type: bring-up, reset and end -----------------------------------------------
 
     @abstractmethod
-    def sender(self, frame: Frame) -> int | None:
-        """The node whose message it is; `HOST` if only a host sends it; None for what does not matter."""
+    def request_identity(self, i: int) -> None:
+        """Request firmware version and state, and whatever else `is_identified` needs."""
 
-    @abstractmethod
-    def hear(self, i: int, frame: Frame) -> None:
-        """A message of a drive, into `readings`, `following` and `firmware`.
-
-        ValueError, LookupError, struct.error: it is malformed.
-        """
-
-    @abstractmethod
-    def identify(self, i: int) -> None:
-        """Ask for firmware and state."""
-
-    def identified(self, i: int) -> bool:
-        """Whether a drive has said all that the bring-up asks it for."""
+    def is_identified(self, i: int) -> bool:
+        """Return whether a drive has sent everything that bring-up requests."""
         return bool(self.firmware[i])
 
-    def begin_anew(self) -> None:
-        """Forget what drives said before, as a bring-up begins."""
+    def forget_identities(self) -> None:
+        """Forget what drives have reported, as a bring-up begins."""
         self.firmware = [()] * len(self.nodes)
         self._serials = [[] for _ in self.nodes]
 
     @abstractmethod
-    def give_back(self, i: int) -> None:
-        """At the end: write back settings of a drive that this driver has changed, and that the next one reads."""
+    def find_mismatch(self, i: int) -> str:
+        """Return why an identified drive cannot be used; empty if it can."""
 
     @abstractmethod
-    def unfit(self, i: int) -> str:
-        """Why a drive that said its firmware cannot be used; empty if it can."""
+    def clear_leftover_errors(self, i: int) -> None:
+        """Clear the errors that a driver that was killed leaves behind, and no others."""
 
     @abstractmethod
-    def ask(self, i: int) -> bool:
-        """Ask for motion and torque; whether the bus took the question."""
-
-    @abstractmethod
-    def ask_health(self, i: int) -> None:
-        """Ask for supply, heat and errors."""
-
-    @abstractmethod
-    def setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
-        """A setpoint, at the shaft."""
-
-    @abstractmethod
-    def tell(self, i: int, word: Word) -> None:
-        """Follow, be idle, or stop."""
-
-    @abstractmethod
-    def set_up(self, i: int) -> None:
-        """Write what is not in a drive's memory after a restart."""
-
-    @abstractmethod
-    def forgive(self, i: int) -> None:
-        """At the start: clear what a driver that was killed has left, and nothing else."""
+    def write_settings(self, i: int) -> None:
+        """Write the settings that a drive loses when it restarts."""
 
     @abstractmethod
     def clear_errors(self, i: int) -> None:
-        """Clear all errors, for the operator."""
+        """Clear all errors of a drive, for the operator."""
 
-    # --- Drives ------------------------------------------------------------------------------------------------
+    @abstractmethod
+    def restore_settings(self, i: int) -> None:
+        """Write back the settings that this driver has changed and the next one reads."""
+
+    # --- the protocol of a driver type: a control cycle -------------------------------------------------------
+
+    @abstractmethod
+    def request_motion(self, i: int) -> bool:
+        """Request motion and torque. Returns whether the bus accepted the request."""
+
+    @abstractmethod
+    def request_health(self, i: int) -> None:
+        """Request supply, temperatures and errors."""
+
+    @abstractmethod
+    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+        """Send a setpoint.
+
+        Args:
+            i: The drive.
+            mode: Its mode.
+            target: At the shaft, in rad, rad/s or N·m by the mode; 0 if passive.
+            limit_nm: Torque limit at the shaft.
+        """
+
+    @abstractmethod
+    def send_command(self, i: int, command: DriveCommand) -> None:
+        """Enable a drive ("follow"), switch it off ("idle"), or stop it by its own emergency stop ("stop")."""
+
+    # --- `Drives`: bring-up, reset and end --------------------------------------------------------------------
 
     def bring_up(self) -> None:
-        """Firmware, then settings; every drive is idle, and stays so."""
-        everybody = range(len(self.nodes))
-        self.begin_anew()
-        self._await(self.identified, self.identify)
-        self._listen_on()
-        wrong = [f"  {self.following.drives[i].who} {why}" for i in everybody for why in self._objections(i)]
-        if self._others:
+        """Find and check every drive, and write its settings. Every drive is idle afterwards.
+
+        Raises:
+            BackendError: a drive is missing or unsuitable, or another program uses the bus.
+        """
+        drives = range(len(self.nodes))
+        self.forget_identities()
+        self._request_until(self.is_identified, self.request_identity)
+        self._wait_for_duplicates()
+        problems = [f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_problems(i)]
+        if self._second_host:
             raise BackendError("another program commands drives on this bus; end it first. Nothing was sent")
-        if wrong:
-            raise BackendError("the robot is not complete; nothing was enabled:", *wrong)
-        self._ours = True
-        for i in everybody:
-            self.tell(i, "idle")
-            self.forgive(i)
-            self.set_up(i)
-        self._await(self.readings.known, self.ask)
-        silent = [self.following.drives[i].who for i in everybody if not self.readings.known(i)]
+        if problems:
+            raise BackendError("the robot is not complete; nothing was enabled:", *problems)
+        self._may_write = True
+        for i in drives:
+            self.send_command(i, "idle")
+            self.clear_leftover_errors(i)
+            self.write_settings(i)
+        self._request_until(self.readings.is_known, self.request_motion)
+        silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
         if silent:
             raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled")
-        for i in everybody:
-            self.ask_health(i)
+        for i in drives:
+            self.request_health(i)
         self._receive()
-        self._strangers.clear()
-
-    def _objections(self, i: int) -> Iterator[str]:
-        """Why the robot cannot be used with what answers by the id of a joint."""
-        if not self.firmware[i]:
-            yield self.unheard
-        elif why := self.unfit(i):
-            yield why
-        if len(self._serials[i]) > 1:
-            yield f"answers with {len(self._serials[i])} serial numbers, {self._both(i)}: give each drive its own id"
-
-    def _both(self, i: int) -> str:
-        return " and ".join(self._serials[i])
+        self._unknown_nodes.clear()
 
     def note_serial(self, i: int, serial: str) -> None:
-        """Remember a serial number that answers by the id of a joint: two are two drives with one id."""
+        """Remember a serial number that answers with a joint's id: two of them are two drives with one id."""
         if serial not in self._serials[i]:
             self._serials[i].append(serial)
-        self.readings.identified(i, serial=self._serials[i][0])
+        self.readings.set_identity(i, serial=self._serials[i][0])
+
+    def reset_faults(self, joints: frozenset[int]) -> None:
+        """Clear errors of these drives, and write the settings that a restart may have lost."""
+        self.states.reset_errors(joints)
+        self._serials = [serials[:1] for serials in self._serials]  # a second drive that is still there answers again
+        for i in sorted(joints):
+            self.clear_errors(i)
+            self.write_settings(i)
+
+    def close(self) -> None:
+        """Switch all drives off, as far as the bus still works, and close the bus."""
+        if self._may_write:
+            for i in range(len(self.nodes)):
+                try:
+                    self.send_command(i, "idle")
+                    self.restore_settings(i)
+                except BackendError:
+                    continue
+        try:
+            self.wire.idle()
+        finally:
+            self.wire.close()
+
+    # --- `Drives`: a control cycle ----------------------------------------------------------------------------
 
     def read(self) -> None:
-        """Ask, and wait for those who answered lately."""
+        """Request motion and torque of all drives and the health of one, and wait for drives that answered lately."""
         self._receive()
         for i in range(len(self.nodes)):
-            if not self.ask(i):
-                self.readings.not_asked(i)
-        self._turn = (self._turn + 1) % len(self.nodes)
-        self.ask_health(self._turn)
-        end = time.monotonic() + self._answer_s
-        while self.readings.incomplete() and (left_s := end - time.monotonic()) > 0:
-            if not wait([self.wire], left_s):
+            if not self.request_motion(i):
+                self.readings.skip_request(i)
+        self._health_turn = (self._health_turn + 1) % len(self.nodes)
+        self.request_health(self._health_turn)
+        end_s = time.monotonic() + self._context.answer_s
+        while self.readings.is_incomplete():
+            left_s = end_s - time.monotonic()
+            if left_s <= 0 or not wait([self.wire], left_s):
                 break
             self._receive()
-
-    def let_run(self) -> None:
-        """Receive."""
-        wait([self.wire], 0.0)
-        self._receive()
 
     def command(
         self,
@@ -200,24 +247,21 @@ class CanDrives(ABC):
         may_enable: bool,
         emergency: bool,
     ) -> None:
-        """SafeSetpoints; enable, let go, remind."""
+        """Send setpoints to the drives that follow, then commands to those that change or did not obey."""
         if not may_enable:
-            following &= self.following.enabled()
+            following &= self.states.following_drives()
         for i in sorted(following):
-            self.setpoint(i, modes[i], float(targets[i]), float(limits_nm[i]))
-        for i, word in self.following.words(following, emergency=emergency):
-            self.tell(i, word)
+            self.send_setpoint(i, modes[i], float(targets[i]), float(limits_nm[i]))
+        for i, command in self.states.next_commands(following, emergency=emergency):
+            self.send_command(i, command)
 
-    def clear(self, joints: frozenset[int]) -> None:
-        """Errors, and what a restart has lost; what a drive says of errors from now on is of after the clear."""
-        self.following.forgive(joints)
-        self._serials = [serials[:1] for serials in self._serials]  # whether a second drive is still there
-        for i in sorted(joints):
-            self.clear_errors(i)
-            self.set_up(i)
+    def poll(self) -> None:
+        """Receive what has arrived; drives that are emulated here simulate up to the present time."""
+        wait([self.wire], 0.0)
+        self._receive()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Faults of the bus, and of drives that are emulated here."""
+        """Begin or end a fault of the bus or of a drive that is emulated here; return False for any other fault."""
         if inject_into([self.wire], injection, begins=begins):
             return True
         if self._emulator is None or injection.kind not in FAULTS:
@@ -225,69 +269,108 @@ class CanDrives(ABC):
         self._emulator.inject(injection, begins=begins)
         return True
 
-    def close(self) -> None:
-        """Idle, as far as the bus still works."""
-        for i in range(len(self.nodes)) if self._ours else ():
-            try:
-                self.tell(i, "idle")
-                self.give_back(i)
-            except BackendError:
-                continue
-        try:
-            self.wire.idle()
-        finally:
-            self.wire.close()
-
     def findings(self) -> list[Finding]:
-        """Of bus, strangers and drives."""
-        found = [
-            Finding(error.kind, f"{error.channel}: {error.detail}; {BUS_FAULTS[error.kind]}")
-            for error in self.wire.errors()
-            if error.kind in BUS_FAULTS
+        """Return what is wrong with the bus, with other nodes on it, and with its drives."""
+        return [
+            *self._find_bus_errors(),
+            *self._find_others(),
+            *self._find_duplicates(),
+            *self.states.findings(),
         ]
-        if self._others:
-            found.append(Finding("second_host", "another program commands drives on this bus; end one of the two"))
-            self._others = False
-        for node, frames in self._strangers.items():
-            if frames >= STRANGER_FRAMES:
-                found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
-        for i, serials in enumerate(self._serials):
-            if len(serials) > 1:  # it concerns all: nothing is known of where which of the two is
-                cause = f"{self.following.drives[i].who} is duplicated: serial numbers {self._both(i)} answer; "
-                found.append(Finding("duplicate_node", cause + "give each drive its own id", i))
-        return [*found, *self.following.findings()]
 
-    def take(self, frame: Frame) -> None:
-        """One frame of the bus."""
-        node = self.sender(frame)
-        i = self._at.get(-1 if node is None else node)
+    def handle_frame(self, frame: Frame) -> None:
+        """Handle a frame of the bus by its sender: a drive, another host or an unknown node."""
+        sender = self.find_sender(frame)
+        if sender is None:
+            return
+        i = self._index_of_node.get(sender)
         if i is not None:
             try:
-                self.hear(i, frame)
+                self.handle_answer(i, frame)
             except (ValueError, LookupError, struct.error):
                 return
-        elif node == HOST:
-            self._others = True
-        elif node is not None:
-            self._strangers[node] += 1
+        elif sender == HOST:
+            self._second_host = True
+        else:
+            self._unknown_nodes[sender] += 1
+
+    # --- inside: findings -------------------------------------------------------------------------------------
+
+    def _find_bus_errors(self) -> list[Finding]:
+        findings: list[Finding] = []
+        for error in self.wire.errors():
+            if error.kind in BUS_FAULTS:
+                cause = f"{error.channel}: {error.detail}; {BUS_FAULTS[error.kind]}"
+                findings.append(Finding(error.kind, cause))
+        return findings
+
+    def _find_others(self) -> list[Finding]:
+        """Return findings for another host and for unknown nodes."""
+        findings: list[Finding] = []
+        if self._second_host:
+            findings.append(Finding("second_host", "another program commands drives on this bus; end one of the two"))
+            self._second_host = False
+        for node, frame_count in self._unknown_nodes.items():
+            if frame_count >= MIN_UNKNOWN_NODE_FRAMES:
+                findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
+        return findings
+
+    def _find_duplicates(self) -> list[Finding]:
+        """Return a finding for each id that two drives have. It affects all joints: their readings may be mixed up."""
+        findings: list[Finding] = []
+        for i, serials in enumerate(self._serials):
+            if len(serials) > 1:
+                cause = (
+                    f"{self.states.drives[i].label} is duplicated: serial numbers {' and '.join(serials)} answer; "
+                    "give each drive its own id"
+                )
+                findings.append(Finding("duplicate_node", cause, i))
+        return findings
+
+    def _find_problems(self, i: int) -> list[str]:
+        """Return why the robot cannot be used with what answered in bring-up with the id of a joint."""
+        problems: list[str] = []
+        if not self.firmware[i]:
+            problems.append(self.missing_identity_reason)
+        else:
+            mismatch = self.find_mismatch(i)
+            if mismatch:
+                problems.append(mismatch)
+        serials = self._serials[i]
+        if len(serials) > 1:
+            problems.append(
+                f"answers with {len(serials)} serial numbers, {' and '.join(serials)}: give each drive its own id"
+            )
+        return problems
+
+    # --- inside: the bus --------------------------------------------------------------------------------------
 
     def _receive(self) -> None:
         for frame in self.wire.receive():
-            self.take(frame)
+            self.handle_frame(frame)
 
-    def _listen_on(self) -> None:
-        """Receive for a while; not from emulated drives in this process once they have nothing more to say."""
-        end = time.monotonic() + LISTEN_ON_S
-        while (left_s := end - time.monotonic()) > 0 and wait([self.wire], left_s):
+    def _wait_for_duplicates(self) -> None:
+        """Receive for a while. Emulated drives in this process end the wait when they have nothing more to send."""
+        end_s = time.monotonic() + DUPLICATE_WAIT_S
+        while True:
+            left_s = end_s - time.monotonic()
+            if left_s <= 0 or not wait([self.wire], left_s):
+                break
             self._receive()
         self._receive()
 
-    def _await(self, done: Callable[[int], bool], ask: Callable[[int], object]) -> None:
-        end, ask_at = time.monotonic() + self._bring_up_s, 0.0
-        while (now := time.monotonic()) < end and not all(map(done, range(len(self.nodes)))):
-            if now >= ask_at:
-                for i in range(len(self.nodes)):
-                    ask(i)
-                ask_at = now + ASK_EVERY_S
+    def _request_until(self, is_done: Callable[[int], bool], request: Callable[[int], object]) -> None:
+        """Send requests to all drives, again and again, until all are done or the time for bring-up is over."""
+        drives = range(len(self.nodes))
+        end_s = time.monotonic() + self._context.bring_up_s
+        next_request_s = 0.0
+        while True:
+            now_s = time.monotonic()
+            if now_s >= end_s or all(is_done(i) for i in drives):
+                return
+            if now_s >= next_request_s:
+                for i in drives:
+                    request(i)
+                next_request_s = now_s + REQUEST_PERIOD_S
             for _, frame in arrivals([self.wire]):
-                self.take(frame)
+                self.handle_frame(frame)

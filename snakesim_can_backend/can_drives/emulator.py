@@ -8,67 +8,86 @@ from typing import ClassVar
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.emulation.emulated_body import EmulatedBody, EmulatedDrive
+from snakesim_drivers.emulation.emulated_body import DriveEmulator, EmulatedBody
 from snakesim_drivers.kit.drive_settings import DriveSettings
 
+NO_BROADCAST = -1  # no frame has this address
 
-class CanEmulator(EmulatedDrive):
-    """All drives of a driver type on CAN."""
 
-    everybody: ClassVar[int] = -1  # the address of frames that every drive takes; -1: there is none
+class CanEmulator(DriveEmulator):
+    """All drives of a driver type on CAN. In all methods `i` is the index of a drive, from tail to head.
+
+    A driver type implements the abstract methods, and `restart` and `on_step` of `DriveEmulator`. The thread that
+    calls the emulator calls them while it holds the lock of the body.
+    """
+
+    broadcast_id: ClassVar[int] = NO_BROADCAST  # the address of frames that every drive receives
 
     def __init__(
         self, settings: DriveSettings, body: EmulatedBody, wires: Sequence[Wire], clock_ns: Callable[[], int]
     ) -> None:
-        """wires: of every joint; clock_ns: the time, since anything."""
-        self.wires, self.watchdog_us = list(wires), settings.watchdog_s * 1e6
-        nodes = (joint.id for joint in body.joints)
-        self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, nodes, strict=True))}
+        """Begin to receive.
+
+        Args:
+            settings: The settings of the driver type.
+            body: The body that these drives move.
+            wires: The bus of every drive; drives of one bus have the same object.
+            clock_ns: A steady time, with any origin.
+        """
+        self.wires = list(wires)
+        self.watchdog_us = settings.watchdog_s * 1e6
+        self._index_of_node: dict[tuple[int, int], int] = {}  # by id() of the wire, and node
+        for i, (wire, joint) in enumerate(zip(wires, body.joints, strict=True)):
+            self._index_of_node[id(wire), joint.id] = i
         super().__init__(body, wires, clock_ns)
 
     @abstractmethod
-    def addressee(self, frame: Frame) -> int:
-        """The node that a frame is for."""
+    def find_addressee(self, frame: Frame) -> int:
+        """Return the node that a frame is for."""
 
     @abstractmethod
-    def take(self, i: int, frame: Frame) -> None:
-        """A frame to a drive. ValueError, LookupError, struct.error: malformed."""
+    def handle_frame(self, i: int, frame: Frame) -> None:
+        """Handle a frame that a drive receives.
 
-    def __call__(self) -> float | None:
-        """Handle what has arrived, and let time pass up to now."""
-        with self.body.lock:
-            self._act()
-        return None
-
-    def _act(self) -> None:
-        self.catch_up()
-        for wire in self._ends:
-            for frame in wire.receive():
-                for i in self._addressees(wire, frame):
-                    if self.body.deaf(i):
-                        continue
-                    with contextlib.suppress(ValueError, LookupError, struct.error):
-                        self.take(i, frame)
-        self.pass_time()
-
-    @abstractmethod
-    def of_second(self, frame: Frame) -> Frame:
-        """What a second drive with the same id sends beside a frame of the first one.
-
-        It gets the same commands, so only its serial number is its own.
+        Raises:
+            ValueError, LookupError, struct.error: the frame is malformed, and is ignored.
         """
 
-    def _addressees(self, wire: Wire, frame: Frame) -> list[int]:
-        node = self.addressee(frame)
-        if node == self.everybody:
-            return [i for i, one in enumerate(self.wires) if one is wire]
-        i = self._at.get((id(wire), node))
-        return [] if i is None else [i]
+    @abstractmethod
+    def duplicate_frame(self, frame: Frame) -> Frame:
+        """Return the frame that a second drive with the same id sends together with a frame of the first one.
 
-    def say(self, i: int, frame: Frame) -> None:
-        """A frame of a drive, unless it is silent."""
-        if self.body.silent(i):
+        It gets the same commands, so that only its serial number differs.
+        """
+
+    def __call__(self) -> float | None:
+        """Handle the frames that have arrived, and simulate up to the present time."""
+        with self.body.lock:
+            self._handle_arrivals()
+        return None
+
+    def send_frame(self, i: int, frame: Frame) -> None:
+        """Send a frame of a drive, unless the drive is silent."""
+        if self.body.is_silent(i):
             return
         self.wires[i].send(frame)
         if self.body.is_doubled(i):
-            self.wires[i].send(self.of_second(frame))
+            self.wires[i].send(self.duplicate_frame(frame))
+
+    def _handle_arrivals(self) -> None:
+        self.catch_up()
+        for wire in self._ends:
+            for frame in wire.receive():
+                for i in self._find_receivers(wire, frame):
+                    if self.body.is_booting(i):
+                        continue
+                    with contextlib.suppress(ValueError, LookupError, struct.error):
+                        self.handle_frame(i, frame)
+        self.pass_time()
+
+    def _find_receivers(self, wire: Wire, frame: Frame) -> list[int]:
+        node = self.find_addressee(frame)
+        if node == self.broadcast_id:
+            return [i for i, drive_wire in enumerate(self.wires) if drive_wire is wire]
+        i = self._index_of_node.get((id(wire), node))
+        return [] if i is None else [i]

@@ -6,26 +6,37 @@ from dataclasses import dataclass
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_hal.base.errors import ConfigError
 
-
-@dataclass(frozen=True)
-class Traffic:
-    """Frames by their length in bytes."""
-
-    each_drive: tuple[int, ...]  # of a tick
-    one_drive: tuple[int, ...] = ()  # of a tick, and of one drive in turn
-    heartbeats_hz: float = 0.0  # of a drive, of 8 bytes
+HEARTBEAT_BYTES = 8
 
 
 @dataclass(frozen=True)
-class Load:
-    """Of the fullest bus."""
+class CycleTraffic:
+    """The frames of a driver type, by their lengths in bytes."""
 
-    share: float  # of its time
-    fits_hz: int
+    each_drive: tuple[int, ...]  # in each control cycle, for every drive
+    one_drive: tuple[int, ...] = ()  # in each control cycle, for one drive in turn
+    heartbeats_hz: float = 0.0  # of every drive
+
+
+@dataclass(frozen=True)
+class BusLoad:
+    """The load of the fullest bus."""
+
+    share: float  # of its time, 0 to 1
+    fits_hz: int  # the highest rate that is allowed
     drives: int
 
     def check(self, name: str, rate_hz: float, bus: str) -> None:
-        """Raise ConfigError when it is too high. bus: its rate, in words."""
+        """Refuse a load that is too high.
+
+        Args:
+            name: Name of the backend.
+            rate_hz: Rate of the control cycle on the bus.
+            bus: Bit rate of the bus, in words.
+
+        Raises:
+            ConfigError: the load is higher than `MAX_LOAD`.
+        """
         if self.share > MAX_LOAD:
             raise ConfigError(
                 f"{self.drives} drives at {rate_hz:g} Hz need {self.share:.0%} of a bus of {bus}, at worst-case "
@@ -33,9 +44,23 @@ class Load:
             )
 
 
-def load_of(traffic: Traffic, on: Sequence[int], rate_hz: float, frame_s: Callable[[int], float]) -> Load:
-    """on: the number of every joint's bus; frame_s: time that a frame of so many bytes takes."""
-    drives = max(on.count(bus) for bus in set(on))
-    tick_s = drives * sum(map(frame_s, traffic.each_drive)) + sum(map(frame_s, traffic.one_drive))
-    steady = drives * traffic.heartbeats_hz * frame_s(8) if traffic.heartbeats_hz else 0.0
-    return Load(tick_s * rate_hz + steady, int((MAX_LOAD - steady) / tick_s), drives)
+def compute_load(
+    traffic: CycleTraffic, bus_indices: Sequence[int], rate_hz: float, frame_s: Callable[[int], float]
+) -> BusLoad:
+    """Return the load of the fullest bus.
+
+    Args:
+        traffic: The frames of the driver type.
+        bus_indices: The bus of every joint.
+        rate_hz: Rate of the control cycle on the bus.
+        frame_s: Returns the time that a frame of so many bytes takes at most.
+    """
+    drives = max(bus_indices.count(bus) for bus in set(bus_indices))
+    each_drive_s = sum(map(frame_s, traffic.each_drive))
+    one_drive_s = sum(map(frame_s, traffic.one_drive))
+    cycle_s = drives * each_drive_s + one_drive_s
+    heartbeat_share = 0.0
+    if traffic.heartbeats_hz:
+        heartbeat_share = drives * traffic.heartbeats_hz * frame_s(HEARTBEAT_BYTES)
+    max_rate_hz = int((MAX_LOAD - heartbeat_share) / cycle_s)
+    return BusLoad(cycle_s * rate_hz + heartbeat_share, max_rate_hz, drives)

@@ -8,10 +8,10 @@ from snakesim_can_backend.driver.parameters import check_drives, check_ratings, 
 from snakesim_can_backend.driver.sensors import Sensors, described
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import check_mounted
-from snakesim_drivers.kit.drive_backend import Clock, DriveBackend
+from snakesim_drivers.kit.drive_backend import DriveBackend, DriverClock
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.readings import Readings
-from snakesim_drivers.motion_capture.mocap import check_pose, receiver
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_drivers.motion_capture.mocap import check_pose, make_receiver
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motor import check_gains
@@ -24,7 +24,7 @@ class CanBackend(DriveBackend):
     """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
 
     Settings = CanSettings
-    clear_grace = 0  # the monitor has its own, for what takes a while to be over
+    reset_grace_cycles = 0  # the monitor has its own grace for each kind of fault
     modules: Modules
     _sensors: Sensors
 
@@ -48,11 +48,13 @@ class CanBackend(DriveBackend):
     def __init__(self, config: RunConfig, settings: CanSettings) -> None:
         """Open the buses and find every module; nothing is enabled. Raises ConfigError and BackendError."""
         self.check(config, settings)
-        clock, emulators = Clock(config), settings.emulators_run != "none"
-        mocap = receiver(config, settings.pose_listen, emulators=emulators, clock=lambda _timestamp_ns: clock.ns())
+        clock, emulators = DriverClock(config), settings.emulators_run != "none"
+        mocap = make_receiver(
+            config, settings.pose_listen, emulators=emulators, clock=lambda _timestamp_ns: clock.now_ns()
+        )
         self._reports = reports_of(config, settings)
 
-        def make_modules(readings: Readings) -> Modules:
+        def make_modules(readings: DriveReadings) -> Modules:
             pose = mocap.address if mocap is not None else None
             self.modules = Modules(config, settings, clock, pose, readings)
             self._sensors = Sensors(config, self._reports, self.modules.reading, mocap)
@@ -61,14 +63,14 @@ class CanBackend(DriveBackend):
         watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
         super().__init__(config, NAME, "+".join(settings.channels), clock, mocap, make_modules, watchdogs_s)
 
-    def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+    def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)
 
-    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
+    def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
         return self._sensors.sample(tick, timestamp_ns)
 
-    def _silent(self) -> list[Finding]:
+    def _find_silent_drives(self) -> list[Finding]:
         return []  # the monitor finds it, by the answers to Syncs
 
-    def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
         return described(config, self._reports, pose_delay_s=pose_delay_s)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence, Set
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS, BusError
 from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
-from snakesim_drivers.kit.findings import Finding, Told
+from snakesim_drivers.kit.findings import Finding, ReportedFindings
 from snakesim_hal.wire.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer
@@ -32,7 +32,7 @@ class Watch:
         """joints, channel_of: name and bus of every joint, tail to head."""
         self._names, self._channels = joints, channel_of
         self._period_s = period_s
-        self._told = Told()
+        self._told = ReportedFindings()
         self._restarts = [0] * len(joints)
         self._unarmed = [0] * len(joints)  # Syncs in a row in which a module was not armed although the robot was
         self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime decreased
@@ -49,7 +49,7 @@ class Watch:
 
     def forget(self, sync: int) -> None:
         """The fault was cleared: report persistent findings again once the modules have followed."""
-        self._told.forget()
+        self._told.reset()
         self._restarted.clear()
         self._quiet_until = sync + CLEAR_GRACE
 
@@ -80,7 +80,7 @@ class Watch:
         if lifecycle == "armed":
             found += [self._bare(i) for i in unconfigured if i not in isolated]
         found = [finding for finding in found if not (finding.alone and finding.joint in isolated)]
-        return self._told.fresh(found)
+        return self._told.filter_new(found)
 
     def take_changed(self) -> set[int]:
         """Joints whose parameters may have changed since the last call."""

@@ -1,4 +1,4 @@
-"""Joint modules on their buses: a `snakesim_drivers.kit.drive_backend.Drives`. Thin: every task has its own file.
+"""Joint modules on their buses: a `snakesim_drivers.kit.drives.Drives`. Thin: every task has its own file.
 
 A tick: Sync is sent, every module answers with its samples of that instant, and enacts the setpoint that it received
 in the period before. So a command acts exactly one period after the state that it answers, whatever the load.
@@ -22,9 +22,9 @@ from snakesim_can_backend.driver.sensors import contacts_due
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.findings import Finding
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
@@ -58,7 +58,7 @@ class Modules:
     emulated = False  # until they have said so
 
     def __init__(
-        self, config: RunConfig, settings: CanSettings, clock: Clock, pose: str | None, readings: Readings
+        self, config: RunConfig, settings: CanSettings, clock: DriverClock, pose: str | None, readings: DriveReadings
     ) -> None:
         """Open the buses. Raises ConfigError and BackendError.
 
@@ -106,7 +106,7 @@ class Modules:
         self._ours = True
         self.emulated = all(identity.emulated for identity in found)
         for identity in found:
-            self._readings.identified(identity.node - 1, serial=f"{identity.serial:08X}", firmware=identity.firmware)
+            self._readings.set_identity(identity.node - 1, serial=f"{identity.serial:08X}", firmware=identity.firmware)
         self._broadcast(commands.command(Action.DISARM))
         self._configure(limit_s)
         self._await_first_states()
@@ -116,7 +116,7 @@ class Modules:
     def read(self) -> None:
         """Send Sync, and collect the modules' samples. Waits for late ones only for a limited time."""
         reading, questions = self.reading, self._questions()
-        time_us = self._clock.ns() // 1000
+        time_us = self._clock.now_ns() // 1000
         self._receive()
         due = contacts_due(self._reports, reading.sync + 1)
         reading.begin(reading.sync + 1, contacts=due, tail=self._reports.tail, questions=len(questions))
@@ -149,7 +149,7 @@ class Modules:
         for i in sorted(fresh):
             self._wire_of[i].send(commands.command(Action.DISARM, i + 1))
 
-    def clear(self, joints: frozenset[int]) -> None:
+    def reset_faults(self, joints: frozenset[int]) -> None:
         """Modules whose parameters may have changed are configured again, once, while motors are off.
 
         A module that is not configured then is reported as a fault, and nothing is armed.
@@ -195,7 +195,7 @@ class Modules:
         self._unconfigured |= self.watch.take_changed()
         return found
 
-    def let_run(self) -> None:
+    def poll(self) -> None:
         """Process frames received meanwhile."""
         if self._emulators is not None and (how := self._emulators.how_it_ended()) is not None:
             raise BackendError(how)

@@ -58,7 +58,7 @@ class Sensors:
             others[keys.IMU] = imu
         if tick % self._health_every == 0:
             others[keys.POWER] = self._power(tick, timestamp_ns)
-        pose = self._mocap.newest(tick, timestamp_ns) if self._mocap is not None else None
+        pose = self._mocap.read_newest(tick, timestamp_ns) if self._mocap is not None else None
         if pose is not None:
             others[keys.POSE] = pose
         return Samples(self._joints(tick, timestamp_ns), others)

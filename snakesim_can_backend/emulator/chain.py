@@ -24,7 +24,7 @@ from snakesim_can_backend.emulator.node_ids import node_ids
 from snakesim_can_backend.emulator.parameters import Parameters, from_factory
 from snakesim_can_backend.protocol.definitions import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import as_built, built
+from snakesim_drivers.emulation.mounted import build_config, build_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import Mounting, joint_target
 from snakesim_hal.model.fault_kinds import Change, Injection, Plan
@@ -59,8 +59,8 @@ class ModuleChain:
         robot, self.stepped, self.physics_model = config.robot, stepped, physics_model
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
-        self.motors = Motors(as_built(config, settings.mounted).robot, physics_model.step_s)
-        self._joints, self._told = built(robot, settings.mounted), robot.joint_table
+        self.motors = Motors(build_config(config, settings.mounted).robot, physics_model.step_s)
+        self._joints, self._told = build_joints(robot, settings.mounted), robot.joint_table
         self._nodes = node_ids(robot, settings)
         loose = {name for name, truth in settings.mounted.items() if not truth.connected}
         self._loose = {i for i, joint in enumerate(self._joints) if joint.name in loose}
@@ -209,7 +209,7 @@ class ModuleChain:
             self._step_to(time)
         if self._camera is not None and self._send_pose is not None and time != self._pose_time:
             self._pose_time = time
-            sample = self._camera.look(round(self.now_us * 1000))
+            sample = self._camera.capture(round(self.now_us * 1000))
             if sample is not None:
                 self._send_pose(self._encode(sample))
         first = sum(self.counts[:channel])

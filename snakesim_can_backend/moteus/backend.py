@@ -7,15 +7,15 @@ from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.can_drives.command import run
-from snakesim_can_backend.can_drives.traffic import Traffic
-from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
+from snakesim_can_backend.can_drives.traffic import CycleTraffic
+from snakesim_can_backend.moteus.controllers import Controllers, configured_gains, needed_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
-ROUNDING = 1.001  # of gains that a person has copied
+ROUNDING = 1.001  # factor: people round the gains that they copy
 
 
 class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
@@ -29,34 +29,48 @@ class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
 
     @property
     def fd_rate(self) -> int | None:
-        """CAN FD."""
+        """Bit rate of the data on CAN FD."""
         return self.data_bit_rate
 
 
 class MoteusBackend(CanDriveBackend):
     """A `snakesim_hal.backend.Backend` on moteus controllers, real or emulated."""
 
-    Settings, drives, emulator = MoteusSettings, Controllers, EmulatedMoteus
-    name, a_drive, first_id, last_id = "moteus", "controllers", HOST_ID + 1, LAST_ID
+    Settings = MoteusSettings
+    drives_class = Controllers
+    emulator_class = EmulatedMoteus
+    name = "moteus"
+    plural_noun = "controllers"
+    first_id = HOST_ID + 1
+    last_id = LAST_ID
     reserved_ids = f"{HOST_ID} is the host's, {BROADCAST_ID} the broadcast address"
-    says_every_s = 0.05  # it says so whenever it is asked; but it takes a while to get ready
-    # Question, answer and command; of one controller two questions more: its health, and its serial number.
-    traffic = Traffic((5, 24, 48), (6, 24, 3, 16))
+    report_period_s = 0.05  # a controller reports whenever it is requested, but takes a while to get ready
+    traffic = CycleTraffic(
+        each_drive=(5, 24, 48),  # request, answer and command
+        one_drive=(6, 24, 3, 16),  # requests and answers of health and serial number
+    )
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:
-        """And gains that all controllers have alike."""
+        """Check also the gains that all controllers have alike.
+
+        Raises:
+            ConfigError: the joints need higher gains, or the gains of real controllers are not known.
+        """
         super().check_drives(config, settings, joints)
-        most, have = needed(joints), configured(joints, settings)
-        named = settings.kp_nm_per_turn is not None and settings.kd_nm_s_per_turn is not None
-        if (cls.real(settings) and not named) or any(a > b * ROUNDING for a, b in zip(most, have, strict=True)):
+        needed_kp, needed_kd = needed_gains(joints)
+        kp, kd = configured_gains(joints, settings)
+        are_named = settings.kp_nm_per_turn is not None and settings.kd_nm_s_per_turn is not None
+        are_unknown = cls.has_real_bus(settings) and not are_named
+        are_too_low = needed_kp > kp * ROUNDING or needed_kd > kd * ROUNDING
+        if are_unknown or are_too_low:
             raise ConfigError(
-                f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {most[0]:.4g} N·m/turn on, and `.kd` "
-                f"from {most[1]:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
+                f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {needed_kp:.4g} N·m/turn on, and "
+                f"`.kd` from {needed_kd:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
                 f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`"
             )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """`snakesim moteus`."""
+    """Run `snakesim moteus`."""
     return run(MoteusBackend, "moteus", argv)

@@ -1,15 +1,16 @@
-"""moteus controllers as a driver type of drives on CAN FD.
+"""moteus controllers on one CAN FD bus, as a driver type.
 
-Every setpoint is a whole command in position mode: gains of the robot file as shares of the configured ones. Velocity
-mode is a proportional gain of 0, torque mode both gains 0, passive that without torque. Answers say mode and fault.
+Every setpoint is a complete command in position mode, with the gains of the robot file as fractions of the configured
+ones. Velocity mode is a proportional gain of 0, torque mode has both gains 0, and passive is that without torque.
+Answers report mode and fault.
 """
 
 import logging
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-from snakesim_can_backend.can_drives.drives import HOST, CanDrives
+from snakesim_can_backend.can_drives.drives import HOST, CanDrives, CanDrivesContext
 from snakesim_can_backend.moteus.protocol import (
     FAULTS,
     FLOAT,
@@ -21,177 +22,255 @@ from snakesim_can_backend.moteus.protocol import (
     RELATIVE,
     REPLY,
     WRITE,
-    Mode,
+    MoteusMode,
     Register,
-    addresses,
-    framed,
-    part,
-    parts,
+    decode_subframes,
+    encode_subframe,
+    make_frame,
+    split_addresses,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.following import Word
+from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode as JointMode
+from snakesim_hal.wire.messages import Mode
 
-TURN = 2 * math.pi
-OFF_BY_ITSELF = (Mode.FAULT, Mode.TIMEOUT)  # latched until a stop, which also clears the reason
+TURN = 2 * math.pi  # rad
+LATCHED_MODES = (MoteusMode.FAULT, MoteusMode.TIMEOUT)  # until a stop, which also clears the reason
 NO_LIMIT = -1.0
-IDENTITY = part(READ, INT32, Register.MAP_VERSION, count=1), part(READ, INT8, Register.HOME_STATE, count=1)
-MOTION = part(READ, FLOAT, Register.MODE, count=4), part(READ, INT8, Register.FAULT, count=1)
-HEALTH = (
-    part(READ, FLOAT, Register.POWER, count=1),
-    part(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
-    part(READ, FLOAT, Register.VOLTAGE, count=2),
+MODE_UNKNOWN = -1
+SERIAL_WORDS = 3  # registers of a serial number
+MIN_DIVISOR_V = 1.0  # for power / voltage, when the supply is off
+
+# Subframes of requests.
+IDENTITY = (
+    encode_subframe(READ, INT32, Register.MAP_VERSION, count=1),
+    encode_subframe(READ, INT8, Register.HOME_STATE, count=1),
 )
-SERIAL_WORDS = 3
-SERIAL = part(READ, INT32, Register.SERIAL, count=SERIAL_WORDS)
+MOTION = (
+    encode_subframe(READ, FLOAT, Register.MODE, count=4),  # mode, position, velocity, torque
+    encode_subframe(READ, INT8, Register.FAULT, count=1),
+)
+HEALTH = (
+    encode_subframe(READ, FLOAT, Register.POWER, count=1),
+    encode_subframe(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
+    encode_subframe(READ, FLOAT, Register.VOLTAGE, count=2),  # voltage, board temperature
+)
+SERIAL = encode_subframe(READ, INT32, Register.SERIAL, count=SERIAL_WORDS)
 
 _log = logging.getLogger("snakesim.moteus")
+
+
+class ShaftGains(NamedTuple):
+    """Gains at a controller's shaft, in turns; or, as fractions of the configured ones, without a unit."""
+
+    stiffness: float  # N·m/turn
+    damping: float  # N·m/(turn/s), position mode
+    velocity: float  # N·m/(turn/s), velocity mode
 
 
 class Controllers(CanDrives):
     """All controllers of a bus."""
 
-    unheard = "does not say its register map: it is off, has another id, or the bus another bit rate or sample point"
+    missing_identity_reason = (
+        "does not say its register map: it is off, has another id, or the bus another bit rate or sample point"
+    )
 
-    def __init__(
-        self, everybody: Sequence[Joint], settings: Any, joints: Sequence[Joint], *rest: Any, **kit: Any
-    ) -> None:
-        super().__init__(joints, *rest, **kit)
-        self._kp_nm_per_turn, kd = kp, kd = configured(everybody, settings)
-        self._gains = [tuple(a / b for a, b in zip(gains_of(j), (kp, kd, kd), strict=True)) for j in joints]
-        self._watchdog_s = settings.watchdog_s
-        self._mode, self._home = [-1] * len(joints), [RELATIVE] * len(joints)
+    def __init__(self, context: CanDrivesContext) -> None:
+        """Compute the gains that setpoints carry."""
+        super().__init__(context)
+        kp_nm_per_turn, kd_nm_s_per_turn = configured_gains(context.all_joints, context.settings)
+        self._gain_fractions: list[ShaftGains] = []
+        for joint in context.joints:
+            gains = shaft_gains(joint)
+            self._gain_fractions.append(
+                ShaftGains(
+                    stiffness=gains.stiffness / kp_nm_per_turn,
+                    damping=gains.damping / kd_nm_s_per_turn,
+                    velocity=gains.velocity / kd_nm_s_per_turn,
+                )
+            )
+        self._watchdog_s: float = context.settings.watchdog_s
+        self._mode = [MODE_UNKNOWN] * len(context.joints)
+        self._home_state = [RELATIVE] * len(context.joints)
 
-    def sender(self, frame: Frame) -> int | None:
-        """Another host of our id is known by its writing."""
-        source, destination = addresses(frame)
+    # --- frames that arrive -----------------------------------------------------------------------------------
+
+    def find_sender(self, frame: Frame) -> int | None:
+        """Return the sender. Another host has the same id as this one; it matters only if it writes."""
+        source, destination = split_addresses(frame)
         if source == HOST_ID:
-            return HOST if frame.data[:1] < bytes([READ]) else None
+            first_subframe_writes = frame.data[:1] < bytes([READ])
+            return HOST if first_subframe_writes else None
         return source if destination == HOST_ID else None
 
-    def hear(self, i: int, frame: Frame) -> None:
-        """One answer, to one of three questions."""
-        said = {
-            one.register + k: value
-            for one in parts(frame.data)
-            if one.kind == REPLY
-            for k, value in enumerate(one.values)
-        }
-        if Register.POSITION in said:
-            mode, fault = int(said[Register.MODE]), int(said[Register.FAULT])
-            self._mode[i] = mode
-            self.readings.state_was_read(i)
-            self.readings.moved(i, said[Register.POSITION] * TURN, said[Register.VELOCITY] * TURN)
-            self.readings.pushed(i, said[Register.TORQUE])
-            self.following.says(i, enabled=mode == Mode.POSITION, state=f"in mode {mode}")
-            named = f"fault {fault}, {FAULTS.get(fault, 'see its manual')}" if mode == Mode.FAULT else ""
-            self.following.drives[i].errors = "timeout: its watchdog expired" if mode == Mode.TIMEOUT else named
-        if Register.VOLTAGE in said:
-            voltage_v = said[Register.VOLTAGE]
-            self.readings.supplied(i, voltage_v, said[Register.POWER] / max(voltage_v, 1.0))
-            self.readings.warmed(i, said[Register.MOTOR_TEMPERATURE], said[Register.BOARD_TEMPERATURE])
-        if Register.MAP_VERSION in said:
-            self.firmware[i], self._home[i] = (int(said[Register.MAP_VERSION]),), int(said[Register.HOME_STATE])
-        if Register.SERIAL in said:
-            words = [int(said[Register.SERIAL + k]) & 0xFFFF_FFFF for k in range(SERIAL_WORDS)]
+    def handle_answer(self, i: int, frame: Frame) -> None:
+        """Store the registers of an answer. Each request reads other registers, by which its answer is known."""
+        registers: dict[int, float] = {}
+        for subframe in decode_subframes(frame.data):
+            if subframe.kind == REPLY:
+                for offset, value in enumerate(subframe.values):
+                    registers[subframe.register + offset] = value
+        if Register.POSITION in registers:
+            self._store_motion(i, registers)
+        if Register.VOLTAGE in registers:
+            self._store_health(i, registers)
+        if Register.MAP_VERSION in registers:
+            self.firmware[i] = (int(registers[Register.MAP_VERSION]),)
+            self._home_state[i] = int(registers[Register.HOME_STATE])
+        if Register.SERIAL in registers:
+            words = [int(registers[Register.SERIAL + k]) & 0xFFFF_FFFF for k in range(SERIAL_WORDS)]
             self.note_serial(i, "".join(f"{word:08X}" for word in reversed(words)))
 
-    def identify(self, i: int) -> None:
-        """Version of its registers, reference of its position, serial number, mode."""
+    def _store_motion(self, i: int, registers: Mapping[int, float]) -> None:
+        mode = int(registers[Register.MODE])
+        fault = int(registers[Register.FAULT])
+        self._mode[i] = mode
+        self.readings.mark_checked(i)
+        self.readings.set_motion(i, registers[Register.POSITION] * TURN, registers[Register.VELOCITY] * TURN)
+        self.readings.set_torque(i, registers[Register.TORQUE])
+        self.states.note_report(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
+        self.states.drives[i].errors = describe_fault(mode, fault)
+
+    def _store_health(self, i: int, registers: Mapping[int, float]) -> None:
+        voltage_v = registers[Register.VOLTAGE]
+        current_a = registers[Register.POWER] / max(voltage_v, MIN_DIVISOR_V)
+        self.readings.set_supply(i, voltage_v, current_a)
+        self.readings.set_temperatures(i, registers[Register.MOTOR_TEMPERATURE], registers[Register.BOARD_TEMPERATURE])
+
+    # --- bring-up, reset and end ------------------------------------------------------------------------------
+
+    def request_identity(self, i: int) -> None:
+        """Request the version of the registers, the reference of the position, serial number and mode."""
         self._send(i, *IDENTITY, reply=True)
         self._send(i, SERIAL, reply=True)
-        self.ask(i)
+        self.request_motion(i)
 
-    def unfit(self, i: int) -> str:
-        """Another register map, or a position that means nothing."""
+    def find_mismatch(self, i: int) -> str:
+        """Return why the register map or the encoder of a controller cannot be used; empty if both can."""
         if self.firmware[i] != (REGISTER_MAP,):
             return f"has register map {self.firmware[i][0]}; this driver knows {REGISTER_MAP}: update its firmware"
-        if self._home[i] == RELATIVE:
+        if self._home_state[i] == RELATIVE:
             return "does not know where it is: its position has no reference (home state 0); configure its encoders"
         return ""
 
-    def ask(self, i: int) -> bool:
-        """Mode, position, velocity, torque, fault."""
+    def clear_leftover_errors(self, i: int) -> None:
+        """Clear an expired watchdog."""
+        if self._mode[i] == MoteusMode.TIMEOUT:
+            _log.warning("%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label)
+            self._send_stop(i)
+
+    def write_settings(self, i: int) -> None:
+        """Write nothing: every command is complete."""
+
+    def clear_errors(self, i: int) -> None:
+        """Stop a controller, which clears its faults as well."""
+        self._send_stop(i)
+
+    def restore_settings(self, i: int) -> None:
+        """Write nothing: limits are part of each command."""
+
+    # --- a control cycle --------------------------------------------------------------------------------------
+
+    def request_motion(self, i: int) -> bool:
+        """Request mode, position, velocity, torque and fault."""
         return self._send(i, *MOTION, reply=True)
 
-    def ask_health(self, i: int) -> None:
-        """Power, temperatures and voltage; and the serial number, to notice a second controller of its id."""
+    def request_health(self, i: int) -> None:
+        """Request power, temperatures and voltage; and the serial number, to notice a second drive with this id."""
         self._send(i, *HEALTH, reply=True)
         self._send(i, SERIAL, reply=True)
 
-    def setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
-        """A command, which would also start it: so none to one that was restarted, or may be restarting."""
-        restarted = self.following.drives[i].followed and self._mode[i] != Mode.POSITION
-        if restarted or self.readings.unanswered(i):
+    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+        """Send a command, unless the controller was restarted or may be restarting: a command would enable it."""
+        was_restarted = self.states.drives[i].has_followed and self._mode[i] != MoteusMode.POSITION
+        if was_restarted or self.readings.unanswered_requests(i):
             return
-        stiffness, damping, velocity_gain = self._gains[i]
-        position, velocity, torque, kp, kd = math.nan, 0.0, 0.0, 0.0, 0.0
+        gains = self._gain_fractions[i]
+        position = math.nan  # the present one
+        velocity = 0.0
+        torque = 0.0
+        kp = 0.0
+        kd = 0.0
         match mode:
-            case JointMode.POSITION:
-                position, kp, kd = target / TURN, stiffness, damping
-            case JointMode.VELOCITY:
-                velocity, kd = target / TURN, velocity_gain
-            case JointMode.TORQUE | JointMode.PASSIVE:
+            case Mode.POSITION:
+                position = target / TURN
+                kp = gains.stiffness
+                kd = gains.damping
+            case Mode.VELOCITY:
+                velocity = target / TURN
+                kd = gains.velocity
+            case Mode.TORQUE | Mode.PASSIVE:
                 torque = target
         self._send(
             i,
-            part(WRITE, INT8, Register.MODE, Mode.POSITION),
-            part(WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm),
-            part(WRITE, FLOAT, Register.WATCHDOG, self._watchdog_s, NO_LIMIT, NO_LIMIT),
+            encode_subframe(WRITE, INT8, Register.MODE, MoteusMode.POSITION),
+            encode_subframe(WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm),
+            encode_subframe(WRITE, FLOAT, Register.WATCHDOG, self._watchdog_s, NO_LIMIT, NO_LIMIT),
         )
 
-    def tell(self, i: int, word: Word) -> None:
-        """A setpoint is what makes it follow; a stop clears whatever has stopped a controller before."""
-        if self._mode[i] in OFF_BY_ITSELF:
-            return  # its reason is for the operator to reset
-        match word:
+    def send_command(self, i: int, command: DriveCommand) -> None:
+        """Stop a controller unless it should follow: a setpoint enables it.
+
+        A controller that has stopped by itself gets no stop, which would clear the reason: that is for the operator.
+        """
+        if self._mode[i] in LATCHED_MODES:
+            return
+        match command:
             case "follow":
                 return
             case "idle":
-                if i not in self.readings.doubted:  # else it is told again, once it says that it is on
-                    self._stop(i)
+                # A controller that may have stopped by itself gets the stop later, once it reports that it is on.
+                if i not in self.readings.drives_to_check:
+                    self._send_stop(i)
             case "stop":
-                self._stop(i)
+                self._send_stop(i)
 
-    def set_up(self, i: int) -> None:
-        """Nothing: every command is whole."""
+    def _send_stop(self, i: int) -> None:
+        self._send(i, encode_subframe(WRITE, INT8, Register.MODE, MoteusMode.STOPPED))
 
-    def forgive(self, i: int) -> None:
-        """An expired watchdog."""
-        if self._mode[i] == Mode.TIMEOUT:
-            _log.warning("%s: clearing an expired watchdog of an earlier run", self.following.drives[i].who)
-            self._stop(i)
-
-    def give_back(self, i: int) -> None:
-        """Nothing: limits are part of each command."""
-
-    def clear_errors(self, i: int) -> None:
-        """Stopped: it clears faults, too."""
-        self._stop(i)
-
-    def _stop(self, i: int) -> None:
-        self._send(i, part(WRITE, INT8, Register.MODE, Mode.STOPPED))
-
-    def _send(self, i: int, *content: bytes, reply: bool = False) -> bool:
-        return self.wire.send(framed(HOST_ID, self.nodes[i], *content, reply=reply))
+    def _send(self, i: int, *subframes: bytes, reply: bool = False) -> bool:
+        return self.wire.send(make_frame(HOST_ID, self.nodes[i], *subframes, reply=reply))
 
 
-def gains_of(joint: Joint) -> tuple[float, float, float]:
-    """Stiffness in N·m/turn, damping and gain of velocity mode in N·m/(turn/s), at the shaft."""
-    motor, at_shaft = joint.motor, TURN / joint.drive.gear**2
-    gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, motor.velocity_gain_nm_s_per_rad
-    stiffness, damping, velocity_gain = (gain * at_shaft for gain in gains)
-    return stiffness, damping, velocity_gain
+def describe_fault(mode: int, fault: int) -> str:
+    """Return why a controller has stopped by itself; empty if it has not."""
+    match mode:
+        case MoteusMode.TIMEOUT:
+            return "timeout: its watchdog expired"
+        case MoteusMode.FAULT:
+            return f"fault {fault}, {FAULTS.get(fault, 'see its manual')}"
+        case _:
+            return ""
 
 
-def needed(joints: Sequence[Joint]) -> tuple[float, float]:
-    """The gains that all joints' are shares of: `servo.pid_position.kp` and `kd`."""
-    gains = [gains_of(joint) for joint in joints]
-    return max(kp for kp, _, _ in gains), max(max(damping, velocity) for _, damping, velocity in gains)
+def shaft_gains(joint: Joint) -> ShaftGains:
+    """Return the gains of a joint at the shaft of its controller."""
+    motor = joint.motor
+    joint_to_shaft = TURN / joint.drive.gear**2
+    return ShaftGains(
+        stiffness=motor.stiffness_nm_per_rad * joint_to_shaft,
+        damping=motor.damping_nm_s_per_rad * joint_to_shaft,
+        velocity=motor.velocity_gain_nm_s_per_rad * joint_to_shaft,
+    )
 
 
-def configured(joints: Sequence[Joint], settings: Any) -> tuple[float, float]:
-    """Those that the controllers have. joints: all of them."""
-    kp, kd = needed(joints)
+def needed_gains(joints: Sequence[Joint]) -> tuple[float, float]:
+    """Return the least `servo.pid_position.kp` and `kd` that all joints can be fractions of.
+
+    A fraction above 1 is not possible, so these are the maxima over all joints, in N·m/turn and N·m/(turn/s).
+    """
+    gains = [shaft_gains(joint) for joint in joints]
+    kp = max(joint_gains.stiffness for joint_gains in gains)
+    kd = max(max(joint_gains.damping, joint_gains.velocity) for joint_gains in gains)
+    return kp, kd
+
+
+def configured_gains(joints: Sequence[Joint], settings: Any) -> tuple[float, float]:
+    """Return the `servo.pid_position.kp` and `kd` that the controllers have.
+
+    Args:
+        joints: All joints of the driver type.
+        settings: The settings of the driver type; gains that they leave out are what the joints need.
+    """
+    kp, kd = needed_gains(joints)
     return settings.kp_nm_per_turn or kp or 1.0, settings.kd_nm_s_per_turn or kd or 1.0

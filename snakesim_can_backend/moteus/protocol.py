@@ -1,6 +1,7 @@
-"""Registers in CAN FD frames: an id is source << 8 | destination, with a bit that asks for a reply; data are parts.
+"""Registers of moteus controllers in CAN FD frames.
 
-A part writes, reads or answers registers in a row, in one of four types. Written from mjbots' public documentation;
+An id is source << 8 | destination, with a bit that requests a reply. The data are subframes: each writes, reads or
+answers consecutive registers, in one of four types. Written from mjbots' public documentation;
 tests hold it against mjbots' own library.
 """
 
@@ -13,17 +14,25 @@ from snakesim_can_backend.protocol.definitions import Frame
 
 HOST_ID = 0
 LAST_ID = 126
-BROADCAST_ID = 127  # every controller takes its frames
+BROADCAST_ID = 127  # every controller receives its frames
 REPLY_WANTED = 0x8000
-REGISTER_MAP = 5  # the version that this file is of
-WRITE, READ, REPLY, NOTHING = 0x00, 0x10, 0x20, 0x50  # high bits of a part
-INT8, INT16, INT32, FLOAT = range(4)
+REGISTER_MAP = 5  # the version of the register map that this file describes
+# Kinds of subframes: the high bits of their first byte.
+WRITE = 0x00
+READ = 0x10
+REPLY = 0x20
+NOTHING = 0x50  # padding
+# Types of values: the next two bits.
+INT8 = 0
+INT16 = 1
+INT32 = 2
+FLOAT = 3
 TYPES = (Struct("<b"), Struct("<h"), Struct("<i"), Struct("<f"))
-LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # that CAN FD has
+LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # possible data lengths of CAN FD, bytes
 
 
 class Register(IntEnum):
-    """Those that are used here."""
+    """The registers that are used here."""
 
     MODE = 0x000
     POSITION = 0x001  # turns
@@ -41,7 +50,7 @@ class Register(IntEnum):
     SERIAL = 0x120  # three words of 32 bits, the lowest one first
 
 
-class Mode(IntEnum):
+class MoteusMode(IntEnum):
     """What a controller does; those between FAULT and POSITION prepare it, or are of other uses."""
 
     STOPPED = 0
@@ -65,64 +74,98 @@ FAULTS = {
 }
 
 
-class Part(NamedTuple):
-    """Registers in a row; length: how many; values: () of a READ."""
+class Subframe(NamedTuple):
+    """Consecutive registers that a frame writes, reads or answers."""
 
-    kind: int
-    type: int
-    register: int
-    length: int
-    values: tuple[float, ...] = ()
+    kind: int  # WRITE, READ or REPLY
+    type: int  # INT8, INT16, INT32 or FLOAT
+    register: int  # the first one
+    length: int  # how many registers
+    values: tuple[float, ...] = ()  # empty in a READ
 
 
-def part(kind: int, type_: int, register: int, *values: float, count: int = 0) -> bytes:
-    """As bytes. count: of a READ."""
+def encode_subframe(kind: int, type_: int, register: int, *values: float, count: int = 0) -> bytes:
+    """Return a subframe as bytes.
+
+    Args:
+        kind: WRITE, READ or REPLY.
+        type_: INT8, INT16, INT32 or FLOAT.
+        register: The first register.
+        values: The values that it writes or answers.
+        count: How many registers a READ reads.
+    """
     count = count or len(values)
-    head = bytes([kind | type_ << 2 | count]) if count <= 3 else bytes([kind | type_ << 2]) + _varuint(count)
-    return head + _varuint(register) + b"".join(TYPES[type_].pack(value) for value in values)
+    head = bytes([kind | type_ << 2 | count])
+    if count > 3:  # it does not fit into the two low bits, and follows
+        head = bytes([kind | type_ << 2]) + _encode_varuint(count)
+    data = b"".join(TYPES[type_].pack(value) for value in values)
+    return head + _encode_varuint(register) + data
 
 
-def parts(data: bytes) -> Iterator[Part]:
-    """Of a frame. ValueError, LookupError, struct.error: it is malformed, or has parts of another use."""
-    at = 0
-    while at < len(data):
-        head, at = data[at], at + 1
+def decode_subframes(data: bytes) -> Iterator[Subframe]:
+    """Yield the subframes of a frame.
+
+    Raises:
+        ValueError, LookupError, struct.error: a subframe is malformed or of a kind that is not used here.
+    """
+    offset = 0
+    while offset < len(data):
+        head = data[offset]
+        offset += 1
         if head == NOTHING:
             continue
-        kind, type_, count = head & 0xF0, head >> 2 & 3, head & 3
+        kind = head & 0xF0
+        type_ = head >> 2 & 3
+        count = head & 3
         if kind not in (WRITE, READ, REPLY):
             raise ValueError(f"a part 0x{head:02X}")
         if count == 0:
-            count, at = _read_varuint(data, at)
-        register, at = _read_varuint(data, at)
-        values = []
-        for _ in range(count if kind != READ else 0):
-            values += TYPES[type_].unpack_from(data, at)
-            at += TYPES[type_].size
-        yield Part(kind, type_, register, count, tuple(values))
+            count, offset = _decode_varuint(data, offset)
+        register, offset = _decode_varuint(data, offset)
+        values: list[float] = []
+        value_count = 0 if kind == READ else count
+        for _ in range(value_count):
+            values += TYPES[type_].unpack_from(data, offset)
+            offset += TYPES[type_].size
+        yield Subframe(kind, type_, register, count, tuple(values))
 
 
-def framed(source: int, destination: int, *parts: bytes, reply: bool = False) -> Frame:
-    """A message, filled up to a length that CAN FD has."""
-    data = b"".join(parts)
+def make_frame(source: int, destination: int, *subframes: bytes, reply: bool = False) -> Frame:
+    """Return a frame with these subframes, padded to a length that CAN FD has.
+
+    Args:
+        source: The id of the sender.
+        destination: The id of the receiver.
+        subframes: The subframes.
+        reply: Whether the receiver sends an answer.
+    """
+    data = b"".join(subframes)
     length = next(length for length in LENGTHS if length >= len(data))
-    return Frame((REPLY_WANTED if reply else 0) | source << 8 | destination, data.ljust(length, bytes([NOTHING])))
+    padded = data.ljust(length, bytes([NOTHING]))
+    reply_bit = REPLY_WANTED if reply else 0
+    return Frame(reply_bit | source << 8 | destination, padded)
 
 
-def addresses(frame: Frame) -> tuple[int, int]:
-    """Source and destination."""
+def split_addresses(frame: Frame) -> tuple[int, int]:
+    """Return source and destination of a frame."""
     return frame.id >> 8 & 0x7F, frame.id & 0x7F
 
 
-def _varuint(value: int) -> bytes:
-    return bytes([value]) if value < 0x80 else bytes([value & 0x7F | 0x80]) + _varuint(value >> 7)
+def _encode_varuint(value: int) -> bytes:
+    """Return an unsigned integer in groups of 7 bits, the lowest first; bit 7 says that another group follows."""
+    if value < 0x80:
+        return bytes([value])
+    return bytes([value & 0x7F | 0x80]) + _encode_varuint(value >> 7)
 
 
-def _read_varuint(data: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
+def _decode_varuint(data: bytes, offset: int) -> tuple[int, int]:
+    """Return the integer that begins at an offset, and the offset after it."""
+    value = 0
+    shift = 0
     while True:
-        byte, at = data[at], at + 1
+        byte = data[offset]
+        offset += 1
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return value, at
+            return value, offset
         shift += 7

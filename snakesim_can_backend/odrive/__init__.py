@@ -1,7 +1,10 @@
 """The backend `odrive`: axes of ODrive controllers, firmware 0.6, by CANSimple on classic CAN.
 
-`backend`   OdriveBackend: settings and checks      `axes`     what a tick says to an axis, and hears
-`protocol`  messages as bytes                       `emulator`     emulated axes
+`backend`    OdriveBackend: settings and checks
+`axes`       what the driver sends to an axis in each control cycle, and how it handles the answers
+`protocol`   messages as bytes
+`endpoints`  which settings of an axis the driver reads, and their ids
+`emulator`   emulated axes
 
 All else is in `snakesim_can_backend.can_drives` and `snakesim_drivers.kit`.
 Numbers are those of the motor's shaft: turns, A, N·m.

@@ -1,67 +1,70 @@
-"""ODrive axes as a driver type of drives on CAN.
+"""ODrive axes on one CAN bus, as a driver type.
 
 Position mode is the axis' own cascade, with gains that make it the PD law of the robot file; passive is a torque of 0,
-without a change of state. Heartbeats say state and errors.
+without a change of state. Heartbeats report state and errors.
 """
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
-from snakesim_can_backend.can_drives.drives import HOST, CanDrives
-from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, Endpoints, Setting, read_all_endpoints
+from snakesim_can_backend.can_drives.drives import HOST, CanDrives, CanDrivesContext
+from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, Endpoints, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
     FIRMWARE,
     FROM_HOST,
     PASSTHROUGH,
     PAYLOADS,
     WRITE_SETTING,
-    Control,
-    Error,
-    Message,
-    State,
-    ask,
-    names,
-    parted,
-    read_setting,
-    setting_of,
-    write,
+    AxisError,
+    AxisState,
+    ControlMode,
+    MessageId,
+    decode_setting_answer,
+    describe_errors,
+    encode_message,
+    encode_request,
+    encode_setting_request,
+    split_id,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.following import Word
+from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-TURN = 2 * math.pi
-_log = logging.getLogger("snakesim.drivers")
-TWIN_CONSTANT = 1.0  # N·m/A, of emulators whose robot file says none
-UNKNOWN_MAX_CURRENT_A = 1.0  # where it cannot be read what an axis is configured for: even a small motor stands it
+TURN = 2 * math.pi  # rad
+EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of emulated axes whose robot file names none
+UNKNOWN_MAX_CURRENT_A = 1.0  # used if an axis' own limit cannot be read: even a small motor withstands it
 NO_LIMIT_SENT = -1.0
-READING = 1e-3  # relative: settings are single precision, and people round them
-LEFT_BEHIND = Error.WATCHDOG_TIMER_EXPIRED  # by a driver that was killed
-CONTROLS = {
-    Mode.PASSIVE: Control.TORQUE,
-    Mode.TORQUE: Control.TORQUE,
-    Mode.VELOCITY: Control.VELOCITY,
-    Mode.POSITION: Control.POSITION,
+ROUNDING = 1e-3  # relative: settings are single precision, and people round them
+LEFTOVER_ERRORS = AxisError.WATCHDOG_TIMER_EXPIRED  # of a driver that was killed
+CONTROL_MODES = {
+    Mode.PASSIVE: ControlMode.TORQUE,
+    Mode.TORQUE: ControlMode.TORQUE,
+    Mode.VELOCITY: ControlMode.VELOCITY,
+    Mode.POSITION: ControlMode.POSITION,
 }
+
+_log = logging.getLogger("snakesim.drivers")
 
 
 @dataclass
 class Axis:
-    """One axis: its settings, at its shaft, and which of them it has been sent."""
+    """One axis: what its joint needs, what the axis is configured for, and what this driver has sent."""
 
+    # What its joint needs, at the shaft.
     torque_constant: float  # N·m/A
     position_gain: float  # 1/s
     damping: float  # N·m / (turn/s), position mode
     velocity_gain: float  # N·m / (turn/s), velocity mode
     speed_limit: float  # turns/s
     torque_nm: float  # that the joint may ask for
-    max_current_a: float  # never sends more
-    configured: dict[Setting, float] = field(default_factory=dict[Setting, float])  # as it says in the bring-up
+    # What the axis reports.
+    max_current_a: float  # the driver never sends a higher limit
+    configured: dict[AxisSetting, float] = field(default_factory=dict[AxisSetting, float])  # read in bring-up
     errors: int = 0
+    # What the driver has sent.
     mode: Mode | None = None
     limit_nm: float = NO_LIMIT_SENT
 
@@ -69,219 +72,264 @@ class Axis:
 class Axes(CanDrives):
     """All axes of a bus."""
 
-    unheard = "does not say its version: it is off, has another id or bit rate, or firmware 0.5, which does not say it"
+    missing_identity_reason = (
+        "does not say its version: it is off, has another id or bit rate, or firmware 0.5, which does not say it"
+    )
 
-    def __init__(self, _everybody: object, settings: Any, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
-        super().__init__(joints, *rest, **kit)
+    def __init__(self, context: CanDrivesContext) -> None:
+        """Read the endpoint files that the settings name.
+
+        Raises:
+            ConfigError: a file cannot be read.
+        """
+        super().__init__(context)
+        settings = context.settings
         self._allowed_a: float = settings.max_current_a or math.inf
         self._watchdog_s: float = settings.watchdog_s
-        self._files = read_all_endpoints(settings.endpoints)
-        if self.emulated and not self._files:
-            self._files = [EMULATED]
-        self._hardware = [""] * len(joints)
-        unknown_a = settings.max_current_a or UNKNOWN_MAX_CURRENT_A
-        if not self._files:
+        self._endpoint_files = read_all_endpoints(settings.endpoints)
+        if self.emulated and not self._endpoint_files:
+            self._endpoint_files = [EMULATED]
+        self._hardware = [""] * len(context.joints)
+        unknown_limit_a = settings.max_current_a or UNKNOWN_MAX_CURRENT_A
+        if not self._endpoint_files:
             _log.warning(
                 "%s: watchdog, current and speed limits of these axes are unknown: the driver sets no more than %g A. "
                 "Name the flat_endpoints.json of their firmware in `backends.odrive.endpoints`, and it reads them",
                 self.wire.channel,
-                unknown_a,
+                unknown_limit_a,
             )
-        self.axes = [axis_of(joint, unknown_a) for joint in joints]
+        self.axes = [make_axis(joint, unknown_limit_a) for joint in context.joints]
 
-    def sender(self, frame: Frame) -> int | None:
-        """Questions have no data."""
-        node, message = parted(frame)
-        if not frame.data and message not in (Message.ESTOP, Message.CLEAR_ERRORS):
+    # --- frames that arrive -----------------------------------------------------------------------------------
+
+    def find_sender(self, frame: Frame) -> int | None:
+        """Return the sender. A request has no data; requests of other programs disturb nothing."""
+        node, message = split_id(frame)
+        if not frame.data and message not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
             return None
-        if message == Message.RX_SDO:  # a question of another program disturbs nobody
+        if message == MessageId.RX_SDO:
             return HOST if frame.data[0] == WRITE_SETTING else None
         return HOST if message in FROM_HOST else node
 
-    def hear(self, i: int, frame: Frame) -> None:
-        """Answers and heartbeats."""
-        message, axis, readings = Message(parted(frame)[1]), self.axes[i], self.readings
-        if message == Message.TX_SDO:
-            self._hear_setting(i, frame.data)
+    def handle_answer(self, i: int, frame: Frame) -> None:
+        """Store what an answer or a heartbeat reports."""
+        message = MessageId(split_id(frame)[1])
+        if message == MessageId.TX_SDO:
+            self._store_setting(i, frame.data)
             return
         values = PAYLOADS[message].unpack(frame.data)
         match message:
-            case Message.MOTION:
-                readings.moved(i, values[0] * TURN, values[1] * TURN)
-            case Message.CURRENT:
-                readings.pushed(i, values[1] * axis.torque_constant)
-            case Message.SUPPLY:
-                readings.supplied(i, values[0], values[1])
-            case Message.TEMPERATURE:
-                readings.warmed(i, values[1], values[0])
-            case Message.HEARTBEAT:
-                self.following.says(i, enabled=values[1] == State.CLOSED_LOOP, state=f"in state {values[1]}")
-                self._errs(i, values[0])
-                if values[1] == State.IDLE and not self.following.drives[i].follows:
-                    self.give_back(i)  # so that a driver that is killed while its motors are off leaves no lower limit
-            case Message.ERROR:
-                self._errs(i, values[0])
-            case Message.VERSION:
-                self.firmware[i] = values[4:7]
-                readings.identified(i, firmware=".".join(map(str, values[4:7])))
-                self._hardware[i] = ".".join(map(str, values[1:4]))
-                if values[4:6] == FIRMWARE:  # 0.5 would take the question for a new node id
-                    self._ask(i, Message.ADDRESS)
-                    self._ask_setting(i)
-            case Message.ADDRESS:
-                self.note_serial(i, f"{int.from_bytes(values[1], 'little'):012X}")
+            case MessageId.MOTION:
+                self.readings.set_motion(i, values[0] * TURN, values[1] * TURN)
+            case MessageId.CURRENT:
+                self.readings.set_torque(i, values[1] * self.axes[i].torque_constant)
+            case MessageId.SUPPLY:
+                self.readings.set_supply(i, values[0], values[1])
+            case MessageId.TEMPERATURE:
+                self.readings.set_temperatures(i, values[1], values[0])
+            case MessageId.HEARTBEAT:
+                self._handle_heartbeat(i, errors=values[0], state=values[1])
+            case MessageId.ERROR:
+                self._store_errors(i, values[0])
+            case MessageId.VERSION:
+                self._store_version(i, hardware=values[1:4], firmware=values[4:7])
+            case MessageId.ADDRESS:
+                serial = int.from_bytes(values[1], "little")
+                self.note_serial(i, f"{serial:012X}")
             case _:
                 pass
 
-    def _errs(self, i: int, errors: int) -> None:
-        self.readings.state_was_read(i)
-        drive, self.axes[i].errors = self.following.drives[i], errors
-        drive.errors = names(errors & ~Error.ESTOP_REQUESTED if drive.stopped else errors)
+    def _handle_heartbeat(self, i: int, errors: int, state: int) -> None:
+        self.states.note_report(i, enabled=state == AxisState.CLOSED_LOOP, state=f"in state {state}")
+        self._store_errors(i, errors)
+        if state == AxisState.IDLE and not self.states.drives[i].should_follow:
+            # A driver that is killed while its motors are off then leaves no lowered limits behind.
+            self.restore_settings(i)
 
-    # --- what an axis is configured for -------------------------------------------------------------------------
+    def _store_errors(self, i: int, errors: int) -> None:
+        self.readings.mark_checked(i)
+        self.axes[i].errors = errors
+        drive = self.states.drives[i]
+        if drive.emergency_stopped:  # this driver has requested it, so it is no fault of the drive
+            errors &= ~AxisError.ESTOP_REQUESTED
+        drive.errors = describe_errors(errors)
 
-    def identify(self, i: int) -> None:
-        """Version and errors; then one setting after another."""
+    def _store_version(self, i: int, hardware: tuple[int, ...], firmware: tuple[int, ...]) -> None:
+        self.firmware[i] = firmware
+        self.readings.set_identity(i, firmware=_join_version(firmware))
+        self._hardware[i] = _join_version(hardware)
+        if firmware[:2] == FIRMWARE:  # firmware 0.5 would take the request for the address as a new node id
+            self._request(i, MessageId.ADDRESS)
+            self._request_next_setting(i)
+
+    # --- what an axis is configured for -----------------------------------------------------------------------
+
+    def request_identity(self, i: int) -> None:
+        """Request version and errors; then one setting after the other."""
         if self.firmware[i]:
-            self._ask_setting(i)
+            self._request_next_setting(i)
         else:
-            self._ask(i, Message.VERSION, Message.ERROR)
+            self._request(i, MessageId.VERSION, MessageId.ERROR)
 
-    def identified(self, i: int) -> bool:
-        """Its firmware, and what it is configured for where that can be read."""
-        return bool(self.firmware[i]) and (self._endpoints(i) is None or not self._unread(i))
+    def is_identified(self, i: int) -> bool:
+        """Return whether an axis has sent its firmware version, and its settings where these can be read."""
+        if not self.firmware[i]:
+            return False
+        return self._find_endpoints(i) is None or not self._missing_settings(i)
 
-    def unfit(self, i: int) -> str:
-        """Another firmware, or a configuration that does not suit the joint."""
-        firmware = self._firmware_name(i)
+    def forget_identities(self) -> None:
+        """Forget also what the axes are configured for."""
+        super().forget_identities()
+        for axis in self.axes:
+            axis.configured.clear()
+
+    def find_mismatch(self, i: int) -> str:
+        """Return why the firmware or the configuration of an axis does not suit its joint; empty if both do."""
+        firmware = _join_version(self.firmware[i])
         if self.firmware[i][:2] != FIRMWARE:
             return f"has firmware {firmware}; this driver knows {FIRMWARE[0]}.{FIRMWARE[1]}"
-        if not self._files:  # the limits are unknown: `Axis.max_current_a` caps the current
+        if not self._endpoint_files:  # the limits are unknown: `Axis.max_current_a` caps the current
             return ""
-        if self._endpoints(i) is None:
-            files = ", ".join(f"{file.firmware} on {file.hardware}" for file in self._files)
+        if self._find_endpoints(i) is None:
+            files = ", ".join(f"{file.firmware} on {file.hardware}" for file in self._endpoint_files)
             return (
                 f"has firmware {firmware} on hardware {self._hardware[i]}, and `backends.odrive.endpoints` names files "
                 f"of {files}: add the flat_endpoints.json of its firmware"
             )
-        if unread := self._unread(i):
-            return f"does not say `{unread[0]}`: is `backends.odrive.endpoints` of its firmware?"
+        missing = self._missing_settings(i)
+        if missing:
+            return f"does not say `{missing[0]}`: is `backends.odrive.endpoints` of its firmware?"
         axis = self.axes[i]
-        axis.max_current_a = min(axis.configured[Setting.CURRENT], self._allowed_a)
-        return "; ".join(objections(axis, self._watchdog_s))
+        axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._allowed_a)
+        return "; ".join(find_objections(axis, self._watchdog_s))
 
-    def _firmware_name(self, i: int) -> str:
-        return ".".join(map(str, self.firmware[i]))
+    def _find_endpoints(self, i: int) -> Endpoints | None:
+        """Return the endpoint ids of an axis' settings, or None if no file is of its firmware and hardware."""
+        firmware = _join_version(self.firmware[i])
+        for file in self._endpoint_files:
+            if file.firmware == firmware and file.hardware == self._hardware[i]:
+                return file
+        return None
 
-    def _endpoints(self, i: int) -> Endpoints | None:
-        """Where this axis has its settings; None: not known."""
-        version = self._firmware_name(i), self._hardware[i]
-        return next((file for file in self._files if (file.firmware, file.hardware) == version), None)
+    def _missing_settings(self, i: int) -> list[AxisSetting]:
+        return [setting for setting in AxisSetting if setting not in self.axes[i].configured]
 
-    def _unread(self, i: int) -> list[Setting]:
-        return [setting for setting in Setting if setting not in self.axes[i].configured]
+    def _request_next_setting(self, i: int) -> None:
+        """Request the next setting that is not known yet; one at a time, so that queues do not fill."""
+        endpoints = self._find_endpoints(i)
+        missing = self._missing_settings(i)
+        if endpoints is not None and missing:
+            self.wire.send(encode_setting_request(self.nodes[i], endpoints.ids[missing[0]]))
 
-    def _ask_setting(self, i: int) -> None:
-        """Ask for the next setting that is not known yet; one at a time, so that queues do not fill."""
-        endpoints, unread = self._endpoints(i), self._unread(i)
-        if endpoints is not None and unread:
-            self.wire.send(read_setting(self.nodes[i], endpoints.ids[unread[0]]))
-
-    def _hear_setting(self, i: int, data: bytes) -> None:
-        endpoints = self._endpoints(i)
-        endpoint, value = setting_of(data)
+    def _store_setting(self, i: int, data: bytes) -> None:
+        endpoints = self._find_endpoints(i)
+        endpoint, value = decode_setting_answer(data)
         setting = None if endpoints is None else endpoints.setting_at(endpoint)
-        if setting is None or setting not in self._unread(i):  # later the driver has lowered limits
-            return
+        if setting is None or setting not in self._missing_settings(i):
+            return  # only the first answer counts: later the driver has lowered limits
         (self.axes[i].configured[setting],) = FORMATS[TYPES[setting]].unpack(value)
-        self._ask_setting(i)
+        self._request_next_setting(i)
 
-    def begin_anew(self) -> None:
-        """Also what they are configured for."""
-        super().begin_anew()
-        for axis in self.axes:
-            axis.configured.clear()
+    # --- settings and errors ----------------------------------------------------------------------------------
 
-    def give_back(self, i: int) -> None:
-        """The limits that an axis was configured for, if this driver has lowered them."""
+    def write_settings(self, i: int) -> None:
+        """Write the position gain; the rest is written when the axis follows."""
         axis = self.axes[i]
-        if axis.limit_nm < 0 or self._unread(i):
+        axis.limit_nm = NO_LIMIT_SENT
+        axis.mode = None
+        self._send(i, MessageId.SET_POSITION_GAIN, axis.position_gain)
+
+    def restore_settings(self, i: int) -> None:
+        """Write back the limits that an axis is configured for, if this driver has lowered them."""
+        axis = self.axes[i]
+        if axis.limit_nm < 0 or self._missing_settings(i):
             return
-        limits = axis.configured[Setting.SPEED], axis.configured[Setting.CURRENT]
-        if self._send(i, Message.SET_LIMITS, *limits):
+        speed = axis.configured[AxisSetting.SPEED]
+        current_a = axis.configured[AxisSetting.CURRENT]
+        if self._send(i, MessageId.SET_LIMITS, speed, current_a):
             axis.limit_nm = NO_LIMIT_SENT
 
-    # --- a tick -------------------------------------------------------------------------------------------------
-
-    def ask(self, i: int) -> bool:
-        """Encoder estimates and current; before them errors, of an axis that may have stopped by itself."""
-        if i in self.readings.doubted:
-            self._ask(i, Message.ERROR)
-        return self._ask(i, Message.MOTION, Message.CURRENT)
-
-    def ask_health(self, i: int) -> None:
-        """Supply, temperatures and errors; and the serial number, to notice a second axis of its id."""
-        self._ask(i, Message.SUPPLY, Message.TEMPERATURE, Message.ERROR, Message.ADDRESS)
-
-    def setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
-        """An input; before it limits, after it gains and mode, if they change."""
-        axis = self.axes[i]
-        if limit_nm != axis.limit_nm:
-            # This assigns `current_soft_max`, so it must never be more than the axis was configured for.
-            current_a = min(limit_nm / axis.torque_constant, axis.max_current_a)
-            if self._send(i, Message.SET_LIMITS, axis.speed_limit, current_a):
-                axis.limit_nm = limit_nm
-        match mode:
-            case Mode.POSITION:
-                self._send(i, Message.SET_POSITION, target / TURN, 0, 0)
-            case Mode.VELOCITY:
-                self._send(i, Message.SET_VELOCITY, target / TURN, 0.0)
-            case Mode.TORQUE | Mode.PASSIVE:
-                self._send(i, Message.SET_TORQUE, target)
-        if mode != axis.mode:
-            gain = axis.damping if mode == Mode.POSITION else axis.velocity_gain
-            sent = self._send(i, Message.SET_VELOCITY_GAINS, gain, 0.0)
-            if self._send(i, Message.SET_MODE, CONTROLS[mode], PASSTHROUGH) and sent:
-                axis.mode = mode
-
-    def tell(self, i: int, word: Word) -> None:
-        """By its state; an emergency stop is an error that it keeps."""
-        if word == "stop":
-            self._send(i, Message.ESTOP)
-        else:
-            self._send(i, Message.SET_STATE, State.CLOSED_LOOP if word == "follow" else State.IDLE)
-        if word != "follow":
-            self.axes[i].mode = None
-
-    def set_up(self, i: int) -> None:
-        """Its gain; the rest is written when it follows."""
-        axis = self.axes[i]
-        axis.limit_nm, axis.mode = NO_LIMIT_SENT, None
-        self._send(i, Message.SET_POSITION_GAIN, axis.position_gain)
-
-    def forgive(self, i: int) -> None:
-        """An expired watchdog."""
-        if self.axes[i].errors and not self.axes[i].errors & ~LEFT_BEHIND:
-            self._send(i, Message.CLEAR_ERRORS)
+    def clear_leftover_errors(self, i: int) -> None:
+        """Clear an expired watchdog, if it is the only error."""
+        errors = self.axes[i].errors
+        if errors and not errors & ~LEFTOVER_ERRORS:
+            self._send(i, MessageId.CLEAR_ERRORS)
 
     def clear_errors(self, i: int) -> None:
-        """And ask what is left."""
-        self._send(i, Message.CLEAR_ERRORS)
-        self._ask(i, Message.ERROR)
+        """Clear all errors, and request those that persist."""
+        self._send(i, MessageId.CLEAR_ERRORS)
+        self._request(i, MessageId.ERROR)
 
-    def _send(self, i: int, message: Message, *values: float) -> bool:
-        return self.wire.send(write(self.nodes[i], message, *values))
+    # --- a control cycle --------------------------------------------------------------------------------------
 
-    def _ask(self, i: int, *questions: Message) -> bool:
-        taken = [self.wire.send(ask(self.nodes[i], question)) for question in questions]
-        return all(taken)
+    def request_motion(self, i: int) -> bool:
+        """Request encoder estimates and current; before them errors, if the axis may have stopped by itself."""
+        if i in self.readings.drives_to_check:
+            self._request(i, MessageId.ERROR)
+        return self._request(i, MessageId.MOTION, MessageId.CURRENT)
+
+    def request_health(self, i: int) -> None:
+        """Request supply, temperatures and errors; and the serial number, to notice a second axis with this id."""
+        self._request(i, MessageId.SUPPLY, MessageId.TEMPERATURE, MessageId.ERROR, MessageId.ADDRESS)
+
+    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+        """Send an input; before it the limits, and after it gains and mode, if they change."""
+        axis = self.axes[i]
+        if limit_nm != axis.limit_nm:
+            self._send_limits(i, limit_nm)
+        match mode:
+            case Mode.POSITION:
+                self._send(i, MessageId.SET_POSITION, target / TURN, 0, 0)
+            case Mode.VELOCITY:
+                self._send(i, MessageId.SET_VELOCITY, target / TURN, 0.0)
+            case Mode.TORQUE | Mode.PASSIVE:
+                self._send(i, MessageId.SET_TORQUE, target)
+        if mode != axis.mode:
+            self._send_mode(i, mode)
+
+    def send_command(self, i: int, command: DriveCommand) -> None:
+        """Change the state of an axis. An emergency stop is an error that the axis keeps."""
+        match command:
+            case "follow":
+                self._send(i, MessageId.SET_STATE, AxisState.CLOSED_LOOP)
+            case "idle":
+                self._send(i, MessageId.SET_STATE, AxisState.IDLE)
+                self.axes[i].mode = None
+            case "stop":
+                self._send(i, MessageId.ESTOP)
+                self.axes[i].mode = None
+
+    def _send_limits(self, i: int, limit_nm: float) -> None:
+        """Send the speed and current limits; the axis never gets a higher current than it was configured for."""
+        axis = self.axes[i]
+        current_a = min(limit_nm / axis.torque_constant, axis.max_current_a)  # assigns `current_soft_max`
+        if self._send(i, MessageId.SET_LIMITS, axis.speed_limit, current_a):
+            axis.limit_nm = limit_nm
+
+    def _send_mode(self, i: int, mode: Mode) -> None:
+        """Send the gain and the control mode; both again in the next cycle if the bus did not accept one of them."""
+        axis = self.axes[i]
+        gain = axis.damping if mode == Mode.POSITION else axis.velocity_gain
+        gain_sent = self._send(i, MessageId.SET_VELOCITY_GAINS, gain, 0.0)
+        mode_sent = self._send(i, MessageId.SET_MODE, CONTROL_MODES[mode], PASSTHROUGH)
+        if gain_sent and mode_sent:
+            axis.mode = mode
+
+    def _send(self, i: int, message: MessageId, *values: float) -> bool:
+        return self.wire.send(encode_message(self.nodes[i], message, *values))
+
+    def _request(self, i: int, *messages: MessageId) -> bool:
+        """Send a request for each of these messages. Returns whether the bus accepted all of them."""
+        accepted = [self.wire.send(encode_request(self.nodes[i], message)) for message in messages]
+        return all(accepted)
 
 
-def axis_of(joint: Joint, max_current_a: float) -> Axis:
-    """An axis with the gains of its joint, at its shaft."""
-    motor, gear = joint.motor, joint.drive.gear
+def make_axis(joint: Joint, max_current_a: float) -> Axis:
+    """Return an axis with the gains and limits of its joint, at its shaft."""
+    motor = joint.motor
+    gear = joint.drive.gear
     return Axis(
-        torque_constant=motor.torque_constant_nm_per_a or TWIN_CONSTANT,
+        torque_constant=motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
         position_gain=motor.stiffness_nm_per_rad / motor.damping_nm_s_per_rad,
         damping=motor.damping_nm_s_per_rad / gear**2 * TURN,
         velocity_gain=motor.velocity_gain_nm_s_per_rad / gear**2 * TURN,
@@ -293,31 +341,35 @@ def axis_of(joint: Joint, max_current_a: float) -> Axis:
 
 def needed_current_a(joint: Joint) -> float:
     """Return the current that a joint's torque limit needs."""
-    constant = joint.motor.torque_constant_nm_per_a or TWIN_CONSTANT
+    constant = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
     return joint.limits.torque_nm / joint.drive.gear / constant
 
 
-def objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
+def find_objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
     """Yield what in the configuration of an axis does not suit its joint. NaN suits nothing."""
     configured = axis.configured
-    timeout_s = configured[Setting.WATCHDOG_TIMEOUT]
-    if not configured[Setting.WATCHDOG_ENABLED]:
+    timeout_s = configured[AxisSetting.WATCHDOG_TIMEOUT]
+    if not configured[AxisSetting.WATCHDOG_ENABLED]:
         yield f"has its watchdog off: set `enable_watchdog` = True and `watchdog_timeout` = {watchdog_s:g}, and save"
-    elif not abs(timeout_s - watchdog_s) <= READING * watchdog_s:
+    elif not abs(timeout_s - watchdog_s) <= ROUNDING * watchdog_s:
         yield (
             f"has a watchdog of {timeout_s:g} s, and `backends.odrive.watchdog_s` says {watchdog_s:g} s: correct "
             f"`watchdog_timeout` and save, or correct the scenario"
         )
-    current_a = configured[Setting.CURRENT]
-    if not axis.torque_nm / axis.torque_constant <= current_a * (1 + READING):
+    current_a = configured[AxisSetting.CURRENT]
+    if not axis.torque_nm / axis.torque_constant <= current_a * (1 + ROUNDING):
         yield (
             f"has a current limit (`current_soft_max`) of {current_a:.4g} A, which is "
             f"{current_a * axis.torque_constant:.3g} N·m, and its joint may ask for {axis.torque_nm:.3g} N·m: raise "
             f"the one, or lower `torque_nm`. If a driver was killed, it may have left a lower limit: restart the axis"
         )
-    speed = configured[Setting.SPEED]
-    if not axis.speed_limit <= speed * (1 + READING):
+    speed = configured[AxisSetting.SPEED]
+    if not axis.speed_limit <= speed * (1 + ROUNDING):
         yield (
             f"has a speed limit (`vel_limit`) of {speed:.4g} turns/s, and its joint may turn at "
             f"{axis.speed_limit:.4g}: raise the one, or lower `speed_rad_s`"
         )
+
+
+def _join_version(numbers: tuple[int, ...]) -> str:
+    return ".".join(map(str, numbers))

@@ -8,13 +8,19 @@ from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.can_drives.command import run
-from snakesim_can_backend.can_drives.traffic import Traffic
-from snakesim_can_backend.odrive.axes import READING, TWIN_CONSTANT, UNKNOWN_MAX_CURRENT_A, Axes, needed_current_a
+from snakesim_can_backend.can_drives.traffic import CycleTraffic
+from snakesim_can_backend.odrive.axes import (
+    EMULATED_CONSTANT_NM_PER_A,
+    ROUNDING,
+    UNKNOWN_MAX_CURRENT_A,
+    Axes,
+    needed_current_a,
+)
 from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_drivers.emulation.mounted import Mounted
-from snakesim_drivers.kit.drive_settings import who
+from snakesim_drivers.kit.drive_settings import joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -46,19 +52,31 @@ class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
 class OdriveBackend(CanDriveBackend):
     """A `snakesim_hal.backend.Backend` on ODrive axes, real or emulated."""
 
-    Settings, drives, emulator = OdriveSettings, Axes, EmulatedOdrive
-    name, a_drive, last_id, says_every_s = "odrive", "axes", LAST_NODE, HEARTBEAT_US * 1e-6
+    Settings = OdriveSettings
+    drives_class = Axes
+    emulator_class = EmulatedOdrive
+    name = "odrive"
+    plural_noun = "axes"
+    last_id = LAST_NODE
     reserved_ids = "63 is the broadcast address"
-    # A tick is two questions, two answers and an input; of one axis four questions more. Then heartbeats.
-    traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 0, 8, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
+    report_period_s = HEARTBEAT_US * 1e-6
+    traffic = CycleTraffic(
+        each_drive=(0, 0, 8, 8, 8),  # two requests, two answers and an input
+        one_drive=(0, 0, 0, 0, 8, 8, 8, 8),  # four requests and their answers
+        heartbeats_hz=1e6 / HEARTBEAT_US,
+    )
 
     @classmethod
     def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
-        """Raise ConfigError for joints that no axis can be."""
-        where = who(config, joint)
+        """Check that an axis suits a joint.
+
+        Raises:
+            ConfigError: it does not.
+        """
+        where = joint_label(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
             raise ConfigError(f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it")
-        if joint.motor.torque_constant_nm_per_a is None and cls.real(settings):
+        if joint.motor.torque_constant_nm_per_a is None and cls.has_real_bus(settings):
             raise ConfigError(
                 f"{where}: `torque_constant_nm_per_a` is not given, and ODrives measure and limit amperes: take it "
                 f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it"
@@ -67,15 +85,19 @@ class OdriveBackend(CanDriveBackend):
 
     @classmethod
     def check_current(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
-        """Raise ConfigError for a joint that needs more current than the driver may set."""
-        limits_are_read = bool(settings.endpoints) or not cls.real(settings)
+        """Check that a joint needs no more current than the driver may set.
+
+        Raises:
+            ConfigError: it needs more.
+        """
+        limits_are_read = bool(settings.endpoints) or not cls.has_real_bus(settings)
         allowed_a = settings.max_current_a
         if allowed_a is None:
             allowed_a = math.inf if limits_are_read else UNKNOWN_MAX_CURRENT_A
         needed_a = needed_current_a(joint)
-        if needed_a <= allowed_a * (1 + READING):
+        if needed_a <= allowed_a * (1 + ROUNDING):
             return
-        constant = joint.motor.torque_constant_nm_per_a or TWIN_CONSTANT
+        constant = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
         fix = "raise `backends.odrive.max_current_a`, if the axis is configured for more"
         if settings.max_current_a is None:
             fix = (
@@ -83,17 +105,17 @@ class OdriveBackend(CanDriveBackend):
                 "reads what each axis is configured for; or say it in `backends.odrive.max_current_a`"
             )
         raise ConfigError(
-            f"{who(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A at "
-            f"{constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`"
+            f"{joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A "
+            f"at {constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`"
         )
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: OdriveSettings, joints: Sequence[Joint]) -> None:
-        """And the files that say where axes have their settings."""
+        """Check also the endpoint files that the settings name."""
         read_all_endpoints(settings.endpoints)
         super().check_drives(config, settings, joints)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """`snakesim odrives`."""
+    """Run `snakesim odrives`."""
     return run(OdriveBackend, "odrives", argv)

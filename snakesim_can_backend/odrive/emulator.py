@@ -5,42 +5,48 @@ error of overspeed, trajectories, arbitration and bit rate.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.can_drives.emulator import CanEmulator
-from snakesim_can_backend.odrive.axes import TURN, TWIN_CONSTANT, needed_current_a
-from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, Setting, read_all_endpoints
+from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, TURN, needed_current_a
+from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
     PAYLOADS,
     READ_SETTING,
     SDO_HEAD,
-    Control,
-    Error,
-    Message,
-    State,
-    ask,
-    parted,
-    say_setting,
-    write,
+    AxisError,
+    AxisState,
+    ControlMode,
+    MessageId,
+    encode_message,
+    encode_request,
+    encode_setting_answer,
+    split_id,
 )
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-HEARTBEAT_US = 100_000.0
-COUNTS = 16384  # of the encoder, a turn
-VERSION = (2, 4, 4, 58, 0, 6, 11, 0)
+HEARTBEAT_US = 100_000.0  # ODrive's default period
+COUNTS_PER_TURN = 16384  # of the encoder
+VERSION = (2, 4, 4, 58, 0, 6, 11, 0)  # protocol, hardware (3), firmware (3), unreleased
 FIRST_SERIAL = 0x3855_0000_0001
-OTHER_SERIAL = 0x0000_0100_0000  # the difference of a second axis with the same id
-MODES = {Control.TORQUE: Mode.TORQUE, Control.VELOCITY: Mode.VELOCITY, Control.POSITION: Mode.POSITION}
+DUPLICATE_SERIAL_BITS = 0x0000_0100_0000  # in which the serial number of a second axis with the same id differs
+MODES = {
+    ControlMode.TORQUE: Mode.TORQUE,
+    ControlMode.VELOCITY: Mode.VELOCITY,
+    ControlMode.POSITION: Mode.POSITION,
+}
+INPUT_INDEX = {MessageId.SET_TORQUE: 0, MessageId.SET_VELOCITY: 1, MessageId.SET_POSITION: 2}  # `EmulatedAxis.inputs`
 
 
 @dataclass(frozen=True)
-class Configuration:
-    """What an axis has in its memory without power, and begins with."""
+class AxisConfiguration:
+    """What an axis has in its nonvolatile memory, and starts with."""
 
     watchdog_enabled: bool
     watchdog_timeout_s: float
@@ -49,188 +55,226 @@ class Configuration:
 
 
 @dataclass
-class Axis:
+class EmulatedAxis:
     """One axis: settings, inputs, state."""
 
     node: int
-    torque_constant: float
-    saved: Configuration
-    state: int = State.IDLE
+    torque_constant: float  # N·m/A
+    saved: AxisConfiguration
+    # State.
+    state: int = AxisState.IDLE
     errors: int = 0
     disarm_reason: int = 0
-    control: int = Control.POSITION
-    inputs: tuple[float, ...] = (0.0, 0.0, 0.0)  # by `Control`, from torque on: N·m, turns/s, turns
-    position_gain: float = 20.0
-    velocity_gain: float = 0.16
-    fed_us: float = 0.0
+    setpoint_us: float = 0.0  # when the watchdog was fed
+    # Inputs and gains.
+    control: int = ControlMode.POSITION
+    inputs: tuple[float, ...] = (0.0, 0.0, 0.0)  # torque in N·m, velocity in turns/s, position in turns
+    position_gain: float = 20.0  # 1/s
+    velocity_gain: float = 0.16  # N·m / (turn/s)
 
     def __post_init__(self) -> None:
-        """The settings in force are those that are saved; `Set_Limits` changes two of them."""
-        self.watchdog_us = self.saved.watchdog_timeout_s * 1e6 if self.saved.watchdog_enabled else math.inf
+        """Start with the saved settings; `Set_Limits` changes two of them."""
+        self.watchdog_us = math.inf
+        if self.saved.watchdog_enabled:
+            self.watchdog_us = self.saved.watchdog_timeout_s * 1e6
         self.current_soft_max_a = self.saved.current_soft_max_a
         self.vel_limit_turns_s = self.saved.vel_limit_turns_s
 
-    def setting(self, setting: Setting) -> float:
-        """A setting in force."""
+    def read_setting(self, setting: AxisSetting) -> float:
+        """Return the present value of a setting."""
         match setting:
-            case Setting.WATCHDOG_ENABLED:
+            case AxisSetting.WATCHDOG_ENABLED:
                 return self.saved.watchdog_enabled
-            case Setting.WATCHDOG_TIMEOUT:
+            case AxisSetting.WATCHDOG_TIMEOUT:
                 return self.saved.watchdog_timeout_s
-            case Setting.CURRENT:
+            case AxisSetting.CURRENT:
                 return self.current_soft_max_a
-            case Setting.SPEED:
+            case AxisSetting.SPEED:
                 return self.vel_limit_turns_s
 
 
 class EmulatedOdrive(CanEmulator):
     """All axes of a driver type."""
 
-    def __init__(self, everybody: Sequence[Joint], settings: Any, body: EmulatedBody, *ends: Any) -> None:
-        super().__init__(settings, body, *ends)
-        files = read_all_endpoints(settings.endpoints)
-        version = EMULATED.firmware, EMULATED.hardware
-        self._endpoints = next((file for file in files if (file.firmware, file.hardware) == version), EMULATED)
+    def __init__(
+        self,
+        joints: Sequence[Joint],
+        settings: Any,
+        body: EmulatedBody,
+        wires: Sequence[Wire],
+        clock_ns: Callable[[], int],
+    ) -> None:
+        """Start all axes; `joints` are as the robot file describes them, those of the body as they are in truth."""
+        super().__init__(settings, body, wires, clock_ns)
+        self._endpoints = EMULATED
+        for file in read_all_endpoints(settings.endpoints):
+            if (file.firmware, file.hardware) == (EMULATED.firmware, EMULATED.hardware):
+                self._endpoints = file
+                break
         self.axes = [
-            Axis(
-                node=built.id,
-                torque_constant=built.motor.torque_constant_nm_per_a or TWIN_CONSTANT,
-                saved=configuration_of(joint, settings),
+            EmulatedAxis(
+                node=true_joint.id,
+                torque_constant=true_joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
+                saved=make_configuration(joint, settings),
             )
-            for joint, built in zip(everybody, body.joints, strict=True)
+            for joint, true_joint in zip(joints, body.joints, strict=True)
         ]
         self._heartbeat_us = -math.inf
-        self.each_step(0.0)
+        self.on_step(0.0)
 
-    def addressee(self, frame: Frame) -> int:
-        """Its node."""
-        return parted(frame)[0]
+    def find_addressee(self, frame: Frame) -> int:
+        """Return the node of a frame."""
+        node, _ = split_id(frame)
+        return node
 
-    def of_second(self, frame: Frame) -> Frame:
-        """Its own serial number in the address."""
-        if parted(frame)[1] != Message.ADDRESS or not frame.data:
+    def duplicate_frame(self, frame: Frame) -> Frame:
+        """Return the frame of a second axis: it has another serial number in its address."""
+        if split_id(frame)[1] != MessageId.ADDRESS or not frame.data:
             return frame
-        node, serial, connection = PAYLOADS[Message.ADDRESS].unpack(frame.data)
-        other = int.from_bytes(serial, "little") ^ OTHER_SERIAL
-        return write(node, Message.ADDRESS, node, other.to_bytes(6, "little"), connection)
+        node, serial, connection = PAYLOADS[MessageId.ADDRESS].unpack(frame.data)
+        other_serial = int.from_bytes(serial, "little") ^ DUPLICATE_SERIAL_BITS
+        return encode_message(node, MessageId.ADDRESS, node, other_serial.to_bytes(6, "little"), connection)
 
     def restart(self, i: int) -> None:
-        """Settings that were not saved are lost."""
-        self.axes[i] = Axis(self.axes[i].node, self.axes[i].torque_constant, self.axes[i].saved)
-        self._drive(i, self.axes[i])
+        """Restart an axis. It loses the settings that were not saved."""
+        axis = self.axes[i]
+        self.axes[i] = EmulatedAxis(axis.node, axis.torque_constant, axis.saved)
+        self._drive_motor(i, self.axes[i])
 
-    def take(self, i: int, frame: Frame) -> None:
-        """Questions have no data, but for those for settings."""
-        known, axis = Message(parted(frame)[1]), self.axes[i]
-        if known == Message.RX_SDO:
+    def handle_frame(self, i: int, frame: Frame) -> None:
+        """Answer a request or obey a message. Requests have no data, except those for settings."""
+        message = MessageId(split_id(frame)[1])
+        axis = self.axes[i]
+        if message == MessageId.RX_SDO:
             self._answer_setting(i, frame.data)
             return
-        values = PAYLOADS[known].unpack(frame.data) if frame.data else ()
-        if not values and known not in (Message.ESTOP, Message.CLEAR_ERRORS):
-            self.say(i, self._message(i, axis, known))
+        values = PAYLOADS[message].unpack(frame.data) if frame.data else ()
+        if not values and message not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
+            self.send_frame(i, self._make_report(i, axis, message))
         else:
-            self._obey(i, axis, known, values)
+            self._obey(i, axis, message, values)
 
-    def _obey(self, i: int, axis: Axis, message: Message, values: tuple[float, ...]) -> None:
-        match message:
-            case Message.ESTOP:
-                self._fail(i, axis, Error.ESTOP_REQUESTED)
-            case Message.CLEAR_ERRORS:
-                axis.errors = 0
-            case Message.SET_STATE if values[0] == State.CLOSED_LOOP and not axis.errors:
-                axis.fed_us = self.body.now_us
-                axis.state = State.CLOSED_LOOP
-            case Message.SET_STATE:
-                axis.state = State.IDLE
-            case Message.SET_MODE:
-                axis.control = int(values[0])
-            case Message.SET_POSITION | Message.SET_VELOCITY | Message.SET_TORQUE:
-                axis.fed_us = self.body.now_us
-                at = {Message.SET_TORQUE: 0, Message.SET_VELOCITY: 1, Message.SET_POSITION: 2}[message]
-                axis.inputs = (*axis.inputs[:at], values[0], *axis.inputs[at + 1 :])
-            case Message.SET_LIMITS:
-                axis.vel_limit_turns_s, axis.current_soft_max_a = values
-            case Message.SET_POSITION_GAIN:
-                axis.position_gain = values[0]
-            case Message.SET_VELOCITY_GAINS:
-                axis.velocity_gain = values[0]
-            case _:
-                return
-        self._drive(i, axis)
-
-    def _answer_setting(self, i: int, data: bytes) -> None:
-        """Say a setting; an endpoint that there is not is no answer. What others write is out of this emulation."""
-        opcode, endpoint, _ = SDO_HEAD.unpack_from(data)
-        setting, axis = self._endpoints.setting_at(endpoint), self.axes[i]
-        if setting is not None and opcode == READ_SETTING:
-            value = FORMATS[TYPES[setting]].pack(axis.setting(setting))
-            self.say(i, say_setting(axis.node, endpoint, value))
-
-    def _message(self, i: int, axis: Axis, message: Message) -> Frame:
-        angle, velocity, torque = self.body.shaft(i)
-        values: tuple[Any, ...]
-        match message:
-            case Message.VERSION:
-                values = VERSION
-            case Message.ADDRESS:
-                values = axis.node, (FIRST_SERIAL + i).to_bytes(6, "little"), 0
-            case Message.HEARTBEAT:
-                values = axis.errors, axis.state, 0, 0
-            case Message.ERROR:
-                values = axis.errors, axis.disarm_reason
-            case Message.MOTION:
-                values = round(angle / TURN * COUNTS) / COUNTS, velocity / TURN
-            case Message.CURRENT:
-                values = torque / axis.torque_constant, torque / axis.torque_constant
-            case Message.TEMPERATURE:
-                motor_c, board_c = self.body.temperatures(i)
-                values = board_c, motor_c
-            case Message.SUPPLY:
-                values = self.body.supply(i)
-            case _:
-                return ask(axis.node, message)
-        return write(axis.node, message, *values)
-
-    def _drive(self, i: int, axis: Axis) -> None:
-        control = Control(axis.control) if axis.control in list(Control) else Control.TORQUE
-        mode = MODES[control] if axis.state == State.CLOSED_LOOP else Mode.PASSIVE
-        target = axis.inputs[control - 1] * (1.0 if control == Control.TORQUE else TURN)
-        damping = axis.velocity_gain / TURN
-        limit_nm = axis.current_soft_max_a * axis.torque_constant
-        speed_rad_s = axis.vel_limit_turns_s * TURN
-        self.body.drive(i, mode, target if mode else 0.0, limit_nm, axis.position_gain * damping, damping, speed_rad_s)
-
-    def _fail(self, i: int, axis: Axis, error: Error) -> None:
-        axis.errors |= error
-        axis.disarm_reason, axis.state = error, State.IDLE
-        self._drive(i, axis)
-
-    def each_step(self, now_us: float) -> None:
-        """Watchdogs, heat, heartbeats."""
+    def on_step(self, now_us: float) -> None:
+        """Stop axes whose watchdog has expired; at each heartbeat, also those that are too hot."""
         for i, axis in enumerate(self.axes):
-            if axis.state == State.CLOSED_LOOP and now_us - axis.fed_us > axis.watchdog_us:
-                self._fail(i, axis, Error.WATCHDOG_TIMER_EXPIRED)
+            if axis.state == AxisState.CLOSED_LOOP and now_us - axis.setpoint_us > axis.watchdog_us:
+                self._fail(i, axis, AxisError.WATCHDOG_TIMER_EXPIRED)
         if now_us - self._heartbeat_us < HEARTBEAT_US:
             return
         self._heartbeat_us = now_us
         for i, axis in enumerate(self.axes):
-            if self.body.too_hot(i):
-                self._fail(i, axis, Error.MOTOR_OVER_TEMP)
-            self.say(i, self._message(i, axis, Message.HEARTBEAT))
+            if self.body.is_too_hot(i):
+                self._fail(i, axis, AxisError.MOTOR_OVER_TEMP)
+            self.send_frame(i, self._make_report(i, axis, MessageId.HEARTBEAT))
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _obey(self, i: int, axis: EmulatedAxis, message: MessageId, values: tuple[float, ...]) -> None:
+        match message:
+            case MessageId.ESTOP:
+                self._fail(i, axis, AxisError.ESTOP_REQUESTED)
+            case MessageId.CLEAR_ERRORS:
+                axis.errors = 0
+            case MessageId.SET_STATE if values[0] == AxisState.CLOSED_LOOP and not axis.errors:
+                axis.setpoint_us = self.body.now_us
+                axis.state = AxisState.CLOSED_LOOP
+            case MessageId.SET_STATE:
+                axis.state = AxisState.IDLE
+            case MessageId.SET_MODE:
+                axis.control = int(values[0])
+            case MessageId.SET_POSITION | MessageId.SET_VELOCITY | MessageId.SET_TORQUE:
+                axis.setpoint_us = self.body.now_us
+                index = INPUT_INDEX[message]
+                axis.inputs = (*axis.inputs[:index], values[0], *axis.inputs[index + 1 :])
+            case MessageId.SET_LIMITS:
+                axis.vel_limit_turns_s, axis.current_soft_max_a = values
+            case MessageId.SET_POSITION_GAIN:
+                axis.position_gain = values[0]
+            case MessageId.SET_VELOCITY_GAINS:
+                axis.velocity_gain = values[0]
+            case _:
+                return
+        self._drive_motor(i, axis)
+
+    def _answer_setting(self, i: int, data: bytes) -> None:
+        """Answer a request for a setting; unknown endpoints get no answer, and writing is not emulated."""
+        opcode, endpoint, _ = SDO_HEAD.unpack_from(data)
+        setting = self._endpoints.setting_at(endpoint)
+        axis = self.axes[i]
+        if setting is not None and opcode == READ_SETTING:
+            value = FORMATS[TYPES[setting]].pack(axis.read_setting(setting))
+            self.send_frame(i, encode_setting_answer(axis.node, endpoint, value))
+
+    def _make_report(self, i: int, axis: EmulatedAxis, message: MessageId) -> Frame:
+        """Return a message in which an axis reports its state; without data if it does not know the message."""
+        angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
+        values: tuple[Any, ...]
+        match message:
+            case MessageId.VERSION:
+                values = VERSION
+            case MessageId.ADDRESS:
+                values = (axis.node, (FIRST_SERIAL + i).to_bytes(6, "little"), 0)
+            case MessageId.HEARTBEAT:
+                values = (axis.errors, axis.state, 0, 0)
+            case MessageId.ERROR:
+                values = (axis.errors, axis.disarm_reason)
+            case MessageId.MOTION:
+                counts = round(angle_rad / TURN * COUNTS_PER_TURN)
+                values = (counts / COUNTS_PER_TURN, velocity_rad_s / TURN)
+            case MessageId.CURRENT:
+                current_a = torque_nm / axis.torque_constant
+                values = (current_a, current_a)
+            case MessageId.TEMPERATURE:
+                motor_c, board_c = self.body.read_temperatures(i)
+                values = (board_c, motor_c)
+            case MessageId.SUPPLY:
+                values = self.body.read_supply(i)
+            case _:
+                return encode_request(axis.node, message)
+        return encode_message(axis.node, message, *values)
+
+    def _drive_motor(self, i: int, axis: EmulatedAxis) -> None:
+        """Apply what an axis controls to its motor. An unknown control mode counts as torque control."""
+        control = ControlMode.TORQUE
+        if axis.control in list(ControlMode):
+            control = ControlMode(axis.control)
+        mode = Mode.PASSIVE
+        target = 0.0
+        if axis.state == AxisState.CLOSED_LOOP:
+            mode = MODES[control]
+            unit = 1.0 if control == ControlMode.TORQUE else TURN
+            target = axis.inputs[control - 1] * unit
+        damping = axis.velocity_gain / TURN
+        self.body.drive_motor(
+            i,
+            mode,
+            target,
+            limit_nm=axis.current_soft_max_a * axis.torque_constant,
+            stiffness=axis.position_gain * damping,
+            damping=damping,
+            speed_rad_s=axis.vel_limit_turns_s * TURN,
+        )
+
+    def _fail(self, i: int, axis: EmulatedAxis, error: AxisError) -> None:
+        axis.errors |= error
+        axis.disarm_reason = error
+        axis.state = AxisState.IDLE
+        self._drive_motor(i, axis)
 
 
-def configuration_of(joint: Joint, settings: Any) -> Configuration:
+def make_configuration(joint: Joint, settings: Any) -> AxisConfiguration:
     """Return what an axis is configured for: what its joint in the robot file needs, unless the scenario differs."""
     mounted = settings.mounted.get(joint.name)
-    watchdog_s, current_a, speed = settings.watchdog_s, needed_current_a(joint), joint.limits.speed_rad_s
-    return Configuration(
-        watchdog_enabled=_said(mounted, "watchdog_timeout_s", watchdog_s) > 0,
-        watchdog_timeout_s=_said(mounted, "watchdog_timeout_s", watchdog_s),
-        current_soft_max_a=_said(mounted, "current_soft_max_a", current_a),
-        vel_limit_turns_s=_said(mounted, "vel_limit_turns_s", speed * joint.drive.gear / TURN),
+    speed_turns_s = joint.limits.speed_rad_s * joint.drive.gear / TURN
+    watchdog_timeout_s = _read_mounted(mounted, "watchdog_timeout_s", settings.watchdog_s)
+    return AxisConfiguration(
+        watchdog_enabled=watchdog_timeout_s > 0,
+        watchdog_timeout_s=watchdog_timeout_s,
+        current_soft_max_a=_read_mounted(mounted, "current_soft_max_a", needed_current_a(joint)),
+        vel_limit_turns_s=_read_mounted(mounted, "vel_limit_turns_s", speed_turns_s),
     )
 
 
-def _said(mounted: Any, field: str, otherwise: float) -> float:
-    value = getattr(mounted, field, None)  # beside drives of other types the scenario has no such fields
-    return otherwise if value is None else value
+def _read_mounted(mounted: Any, field: str, default: float) -> float:
+    value = getattr(mounted, field, None)  # in the backend `mixed` the scenario has no such fields
+    return default if value is None else value

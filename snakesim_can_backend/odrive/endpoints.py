@@ -15,7 +15,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_text
 
 
-class Setting(StrEnum):
+class AxisSetting(StrEnum):
     """Settings of an axis, by their paths in `odrivetool`."""
 
     WATCHDOG_ENABLED = "axis0.config.enable_watchdog"
@@ -25,10 +25,10 @@ class Setting(StrEnum):
 
 
 TYPES = {
-    Setting.WATCHDOG_ENABLED: "bool",
-    Setting.WATCHDOG_TIMEOUT: "float",
-    Setting.CURRENT: "float",
-    Setting.SPEED: "float",
+    AxisSetting.WATCHDOG_ENABLED: "bool",
+    AxisSetting.WATCHDOG_TIMEOUT: "float",
+    AxisSetting.CURRENT: "float",
+    AxisSetting.SPEED: "float",
 }
 FORMATS = {"bool": Struct("<?"), "float": Struct("<f")}
 
@@ -39,15 +39,15 @@ class Endpoints:
 
     firmware: str  # such as 0.6.11
     hardware: str  # such as 4.4.58
-    ids: Mapping[Setting, int]
+    ids: Mapping[AxisSetting, int]
 
-    def setting_at(self, endpoint: int) -> Setting | None:
+    def setting_at(self, endpoint: int) -> AxisSetting | None:
         """Return the setting with this endpoint id; None: it is none of those."""
         return next((setting for setting, number in self.ids.items() if number == endpoint), None)
 
 
 # Of emulated axes. The numbers are their own: no firmware of ODrive has them.
-EMULATED = Endpoints("0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(Setting)})
+EMULATED = Endpoints("0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(AxisSetting)})
 
 
 class _Endpoint(msgspec.Struct):
@@ -76,8 +76,8 @@ def read_endpoints(path: str) -> Endpoints:
         raise ConfigError(f"{where}: {error}; {advice}") from None
     except (msgspec.DecodeError, RecursionError) as error:
         raise ConfigError(f"{where}: {path}: {error}; {advice}") from None
-    ids: dict[Setting, int] = {}
-    for setting in Setting:
+    ids: dict[AxisSetting, int] = {}
+    for setting in AxisSetting:
         endpoint = file.endpoints.get(setting)
         if endpoint is None or not 0 <= endpoint.id <= 0xFFFF:
             raise ConfigError(f"{where}: {path} has no endpoint {setting} with an id of 0 to 65535; {advice}")

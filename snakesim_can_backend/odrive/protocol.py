@@ -1,4 +1,6 @@
-"""CANSimple: an id is node << 5 | message, all numbers little-endian, a question is the message without data.
+"""CANSimple: messages of ODrive axes as bytes.
+
+An id is node << 5 | message. All numbers are little-endian. A request is the message without data.
 
 Written from ODrive's public documentation; tests hold it against the database that ODrive publishes.
 """
@@ -13,14 +15,14 @@ LAST_NODE = 62
 FIRMWARE = (0, 6)
 
 
-class Message(IntEnum):
+class MessageId(IntEnum):
     """The low five bits of an id."""
 
     VERSION = 0x00
     HEARTBEAT = 0x01
     ESTOP = 0x02
     ERROR = 0x03
-    RX_SDO = 0x04  # a question for a setting, or a new value of one
+    RX_SDO = 0x04  # request for a setting, or a new value of one
     TX_SDO = 0x05  # the answer
     ADDRESS = 0x06
     SET_STATE = 0x07
@@ -38,14 +40,14 @@ class Message(IntEnum):
     SET_VELOCITY_GAINS = 0x1B
 
 
-class State(IntEnum):
-    """Of an axis; others are calibrations."""
+class AxisState(IntEnum):
+    """The states of an axis that are used here; others are calibrations."""
 
     IDLE = 1
     CLOSED_LOOP = 8
 
 
-class Control(IntEnum):
+class ControlMode(IntEnum):
     """What an axis controls."""
 
     TORQUE = 1
@@ -56,7 +58,7 @@ class Control(IntEnum):
 PASSTHROUGH = 1  # input mode: an input acts at once
 
 
-class Error(IntFlag):
+class AxisError(IntFlag):
     """Bits of the active errors, firmware 0.6."""
 
     INITIALIZING = 0x1
@@ -85,65 +87,70 @@ class Error(IntFlag):
 
 
 PAYLOADS = {
-    Message.VERSION: Struct("<8B"),  # protocol, hardware (3), firmware (3), unreleased
-    Message.HEARTBEAT: Struct("<IBBBx"),  # active errors, state, result of the last procedure, trajectory done
-    Message.ESTOP: Struct(""),
-    Message.ERROR: Struct("<II"),  # active errors, reason of the last disarming
-    Message.ADDRESS: Struct("<B6sB"),  # node, serial number, connection; only of 0.6: a command in 0.5
-    Message.SET_STATE: Struct("<I"),
-    Message.MOTION: Struct("<ff"),  # turns, turns/s
-    Message.SET_MODE: Struct("<II"),  # what it controls, input mode
-    Message.SET_POSITION: Struct("<fhh"),  # turns; feed-forward of velocity and torque, by 0.001
-    Message.SET_VELOCITY: Struct("<ff"),  # turns/s, feed-forward of torque, N·m
-    Message.SET_TORQUE: Struct("<f"),  # N·m
-    Message.SET_LIMITS: Struct("<ff"),  # turns/s, A
-    Message.CURRENT: Struct("<ff"),  # Iq asked for and measured, A
-    Message.TEMPERATURE: Struct("<ff"),  # of the power stage and of the motor, °C
-    Message.SUPPLY: Struct("<ff"),  # V, A
-    Message.CLEAR_ERRORS: Struct(""),
-    Message.SET_POSITION_GAIN: Struct("<f"),  # (turns/s) / turn
-    Message.SET_VELOCITY_GAINS: Struct("<ff"),  # N·m / (turn/s), and of the integral
+    MessageId.VERSION: Struct("<8B"),  # protocol, hardware (3), firmware (3), unreleased
+    MessageId.HEARTBEAT: Struct("<IBBBx"),  # active errors, state, result of the last procedure, trajectory done
+    MessageId.ESTOP: Struct(""),
+    MessageId.ERROR: Struct("<II"),  # active errors, reason of the last disarming
+    MessageId.ADDRESS: Struct("<B6sB"),  # node, serial number, connection; only of 0.6: a command in 0.5
+    MessageId.SET_STATE: Struct("<I"),
+    MessageId.MOTION: Struct("<ff"),  # turns, turns/s
+    MessageId.SET_MODE: Struct("<II"),  # what it controls, input mode
+    MessageId.SET_POSITION: Struct("<fhh"),  # turns; feed-forward of velocity and torque, by 0.001
+    MessageId.SET_VELOCITY: Struct("<ff"),  # turns/s, feed-forward of torque, N·m
+    MessageId.SET_TORQUE: Struct("<f"),  # N·m
+    MessageId.SET_LIMITS: Struct("<ff"),  # turns/s, A
+    MessageId.CURRENT: Struct("<ff"),  # Iq: setpoint and measured, A
+    MessageId.TEMPERATURE: Struct("<ff"),  # of the power stage and of the motor, °C
+    MessageId.SUPPLY: Struct("<ff"),  # V, A
+    MessageId.CLEAR_ERRORS: Struct(""),
+    MessageId.SET_POSITION_GAIN: Struct("<f"),  # (turns/s) / turn
+    MessageId.SET_VELOCITY_GAINS: Struct("<ff"),  # N·m / (turn/s), and of the integral
 }
-READ_SETTING, WRITE_SETTING = 0, 1  # first byte of RxSdo
+READ_SETTING = 0  # first byte of RxSdo
+WRITE_SETTING = 1
 SDO_HEAD = Struct("<BHB")  # opcode, or reserved in an answer; endpoint id; reserved. The value follows
-FROM_HOST = frozenset(message for message in Message if message.name.startswith("SET_")) | {
-    Message.ESTOP,
-    Message.CLEAR_ERRORS,
-}
+SETTERS = frozenset(message for message in MessageId if message.name.startswith("SET_"))
+FROM_HOST = SETTERS | {MessageId.ESTOP, MessageId.CLEAR_ERRORS}  # messages that only a host sends
 
 
-def write(node: int, message: Message, *values: float | bytes) -> Frame:
-    """A message of, or to, an axis."""
+def encode_message(node: int, message: MessageId, *values: float | bytes) -> Frame:
+    """Return a message of, or to, an axis."""
     return Frame(node << NODE_BITS | message, PAYLOADS[message].pack(*values))
 
 
-def ask(node: int, message: Message) -> Frame:
-    """The question for a message."""
+def encode_request(node: int, message: MessageId) -> Frame:
+    """Return the request for a message: the message without data."""
     return Frame(node << NODE_BITS | message, b"")
 
 
-def read_setting(node: int, endpoint: int) -> Frame:
-    """Return the question for the setting with an endpoint id."""
-    return Frame(node << NODE_BITS | Message.RX_SDO, SDO_HEAD.pack(READ_SETTING, endpoint, 0))
+def encode_setting_request(node: int, endpoint: int) -> Frame:
+    """Return the request for the setting with an endpoint id."""
+    return Frame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEAD.pack(READ_SETTING, endpoint, 0))
 
 
-def say_setting(node: int, endpoint: int, value: bytes) -> Frame:
-    """Return an axis' answer to that question."""
-    return Frame(node << NODE_BITS | Message.TX_SDO, SDO_HEAD.pack(0, endpoint, 0) + value)
+def encode_setting_answer(node: int, endpoint: int, value: bytes) -> Frame:
+    """Return an axis' answer to the request for a setting."""
+    return Frame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEAD.pack(0, endpoint, 0) + value)
 
 
-def setting_of(data: bytes) -> tuple[int, bytes]:
-    """Return endpoint id and value of the answer. Raises struct.error."""
+def decode_setting_answer(data: bytes) -> tuple[int, bytes]:
+    """Return endpoint id and value of an answer with a setting.
+
+    Raises:
+        struct.error: the answer is too short.
+    """
     _, endpoint, _ = SDO_HEAD.unpack_from(data)
     return endpoint, data[SDO_HEAD.size :]
 
 
-def parted(frame: Frame) -> tuple[int, int]:
-    """Node and message of a frame."""
+def split_id(frame: Frame) -> tuple[int, int]:
+    """Return node and message number of a frame."""
     return frame.id >> NODE_BITS, frame.id & ((1 << NODE_BITS) - 1)
 
 
-def names(errors: int) -> str:
-    """Error bits in words; empty for none."""
-    said = [error.name.lower() for error in Error if errors & error and error.name]
-    return ", ".join(said) or (f"0x{errors:x}" if errors else "")
+def describe_errors(errors: int) -> str:
+    """Return the error bits in words; empty if there are none."""
+    known = [error.name.lower() for error in AxisError if errors & error and error.name]
+    if known:
+        return ", ".join(known)
+    return f"0x{errors:x}" if errors else ""

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_drivers.emulation.mounted import Mounted, as_built, built
+from snakesim_drivers.emulation.mounted import Mounted, build_config, build_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import joint_target
 from snakesim_hal.base.errors import ConfigError
@@ -36,11 +36,11 @@ def make_physics_model(config: RunConfig, settings: Any, backend: str) -> Physic
     factory: Any = find_plugin(PLANTS, settings.physics_model)
     source, where = f"physics_model {settings.physics_model!r}", f"backends.{backend}.physics_model_settings"
     own = plugin_settings(factory, settings.physics_model_settings, source, where)
-    truth = as_built(config, settings.mounted)
+    truth = build_config(config, settings.mounted)
     backlash_rad = {name: one.backlash_rad for name, one in settings.mounted.items() if one.backlash_rad}
     if not backlash_rad:
         return factory(truth, own)
-    joints = built(config.robot, settings.mounted)
+    joints = build_joints(config.robot, settings.mounted)
     physics_model = factory(without_rotors(truth, joints, backlash_rad), own)
     return BacklashPlant(physics_model, joints, backlash_rad, config.seed)
 
@@ -56,7 +56,7 @@ def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callab
         wait(POLL_S)
 
 
-class Motion:
+class SharedPhysics:
     """PhysicsModel, motors, heat and camera, on one clock: what all emulated drives of a robot share."""
 
     def __init__(
@@ -67,8 +67,11 @@ class Motion:
         send_pose: Callable[[bytes], None] | None,
     ) -> None:
         """mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period."""
-        self.physics_model, self.joints = physics_model, built(config.robot, mounted)
-        self.motors, self.thermal = Motors(as_built(config, mounted).robot, physics_model.step_s), Thermal(self.joints)
+        self.physics_model, self.joints = physics_model, build_joints(config.robot, mounted)
+        self.motors, self.thermal = (
+            Motors(build_config(config, mounted).robot, physics_model.step_s),
+            Thermal(self.joints),
+        )
         self.now_us, self.each_step = 0.0, list[Callable[[float], None]]()
         self.boots_until_us = [0.0] * len(self.joints)
         self.muted: set[int] = set()
@@ -102,7 +105,7 @@ class Motion:
                 each(self.now_us)
         if self._camera is not None and self._send_pose is not None and self.now_us >= self._pose_us - 1:
             self._pose_us += self._period_us
-            if (sample := self._camera.look(round(self.now_us * 1000))) is not None:
+            if (sample := self._camera.capture(round(self.now_us * 1000))) is not None:
                 self._send_pose(msgspec.json.encode(sample))
 
     def _warm(self) -> None:
@@ -114,7 +117,7 @@ class Motion:
 class EmulatedBody:
     """The body, and motors in it: all, or those of one driver type. Drives are numbered tail to head; idle at first."""
 
-    def __init__(self, motion: Motion, at: Sequence[int]) -> None:
+    def __init__(self, motion: SharedPhysics, at: Sequence[int]) -> None:
         """at: the numbers that these drives have in the robot."""
         self._all, self._at = motion, list(at)
         self.physics_model, self.motors, self.thermal, self.lock = (
@@ -125,7 +128,7 @@ class EmulatedBody:
         )
         self.joints = [motion.joints[j] for j in at]
 
-    def part(self, which: Sequence[int]) -> "EmulatedBody":
+    def select(self, which: Sequence[int]) -> "EmulatedBody":
         """The same body for emulators that are some of its drives, which they number from 0."""
         return EmulatedBody(self._all, [self._at[i] for i in which])
 
@@ -134,11 +137,11 @@ class EmulatedBody:
         """Since the emulators were started."""
         return self._all.now_us
 
-    def each_step(self, act: Callable[[float], None]) -> None:
+    def add_step_callback(self, act: Callable[[float], None]) -> None:
         """From now on called with the drives' own time, in us, at each step: watchdogs, and messages that are due."""
         self._all.each_step.append(act)
 
-    def leave(self, act: Callable[[float], None]) -> None:
+    def remove_step_callback(self, act: Callable[[float], None]) -> None:
         """No longer."""
         with self.lock:
             self._all.each_step.remove(act)
@@ -151,7 +154,7 @@ class EmulatedBody:
         """Physics until then. Emulators of several buses hold the `lock` while they act, as those may be in threads."""
         self._all.advance_to(clock_us)
 
-    def drive(
+    def drive_motor(
         self, i: int, mode: Mode, target: float, limit_nm: float, stiffness: float, damping: float, speed_rad_s: float
     ) -> None:
         """What a drive demands of its motor; all numbers at its shaft, in SI units."""
@@ -161,32 +164,32 @@ class EmulatedBody:
         kp, kd, speed_rad_s = stiffness * gear**2, damping * gear**2, speed_rad_s / gear
         self.motors.drive(self._at[i], mode, target, limit_nm * gear, kp, kd, speed_rad_s)
 
-    def shaft(self, i: int) -> tuple[float, float, float]:
+    def read_shaft(self, i: int) -> tuple[float, float, float]:
         """Angle, velocity and torque of a drive's shaft."""
         drive = self.joints[i].drive
         turns, j = drive.sign * drive.gear, self._at[i]
         angle_rad, velocity_rad_s = float(self.physics_model.angle_rad[j]), float(self.physics_model.velocity_rad_s[j])
         return drive.zero_rad + turns * angle_rad, turns * velocity_rad_s, float(self.motors.torque_nm[j]) / turns
 
-    def supply(self, i: int) -> tuple[float, float]:
+    def read_supply(self, i: int) -> tuple[float, float]:
         """Voltage and current of a drive."""
         supply, j = self.joints[i].supply, self._at[i]
         power_w = self.thermal.power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s)[j]
         voltage_v = WEAK_V if j in self._all.weak else supply.voltage_v
         return voltage_v, supply.idle_a + float(power_w) / voltage_v
 
-    def too_hot(self, i: int) -> bool:
+    def is_too_hot(self, i: int) -> bool:
         """Whether a drive's winding is at `stop_at_c`."""
         j = self._at[i]
         return bool(self.thermal.winding_c[j] >= self.thermal.stop_at_c[j])
 
     # --- faults ----------------------------------------------------------------------------------------------
 
-    def silent(self, i: int) -> bool:
+    def is_silent(self, i: int) -> bool:
         """Whether a drive says nothing now."""
-        return self._at[i] in self._all.muted or self.deaf(i)
+        return self._at[i] in self._all.muted or self.is_booting(i)
 
-    def deaf(self, i: int) -> bool:
+    def is_booting(self, i: int) -> bool:
         """Whether a drive hears nothing now: it boots."""
         return self.now_us < self._all.boots_until_us[self._at[i]]
 
@@ -213,35 +216,35 @@ class EmulatedBody:
                 self.thermal.inject(j, heat=begins, hold=begins and injection.end_s != math.inf)
             case _:
                 if begins:
-                    self.boot(i)
+                    self.start_boot(i)
                     return i
         return None
 
-    def boot(self, i: int) -> None:
+    def start_boot(self, i: int) -> None:
         """A drive restarts now; until it has, it neither hears nor says anything."""
         self._all.boots_until_us[self._at[i]] = self.now_us + BOOT_US
 
-    def temperatures(self, i: int) -> tuple[float, float]:
+    def read_temperatures(self, i: int) -> tuple[float, float]:
         """Of a drive's winding, and of its electronics."""
         j = self._at[i]
         return float(self.thermal.winding_c[j]), float(self.thermal.board_c()[j])
 
 
-class EmulatedDrive(ABC):
+class DriveEmulator(ABC):
     """Emulated drives of one type on their body. A type implements the abstract methods; i: a drive, tail to head."""
 
     def __init__(self, body: EmulatedBody, ends: Sequence[Any], clock_ns: Callable[[], int]) -> None:
         """ends: of every joint's bus, which this one closes; clock_ns: the time, since anything."""
         self.body, self._clock_ns, self._start_ns = body, clock_ns, clock_ns()
         self._ends: list[Any] = list({id(end): end for end in ends}.values())  # each once
-        body.each_step(self.each_step)
+        body.add_step_callback(self.on_step)
 
     @abstractmethod
     def restart(self, i: int) -> None:
         """A drive begins anew."""
 
     @abstractmethod
-    def each_step(self, now_us: float) -> None:
+    def on_step(self, now_us: float) -> None:
         """Time has passed: watchdogs, heat, reports that are due."""
 
     def catch_up(self) -> None:
@@ -269,6 +272,6 @@ class EmulatedDrive(ABC):
 
     def close(self) -> None:
         """Leave the buses."""
-        self.body.leave(self.each_step)
+        self.body.remove_step_callback(self.on_step)
         for end in self._ends:
             end.close()

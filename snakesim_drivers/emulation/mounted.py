@@ -45,7 +45,7 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     backlash_rad: Backlash | None = None
 
 
-def built(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
+def build_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
     """Every joint with its drive and motor as they are in truth, tail to head."""
     joints = robot.joint_table
     for i, joint in enumerate(joints):
@@ -57,7 +57,7 @@ def built(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
     return joints
 
 
-def as_built(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
+def build_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
     """The run's configuration for the physics model that the drives move: with their motors as they are in truth."""
     joints = dict(config.robot.joints)
     for name, truth in mounted.items():

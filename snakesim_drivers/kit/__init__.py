@@ -1,13 +1,22 @@
 """What every driver of real joints needs besides its protocol.
 
-`drive_backend`   a complete backend around `Drives`: lifecycle, isolation, faults, ages, sensors
-`buses`           several buses, each with its drives and, in real time, in a thread of its own
-`drive_type`      parameters, checks and buses of a driver type    `mixed`   a robot with drives of several types
+A driver type implements two interfaces, each in one file:
+
+`drives`          `Drives`: every method that the drives of a bus need, with its arguments, call order and thread
+`drive_type`      `DriverTypeBackend`: parameters, checks and buses of a driver type
+
+The rest is the same for all driver types:
+
+`drive_backend`   a complete backend around `Drives`: lifecycle, isolation, faults, sensors
+`mixed`           a robot with drives of several types
+`drive_settings`  settings that every driver type has
+`bus`             one bus with its drives              `threaded_bus`    the same in a thread of its own
+`buses`           all buses of a robot
 `drive_guard`     keeps a drive that stopped by itself off until reset and arming
+`drive_states`    which drives should follow setpoints, which do, and which must be commanded again
 `braking`         how long drives brake after a fault
-`drive_settings`  parameters that every driver type has
-`following`       which drives should follow setpoints, which do, and which must be commanded again
-`readings`        what the drives measured, with ages              `findings`   faults, each reported once
+`readings`        what the drives measured, with ages
+`findings`        faults, each reported once
 
 Imports no bus, host or network.
 """

@@ -1,22 +1,22 @@
-"""A whole backend over a driver type of drives. The driver type speaks the protocol, in `Drives`; all else is here.
+"""A whole backend around the drives of a robot. A driver type implements `drives.Drives`; all else is here.
 
-A tick: every drive is asked what it measures, and answers; it then gets its setpoint, which holds until the next. All
-numbers between here and a driver type are those of the drives' shafts, in SI units.
+In each control cycle every drive is read, and then gets its setpoint, which holds until the next one. All numbers
+between here and the drives are those at the drives' shafts, in SI units.
 """
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import msgspec
 import numpy as np
 
 from snakesim_drivers.kit.braking import Braking
-from snakesim_drivers.kit.findings import Finding, Told
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.drive_guard import NO_DRIVES, RESET_GRACE_CYCLES
+from snakesim_drivers.kit.drives import Drives
+from snakesim_drivers.kit.findings import Finding, ReportedFindings
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_hal.backend import SafeSetpoints, Samples
-from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.robot import identified
@@ -24,110 +24,80 @@ from snakesim_hal.model.scenario import RunConfig, description_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Message, Mode, SensorDescription
 
-LATCHED = ("fault", "estop")
-SILENT_AFTER = 3  # questions without an answer
-CLEAR_GRACE = 5  # periods in which errors of drives may be of before a clear
-HEALTH_ROUNDS = 3  # in which a drive may not say its health before that is unknown
+LATCHED_STATES = ("fault", "estop")  # only the operator's reset ends them
+SILENT_AFTER_REQUESTS = 3  # unanswered ones: a single lost answer is no fault
+HEALTH_ROUNDS = 3  # one round asks each drive for its health once; after so many without an answer it is unknown
 
 
-class Drives(Protocol):
-    """The drives of one driver type on their buses, tail to head. Every method returns within a period."""
-
-    emulated: bool  # nothing real moves
-
-    def bring_up(self) -> None:
-        """Find every drive, check it, write its settings; nothing is enabled. May take long. Raises BackendError."""
-        ...
-
-    def read(self) -> None:
-        """Ask every drive, and put what it says into the readings; does not wait for silent ones."""
-        ...
-
-    def command(
-        self,
-        following: frozenset[int],
-        modes: list[Mode],
-        targets: Floats,
-        limits_nm: Floats,
-        *,
-        may_enable: bool,
-        emergency: bool,
-    ) -> None:
-        """SafeSetpoints of the drives that follow; any other is to be idle, and is told again if it is not.
-
-        A drive that begins to follow is enabled after it has its setpoint. may_enable: the robot is armed; otherwise
-        a drive that is not on stays off. emergency: by the drives' own stop.
-        """
-        ...
-
-    def clear(self, joints: frozenset[int]) -> None:
-        """The fault was cleared: clear errors of these drives, and write settings that a restart may have lost."""
-        ...
-
-    def findings(self) -> list[Finding]:
-        """What is wrong now with drives and buses; a silent drive need not be among it."""
-        ...
-
-    def let_run(self) -> None:
-        """Receive; drives that are emulated in this process run, up to the present time."""
-        ...
-
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of a bus or of drives emulated here; False for any other."""
-        ...
-
-    def close(self) -> None:
-        """Motors off, buses closed; safe in every state."""
-        ...
-
-
-class Clock:
-    """The time of a driver: a steady clock, or in lockstep the robot's own time, which `sample` sets."""
+class DriverClock:
+    """The time of a driver: a steady clock, or in lockstep the robot's own time, which `DriveBackend` sets."""
 
     def __init__(self, config: RunConfig) -> None:
-        self._lockstep, self.robot_ns = config.clock_mode == "lockstep", 0
+        self._lockstep = config.clock_mode == "lockstep"
+        self.robot_ns = 0
 
-    def ns(self) -> int:
-        """Now."""
+    def now_ns(self) -> int:
+        """Return the present time in ns."""
         return self.robot_ns if self._lockstep else time.monotonic_ns()
 
 
 class DriveBackend:
-    """A `snakesim_hal.backend.Backend`. What a driver type with more than `Drives` may add is at the end."""
+    """A `snakesim_hal.backend.Backend` on drives. The hooks at the end are for driver types that need more."""
 
-    clear_grace = CLEAR_GRACE
+    reset_grace_cycles = RESET_GRACE_CYCLES
 
     def __init__(
         self,
         config: RunConfig,
         name: str,
         hardware: str,
-        clock: Clock,
+        clock: DriverClock,
         mocap: MocapReceiver | None,
-        make_drives: Callable[[Readings], Drives],
+        make_drives: Callable[[DriveReadings], Drives],
         watchdogs_s: Sequence[float],
         decimation: int = 1,
     ) -> None:
-        """make_drives: opens the buses; watchdogs_s: of every joint's drive; decimation: of the slowest bus.
+        """Open the buses and bring up every drive; no drive is enabled.
 
-        Raises ConfigError and BackendError.
+        Args:
+            config: The run.
+            name: Name of the backend.
+            hardware: What the backend drives, such as can0+can1; empty if the drives are emulated.
+            clock: The driver's time.
+            mocap: Receives the base pose; None without motion capture. This object closes it.
+            make_drives: Opens the buses.
+            watchdogs_s: Time of each joint's watchdog, from tail to head.
+            decimation: Control cycles from one reading of the slowest bus to the next.
+
+        Raises:
+            ConfigError: the configuration does not suit the drives.
+            BackendError: a bus cannot be opened, or a drive is missing.
         """
         joints = config.robot.joint_table
-        self._clock, self._mocap, self._open = clock, mocap, True
-        self._period_ns, self._lease_ns, self._every = config.period_ns, config.lease_ns, decimation
-        self._names = [joint.name for joint in joints]
-        self._readings = Readings(joints, clock.ns)
-        self._mounting = self._readings.mounting
+        # Configuration.
+        self._joint_names = [joint.name for joint in joints]
         self._max_isolated = config.robot.safety.max_isolated_joints
-        self._told = Told()
+        self._period_ns = config.period_ns
+        self._lease_ns = config.lease_ns
+        self._decimation = decimation
+        # Measurements.
+        self._clock = clock
+        self._mocap = mocap
+        self._readings = DriveReadings(joints, clock.now_ns)
+        self._mounting = self._readings.mounting
+        # Lifecycle.
+        self._open = True
+        self._tick = 0
+        self._lifecycle: LifecycleState = "disarmed"
+        self._following = NO_DRIVES
         self._braking = Braking(
             [round(watchdog_s * 1e9) for watchdog_s in watchdogs_s], holds=config.robot.safety.action == "hold"
         )
-        self._lifecycle: LifecycleState = "disarmed"
-        self._following: frozenset[int] = frozenset()
-        self._isolated: frozenset[int] = frozenset()
-        self._pending: frozenset[int] = frozenset()  # just reported as failed: their isolation is expected
-        self._tick, self._quiet = 0, 0
+        # Faults.
+        self._reported = ReportedFindings()
+        self._isolated = NO_DRIVES
+        self._pending = NO_DRIVES  # just reported as failed: the HAL is expected to isolate them
+        self._grace_cycles = 0  # left, in which drives may report errors from before a reset
         try:
             self._drives = make_drives(self._readings)
         except BaseException:
@@ -139,34 +109,34 @@ class DriveBackend:
         except BaseException:
             self.close()
             raise
-        described = self._describe(config, name, hardware)
-        self._description = identified(described, self._readings.serials, self._readings.firmware)
+        description = self._make_description(config, name, hardware)
+        self._description = identified(description, self._readings.serials, self._readings.firmware)
 
     def describe(self) -> Description:
-        """The robot of the robot file, with the sensors that its drives are."""
+        """Return the robot of the robot file, with the sensors and serial numbers of its drives."""
         return self._description
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """Ask all drives."""
-        self._must_be_open()
-        self._tick, self._clock.robot_ns, self._quiet = tick, timestamp_ns, self._quiet - 1
-        self._readings.ask()
+        """Read all drives and return what they measure."""
+        self._require_open()
+        self._tick = tick
+        self._clock.robot_ns = timestamp_ns
+        self._grace_cycles -= 1
+        self._readings.count_request()
         self._drives.read()
-        return self._samples(tick, timestamp_ns)
+        return self._make_samples(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """Armed: all that are not isolated follow. At fault those go on that did, while they brake."""
+        """Send setpoints to the drives that follow in this lifecycle state, and switch off the others."""
         if not self._open:
             return
-        self._announce(lifecycle, setpoints.isolated)
-        back = (self._isolated | self._pending) - setpoints.isolated
-        self._isolated, self._pending = setpoints.isolated, frozenset()
-        everybody = frozenset(range(len(self._names))) - self._isolated
-        if lifecycle not in LATCHED and (back or self._lifecycle in LATCHED):
-            self._told.forget()
-            self._drives.clear(everybody if self._lifecycle in LATCHED else back)
-            self._quiet = self.clear_grace * self._every
-        self._following = self._joints_to_drive(lifecycle, everybody, setpoints.mode)
+        self._send_lifecycle(lifecycle, setpoints.isolated)
+        returned = (self._isolated | self._pending) - setpoints.isolated
+        self._isolated = setpoints.isolated
+        self._pending = NO_DRIVES
+        connected = frozenset(range(len(self._joint_names))) - self._isolated
+        self._reset_faults(lifecycle, connected, returned)
+        self._following = self._joints_to_drive(lifecycle, connected, setpoints.mode)
         self._lifecycle = lifecycle
         self._drives.command(
             self._following,
@@ -178,38 +148,37 @@ class DriveBackend:
         )
 
     def advance(self) -> None:
-        """Time passes by itself; in lockstep, by a period."""
-        self._must_be_open()
+        """Receive what has arrived. In lockstep the robot's time passes by one control cycle."""
+        self._require_open()
         self._clock.robot_ns += self._period_ns
-        self._drives.let_run()
+        self._drives.poll()
 
     def faults(self) -> list[Fault]:
-        """New ones since the last call."""
+        """Return the faults that are new since the last call. One that affects the whole robot stops it at once."""
         if not self._open:
             return []
-        found = [*self._drives.findings(), *self._silent()]
-        found = [finding for finding in found if not (finding.alone and finding.joint in self._isolated)]
-        if self._quiet > 0:
-            found = [finding for finding in found if finding.joint is None]
-        fresh = self._told.fresh(found)
-        failed = frozenset(finding.joint for finding in fresh if finding.joint is not None)
-        few = len(self._isolated | failed) <= self._max_isolated
-        if self._lifecycle == "armed" and few and all(finding.alone for finding in fresh):
-            self._pending |= failed  # the HAL isolates them
-        elif fresh and self._lifecycle not in LATCHED:
+        new_findings = self._reported.filter_new(self._relevant_findings())
+        failed = frozenset(finding.joint for finding in new_findings if finding.joint is not None)
+        if self._can_isolate(new_findings, failed):
+            self._pending |= failed
+        elif new_findings and self._lifecycle not in LATCHED_STATES:
             try:
-                self._announce("fault", self._isolated)
+                self._send_lifecycle("fault", self._isolated)
             except BackendError as error:  # the faults are reported all the same; the failing bus raises again
-                fresh.append(Finding("stop_not_sent", str(error)))
-            self._lifecycle = "fault"  # from now on only a clear ends it, also one before the next period
-        return [finding.fault(self._tick, self._names) for finding in fresh]
+                new_findings.append(Finding("stop_not_sent", str(error)))
+            self._lifecycle = "fault"  # from now on only a reset ends it, also one before the next control cycle
+        return [finding.to_fault(self._tick, self._joint_names) for finding in new_findings]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Injects faults of buses and of drives emulated here. Raises ConfigError."""
+        """Begin or end a fault of a bus or of a drive that is emulated here; return False for any other fault.
+
+        Raises:
+            ConfigError: the fault cannot be injected into this robot.
+        """
         return self._drives.inject(injection, begins=begins)
 
     def close(self) -> None:
-        """Motors off, buses closed."""
+        """Switch all motors off and close the buses."""
         if not self._open:
             return
         self._open = False
@@ -222,7 +191,10 @@ class DriveBackend:
     def _joints_to_drive(
         self, lifecycle: LifecycleState, connected: frozenset[int], modes: Sequence[Mode]
     ) -> frozenset[int]:
-        """Return the joints whose drives get setpoints in this lifecycle state. A fault begins with no new one."""
+        """Return the joints whose drives get setpoints in this lifecycle state.
+
+        In a fault these are the joints that followed before it and still brake: no other joint begins to follow.
+        """
         if lifecycle != "fault":
             self._braking.reset()
         match lifecycle:
@@ -230,51 +202,103 @@ class DriveBackend:
                 return connected
             case "fault":
                 speeds = self._mounting.joint_velocity_rad_s(self._readings.velocity_rad_s)
-                return self._braking.joints(connected & self._following, modes, speeds, self._clock.ns())
+                followed_before = connected & self._following
+                return self._braking.select_braking_joints(followed_before, modes, speeds, self._clock.now_ns())
             case _:
-                return frozenset()
+                return NO_DRIVES
 
-    def _must_be_open(self) -> None:
+    def _reset_faults(self, lifecycle: LifecycleState, connected: frozenset[int], returned: frozenset[int]) -> None:
+        """Clear errors of drives after the operator's reset: it ends a latched state, or the isolation of joints.
+
+        Args:
+            lifecycle: The new lifecycle state.
+            connected: Joints that are not isolated.
+            returned: Joints that were isolated until now, or should have been.
+        """
+        if lifecycle in LATCHED_STATES:
+            return
+        was_latched = self._lifecycle in LATCHED_STATES
+        if not was_latched and not returned:
+            return
+        self._reported.reset()
+        self._drives.reset_faults(connected if was_latched else returned)
+        self._grace_cycles = self.reset_grace_cycles * self._decimation
+
+    def _relevant_findings(self) -> list[Finding]:
+        """Return what is wrong now, without isolated joints and without errors that may be from before a reset."""
+        findings = [*self._drives.findings(), *self._find_silent_drives()]
+        relevant: list[Finding] = []
+        for finding in findings:
+            is_known = finding.alone and finding.joint in self._isolated
+            is_outdated = self._grace_cycles > 0 and finding.joint is not None
+            if not is_known and not is_outdated:
+                relevant.append(finding)
+        return relevant
+
+    def _can_isolate(self, findings: list[Finding], failed: frozenset[int]) -> bool:
+        """Return whether the robot stays armed without the failed joints: the HAL isolates them then."""
+        if self._lifecycle != "armed":
+            return False
+        if len(self._isolated | failed) > self._max_isolated:
+            return False
+        return all(finding.alone for finding in findings)
+
+    def _require_open(self) -> None:
         if not self._open:
             raise BackendError("the buses are closed; open a new backend")
 
-    def _describe(self, config: RunConfig, name: str, hardware: str) -> Description:
-        plain = description_of(config, name, emulated=self._drives.emulated)
-        camera = config.robot.sensors.pose
-        delay_s = camera.delay_s if self._mocap is not None and camera is not None else None
-        return msgspec.structs.replace(plain, sensors=self._described(config, delay_s), hardware=hardware)
+    def _make_description(self, config: RunConfig, name: str, hardware: str) -> Description:
+        description = description_of(config, name, emulated=self._drives.emulated)
+        pose_sensor = config.robot.sensors.pose
+        pose_delay_s = None
+        if self._mocap is not None and pose_sensor is not None:
+            pose_delay_s = pose_sensor.delay_s
+        sensors = self._describe_sensors(config, pose_delay_s)
+        return msgspec.structs.replace(description, sensors=sensors, hardware=hardware)
 
-    # --- what a driver type may replace ------------------------------------------------------------------------------
+    # --- hooks that a driver type may replace -----------------------------------------------------------------
 
-    def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
-        """Before anything else of a tick, and at once for a fault: for drives that know the robot's lifecycle."""
+    def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+        """Send the robot's lifecycle state to drives that have such states of their own.
 
-    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
-        """Joints and other sensors, from what was read."""
+        Called before anything else that a control cycle sends, and at once when a fault is found.
+        """
+
+    def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
+        """Return the joint state and the other sensors that are due, from what was read."""
         others: dict[str, Message] = {}
-        if tick % len(self._names) == 0:
-            lasts_ns = HEALTH_ROUNDS * len(self._names) * self._every * self._period_ns
-            others[keys.POWER] = self._readings.power(tick, timestamp_ns, lasts_ns)
-        if self._mocap is not None and (pose := self._mocap.newest(tick, timestamp_ns)) is not None:
-            others[keys.POSE] = pose
-        return Samples(self._readings.joints(tick, timestamp_ns, self._lease_ns), others)
+        if tick % len(self._joint_names) == 0:
+            max_age_ns = HEALTH_ROUNDS * len(self._joint_names) * self._decimation * self._period_ns
+            others[keys.POWER] = self._readings.power(tick, timestamp_ns, max_age_ns)
+        if self._mocap is not None:
+            pose = self._mocap.read_newest(tick, timestamp_ns)
+            if pose is not None:
+                others[keys.POSE] = pose
+        return Samples(self._readings.joint_state(tick, timestamp_ns, self._lease_ns), others)
 
-    def _silent(self) -> list[Finding]:
-        """Drives that do not answer."""
-        found: list[Finding] = []
-        for i, name in enumerate(self._names):
-            if self._readings.unanswered(i) >= SILENT_AFTER:
+    def _find_silent_drives(self) -> list[Finding]:
+        """Return a finding for each drive that has left several requests unanswered."""
+        findings: list[Finding] = []
+        for i, name in enumerate(self._joint_names):
+            if self._readings.unanswered_requests(i) >= SILENT_AFTER_REQUESTS:
                 silent_ms = self._readings.age_ns(i) * 1e-6
                 cause = f"{name}: its drive has not answered for {silent_ms:.0f} ms: power, cable, id or a restart"
-                found.append(Finding("drive_silent", cause, i, alone=True))
-        return found
+                findings.append(Finding("drive_silent", cause, i, alone=True))
+        return findings
 
-    def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
-        """The sensors; pose_delay_s: of motion capture, None without it."""
+    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+        """Return the sensors with their rates and delays.
+
+        Args:
+            config: The run.
+            pose_delay_s: Delay of motion capture; None without it.
+        """
         rate_hz = config.rate_hz
-        delay_s = (self._every - 1) / rate_hz
-        sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=delay_s)]
-        sensors.append(SensorDescription(key=keys.POWER, rate_hz=rate_hz / len(self._names), delay_s=0.0))
+        delay_s = (self._decimation - 1) / rate_hz
+        sensors = [
+            SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=delay_s),
+            SensorDescription(key=keys.POWER, rate_hz=rate_hz / len(self._joint_names), delay_s=0.0),
+        ]
         if pose_delay_s is not None:
             sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=pose_delay_s))
         return sensors

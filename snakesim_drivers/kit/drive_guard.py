@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterable
 from snakesim_drivers.kit.findings import Finding
 
 NO_DRIVES: frozenset[int] = frozenset()
+RESET_GRACE_CYCLES = 5  # control cycles after a reset in which drives may still report errors from before it
 
 
 class DriveGuard:
-    """The drives of one bus, by their numbers on it."""
+    """The drives of one bus, by their indices on it."""
 
     def __init__(self, clock_ns: Callable[[], int], *, gap_ns: int, grace_ns: int) -> None:
         """Start with drives that were just brought up, none of them driven.
@@ -29,15 +30,15 @@ class DriveGuard:
         self._active_ns: int | None = None  # when the driver last used the bus
         self._reset_ns: int | None = None
         self._away = False
-        # Drives, until they are let go or reset.
+        # Drives, until they are released or reset.
         self._driven = NO_DRIVES
         self._stopped = NO_DRIVES
-        self._starved = False  # whether the bus has let its drives go while the robot was armed
+        self._starved = False  # whether the bus has released its drives while the robot was armed
 
     # --- pauses of the driver --------------------------------------------------------------------------------
 
     def mark_active(self) -> None:
-        """Note that the driver runs now. A pause before it is remembered until `states_were_read`."""
+        """Note that the driver runs now. A pause before it is remembered until `mark_states_read`."""
         now_ns = self._clock_ns()
         if self._active_ns is not None and now_ns - self._active_ns > self._gap_ns:
             self._away = True
@@ -48,16 +49,18 @@ class DriveGuard:
         """Whether watchdogs of drives may have expired since their states were read last."""
         return self._away
 
-    def states_were_read(self) -> None:
-        """Note that the driver has asked every drive for its state after the pause."""
+    def mark_states_read(self) -> None:
+        """Note that the driver requests the state of every drive after the pause."""
         self._away = False
 
-    # --- who is driven ---------------------------------------------------------------------------------------
+    # --- which drives are driven -----------------------------------------------------------------------------
 
     def drives_to_command(self, wanted: frozenset[int], *, may_enable: bool) -> frozenset[int]:
         """Return those of the wanted drives that get setpoints now.
 
-        may_enable: whether the robot is armed. Otherwise only drives go on that are driven already.
+        Args:
+            wanted: The drives that should follow setpoints.
+            may_enable: Whether the robot is armed. Otherwise only drives that are driven already stay driven.
         """
         if self._starved:
             self._driven = NO_DRIVES
@@ -67,8 +70,12 @@ class DriveGuard:
             self._driven &= wanted - self._stopped
         return self._driven
 
-    def let_go(self) -> bool:
-        """Note that the bus lets its drives go by itself; whether any was driven. None is driven before a reset."""
+    def release_drives(self) -> bool:
+        """Note that the bus switches its drives off by itself. No drive is driven again before a reset.
+
+        Returns:
+            Whether any drive was driven until now.
+        """
         had_driven = bool(self._driven)
         self._driven = NO_DRIVES
         self._starved |= had_driven

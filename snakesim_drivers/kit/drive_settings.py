@@ -1,11 +1,11 @@
-"""What the scenario may say about any driver type of drives, and checks of it."""
+"""Settings that every driver type has in the scenario, and checks of them before a start."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any
 
 from msgspec import Meta
 
-from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, Motion, make_physics_model
+from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, SharedPhysics, make_physics_model
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_drivers.motion_capture.mocap import check_pose
@@ -15,14 +15,14 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
-ANSWERS_WITHIN = 0.5  # of a period: the rest is for the controller
-LOCKSTEP_ANSWER_S = 2.0
-MIN_PERIODS = 2.2  # in a watchdog's time
-MIN_ROUNDS = 1.5  # of a bus in a lease: its joint states have to be younger
+ANSWER_PERIODS = 0.5  # control cycles that drives have for an answer: the rest is for the controller
+LOCKSTEP_ANSWER_S = 2.0  # robot time does not pass while the driver waits, so a busy computer changes nothing
+MIN_WATCHDOG_PERIODS = 2.2  # setpoint periods in a watchdog's time: one lost setpoint must not stop a drive
+MIN_LEASE_ROUNDS = 1.5  # readings of a bus in a lease: its joint states have to be younger than a lease
 
 
 class BodySettings(FileStruct, frozen=True, kw_only=True):
-    """Fields that concern a robot as a whole, whatever its drives."""
+    """Settings that concern a robot as a whole, whatever its drives."""
 
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None  # of motion capture: HOST:PORT
     physics_model: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.physics_models`
@@ -31,83 +31,127 @@ class BodySettings(FileStruct, frozen=True, kw_only=True):
 
 
 class DriveSettings(BodySettings, frozen=True, kw_only=True):
-    """Fields that the settings of every driver type have; a driver type adds its ports."""
+    """Settings that every driver type has; a driver type adds its ports."""
 
     watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1  # of the drives
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    decimation: Annotated[int, Meta(ge=1, le=100)] = 1  # of the run: how often its buses ask and tell
+    decimation: Annotated[int, Meta(ge=1, le=100)] = 1  # control cycles from one reading of a bus to the next
 
 
-def body_of(config: RunConfig, settings: BodySettings, backend: str, pose: str | None) -> EmulatedBody:
-    """What emulated drives move. pose: where its motion capture sends, HOST:PORT. Raises ConfigError."""
+def make_body(config: RunConfig, settings: BodySettings, backend: str, pose_address: str | None) -> EmulatedBody:
+    """Create the body that the emulated drives of a whole robot move.
+
+    Args:
+        config: The run.
+        settings: The settings of the backend.
+        backend: The backend's name.
+        pose_address: HOST:PORT to which its emulated motion capture sends; None: it does not send.
+
+    Raises:
+        ConfigError: the physics model is unknown, or the address is malformed.
+    """
     physics_model = make_physics_model(config, settings, backend)
-    motion = Motion(config, physics_model, settings.mounted, PoseSender(pose) if pose else None)
-    return EmulatedBody(motion, range(config.robot.chain.modules))
+    send_pose = PoseSender(pose_address) if pose_address else None
+    physics = SharedPhysics(config, physics_model, settings.mounted, send_pose)
+    return EmulatedBody(physics, range(config.robot.chain.modules))
 
 
 def check_body(
     config: RunConfig, settings: BodySettings, *, emulators: bool, buses: int, bus_faults: Collection[str] = ()
 ) -> None:
-    """Raise ConfigError for what no robot of drives could do.
+    """Check motion capture, mounting and the faults that the scenario injects.
 
-    emulators: emulated drives are in this process; bus_faults: injected kinds.
+    Args:
+        config: The run.
+        settings: The settings of the backend.
+        emulators: Whether this process emulates the drives.
+        buses: How many buses the settings name.
+        bus_faults: Kinds of faults that can be injected into these buses.
+
+    Raises:
+        ConfigError: a setting or a fault does not suit the robot.
     """
     check_pose(config, settings.pose_listen)
     check_mounted(config.robot, config.backend_section, settings.mounted, emulators=emulators)
-    does = {*bus_faults, *(FAULTS if emulators else ())}
-    because = (
-        f"its emulated drives know {', '.join(FAULTS)}" if emulators else "its drives are not emulated in its process"
-    )
+    possible_faults = {*bus_faults}
+    if emulators:
+        possible_faults |= {*FAULTS}
+        because = f"its emulated drives know {', '.join(FAULTS)}"
+    else:
+        because = "its drives are not emulated in its process"
     if config.clock_mode == "lockstep" and emulators:
         because += "; and in lockstep no bus is slow"
     else:
-        does.add("slow")
-    check_backend_can(config, does=does, buses=max(buses, 1), because=because)
+        possible_faults.add("slow")
+    check_backend_can(config, does=possible_faults, buses=max(buses, 1), because=because)
 
 
 def check_buses(
     config: RunConfig, settings: DriveSettings, section: str, joints: Sequence[Joint], ports: Collection[str]
 ) -> None:
-    """Raise ConfigError for ports that are not there, and for times that do not suit each other.
+    """Check the ports of joints, the watchdog time and the rate of the buses.
 
-    section: of the settings; ports: names that a joint's `port` may be.
+    Args:
+        config: The run.
+        settings: The settings of the driver type.
+        section: Where the scenario has them, for messages.
+        joints: The joints of the driver type.
+        ports: The names that a joint's `port` may be.
+
+    Raises:
+        ConfigError: a port does not exist, or times do not suit each other.
     """
     for joint in joints:
         if joint.drive.port and joint.drive.port not in ports:
             raise ConfigError(
-                f"{who(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
+                f"{joint_label(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
                 f"`{section}`: {', '.join(ports) or 'none'}"
             )
-    every, min_s = settings.decimation, MIN_PERIODS * settings.decimation / config.rate_hz
-    if settings.watchdog_s < min_s:
-        often = f" and `decimation` = {every}" if every > 1 else ""
-        raise ConfigError(
-            f"`{section}.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}{often}: "
-            f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more"
-        )
-    most = int(config.lease_ns / (MIN_ROUNDS * config.period_ns))
-    if every > most:
-        raise ConfigError(
-            f"`{section}.decimation` = {every} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
-            f"{1000 * every / config.rate_hz:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; "
-            f"at most {most}"
-        )
+    _check_watchdog(config, settings, section)
+    _check_decimation(config, settings.decimation, section)
+
+
+def _check_watchdog(config: RunConfig, settings: DriveSettings, section: str) -> None:
+    decimation = settings.decimation
+    min_s = MIN_WATCHDOG_PERIODS * decimation / config.rate_hz
+    if settings.watchdog_s >= min_s:
+        return
+    decimation_text = f" and `decimation` = {decimation}" if decimation > 1 else ""
+    raise ConfigError(
+        f"`{section}.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}{decimation_text}: "
+        f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more"
+    )
+
+
+def _check_decimation(config: RunConfig, decimation: int, section: str) -> None:
+    max_decimation = int(config.lease_ns / (MIN_LEASE_ROUNDS * config.period_ns))
+    if decimation <= max_decimation:
+        return
+    age_ms = 1000 * decimation / config.rate_hz
+    raise ConfigError(
+        f"`{section}.decimation` = {decimation} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
+        f"{age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}"
+    )
 
 
 def answer_limit_s(config: RunConfig, decimation: int = 1) -> float:
-    """How long a tick, or a bus, may wait for answers; in lockstep a busy computer changes nothing."""
+    """Return how long a bus may wait for the answers of its drives."""
     if config.clock_mode == "lockstep":
         return LOCKSTEP_ANSWER_S
-    return ANSWERS_WITHIN * decimation * config.period_ns * 1e-9
+    return ANSWER_PERIODS * decimation * config.period_ns * 1e-9
 
 
-def port_of(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
-    """Number of every joint's bus: its `port`, or an even share of these joints from the tail; 0 without ports."""
+def assign_ports(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
+    """Return for every joint the index of its port.
+
+    A joint without a `port` gets the port of its share: joints are distributed evenly, from the tail on. Without any
+    ports all joints get index 0.
+    """
     numbers = {port: i for i, port in enumerate(ports)}
-    each = -(-len(joints) // max(len(ports), 1))
-    return [numbers.get(joint.drive.port, i // each) for i, joint in enumerate(joints)]
+    joints_per_port = -(-len(joints) // max(len(ports), 1))  # rounded up
+    return [numbers.get(joint.drive.port, i // joints_per_port) for i, joint in enumerate(joints)]
 
 
-def who(config: RunConfig, joint: Joint) -> str:
-    """A joint, as messages name it."""
+def joint_label(config: RunConfig, joint: Joint) -> str:
+    """Return a joint with its robot, as messages name it."""
     return f"robot {config.robot.name!r}, {joint.name}"

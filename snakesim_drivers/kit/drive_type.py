@@ -1,7 +1,7 @@
 """A backend over drives of one type, or of several: settings, checks before a start, and the buses that it opens.
 
-A driver type is a class below `DriverTypeBackend`. As a backend it has all joints of a robot; beside others, in
-`mixed`, those whose `driver` is its name.
+A driver type is a subclass of `DriverTypeBackend`. If it is the backend of a run, it drives all joints of the robot. In
+the backend `mixed` it drives those whose `driver` is its name.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -10,11 +10,20 @@ from functools import partial
 from typing import Any, ClassVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.kit.buses import Bus, Buses
-from snakesim_drivers.kit.drive_backend import Clock, DriveBackend, Drives
-from snakesim_drivers.kit.drive_settings import DriveSettings, body_of, check_body, check_buses, port_of, who
-from snakesim_drivers.kit.readings import Readings
-from snakesim_drivers.motion_capture.mocap import receiver
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.buses import Buses
+from snakesim_drivers.kit.drive_backend import DriveBackend, DriverClock
+from snakesim_drivers.kit.drive_settings import (
+    DriveSettings,
+    assign_ports,
+    check_body,
+    check_buses,
+    joint_label,
+    make_body,
+)
+from snakesim_drivers.kit.drives import Drives
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_drivers.motion_capture.mocap import make_receiver
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -23,117 +32,192 @@ from snakesim_hal.wire.messages import ClockMode
 
 
 @dataclass(frozen=True)
-class Part:
+class DriverTypePart:
     """The joints of a robot that are of one driver type."""
 
     driver_type: "type[DriverTypeBackend]"
-    settings: Any  # the driver_type's own `Settings`
+    settings: Any  # of the driver type's own `Settings`
     section: str  # where they are in the scenario
-    joints: Mapping[int, Joint]  # by their numbers in the robot
+    joints: Mapping[int, Joint]  # by their indices in the robot
 
     @property
     def ports(self) -> Sequence[str]:
-        """Its buses."""
+        """The names of its buses; empty: its drives are emulated in this process."""
         return self.driver_type.ports(self.settings)
 
 
 class DriverTypeBackend(DriveBackend):
-    """A `snakesim_hal.backend.Backend` on drives, real or emulated. A driver type gives what is declared first."""
+    """A `snakesim_hal.backend.Backend` on drives, real or emulated.
 
-    Settings: ClassVar[type[Any]]  # `BodySettings`; of drives, `DriveSettings`
+    A driver type sets the two class variables and implements the four class methods that raise NotImplementedError.
+    The host's thread calls them before and while the backend is opened.
+    """
+
+    Settings: ClassVar[type[Any]]  # a subclass of `BodySettings`; of a driver type, of `DriveSettings`
     name: ClassVar[str]  # of the backend, and of the driver type in a robot file
 
     @classmethod
     def ports(cls, settings: Any) -> Sequence[str]:
-        """Names of the buses in its settings; empty: its drives are emulated, here."""
+        """Return the names of the buses in the settings; empty: the drives are emulated in this process."""
         raise NotImplementedError
 
     @classmethod
     def bus_faults(cls, settings: Any) -> Collection[str]:
-        """Kinds that can be injected into its buses."""
+        """Return the kinds of faults that can be injected into the buses."""
         raise NotImplementedError
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
-        """Raise ConfigError for joints that no drive of this type can be, and for buses that cannot carry them."""
+        """Check that drives of this type suit the joints, and that the buses can carry their messages.
+
+        Raises:
+            ConfigError: a joint, or the load of a bus, does not suit this driver type.
+        """
         raise NotImplementedError
 
     @classmethod
     def buses(
-        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: EmulatedBody | None
-    ) -> list[Bus]:
-        """Each bus that has some of the joints. body: of these joints, if their drives are emulated here."""
+        cls,
+        config: RunConfig,
+        settings: Any,
+        joints: Mapping[int, Joint],
+        clock: DriverClock,
+        body: EmulatedBody | None,
+    ) -> list[BusSpec]:
+        """Return the buses that have some of the joints; `BusSpec.open` opens them later.
+
+        Args:
+            config: The run.
+            settings: The settings of this driver type.
+            joints: Its joints, by their indices in the robot.
+            clock: The driver's time.
+            body: The body that these joints' drives move if they are emulated here; None: they are on a bus.
+        """
         raise NotImplementedError
 
-    # --- of all driver types ----------------------------------------------------------------------------------------
+    # --- the same for all driver types ------------------------------------------------------------------------
 
     @classmethod
-    def parts(cls, config: RunConfig, settings: Any) -> list[Part]:
-        """The robot, by driver types. Raises ConfigError."""
+    def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
+        """Return the joints of each driver type; here all are of this one.
+
+        Raises:
+            ConfigError: the robot file names another driver type for a joint.
+        """
         joints = dict(enumerate(config.robot.joint_table))
         for joint in joints.values():
             if joint.drive.driver not in ("", cls.name):
                 raise ConfigError(
-                    f"{who(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
+                    f"{joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
                     f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
                 )
-        return [Part(cls, settings, config.backend_section, joints)]
+        return [DriverTypePart(cls, settings, config.backend_section, joints)]
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
-        """Drives on a bus support real time only; emulated ones in this process lockstep, too. Raises ConfigError."""
+        """Check the configuration of a run, without opening anything.
+
+        Returns:
+            The clock modes that are possible: drives on a bus support real time only.
+
+        Raises:
+            ConfigError: the configuration does not suit the drives.
+        """
         check_gains(config.robot)
-        parts = cls.parts(config, settings)
-        here = not any(part.ports for part in parts)
-        bus_faults = set[str].intersection(*({*part.driver_type.bus_faults(part.settings)} for part in parts))
-        buses = sum(max(len(part.ports), 1) for part in parts)
-        check_body(config, settings, emulators=here, buses=buses, bus_faults=bus_faults)
+        parts = cls.split_by_driver_type(config, settings)
+        emulated_here = _are_emulated_here(parts)
+        possible_faults = [{*part.driver_type.bus_faults(part.settings)} for part in parts]
+        common_faults = set[str].intersection(*possible_faults)
+        bus_count = sum(max(len(part.ports), 1) for part in parts)
+        check_body(config, settings, emulators=emulated_here, buses=bus_count, bus_faults=common_faults)
         for part in parts:
             joints = list(part.joints.values())
             check_buses(config, part.settings, part.section, joints, part.ports)
             part.driver_type.check_drives(config, part.settings, joints)
-        return ("lockstep", "realtime") if here else ("realtime",)
+        return ("lockstep", "realtime") if emulated_here else ("realtime",)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:
-        """Open the buses and find every drive; nothing is enabled. Raises ConfigError and BackendError."""
+        """Open the buses and bring up every drive; no drive is enabled.
+
+        Raises:
+            ConfigError: the configuration does not suit the drives.
+            BackendError: a bus cannot be opened, or a drive is missing.
+        """
         self.check(config, settings)
-        parts, clock = self.parts(config, settings), Clock(config)
-        here = not any(part.ports for part in parts)
-        mocap = receiver(config, settings.pose_listen, emulators=here, clock=lambda _timestamp_ns: clock.ns())
+        parts = self.split_by_driver_type(config, settings)
+        clock = DriverClock(config)
+        emulated_here = _are_emulated_here(parts)
+        mocap = make_receiver(
+            config, settings.pose_listen, emulators=emulated_here, clock=lambda _timestamp_ns: clock.now_ns()
+        )
 
-        def open_buses(readings: Readings) -> Buses:
-            pose = mocap.address if mocap is not None else None
-            whole = body_of(config, settings, self.name, pose) if here else None
-            buses: list[Bus] = []
+        def open_buses(readings: DriveReadings) -> Buses:
+            body = None
+            if emulated_here:
+                pose_address = mocap.address if mocap is not None else None
+                body = make_body(config, settings, self.name, pose_address)
+            specs: list[BusSpec] = []
             for part in parts:
-                body = whole.part(list(part.joints)) if whole is not None else None
-                buses += part.driver_type.buses(config, part.settings, part.joints, clock, body)
-            return Buses(config, readings, buses, clock.ns)
+                part_body = body.select(list(part.joints)) if body is not None else None
+                specs += part.driver_type.buses(config, part.settings, part.joints, clock, part_body)
+            return Buses(config, readings, specs, clock.now_ns)
 
-        hardware = "+".join(port for part in parts for port in part.ports)
-        slowest = max(self.decimation(part.settings) for part in parts)
-        watchdog_s = {joint: part.settings.watchdog_s for part in parts for joint in part.joints}
-        watchdogs_s = [watchdog_s[joint] for joint in range(len(watchdog_s))]
-        super().__init__(config, self.name, hardware, clock, mocap, open_buses, watchdogs_s, slowest)
+        super().__init__(
+            config,
+            self.name,
+            hardware="+".join(port for part in parts for port in part.ports),
+            clock=clock,
+            mocap=mocap,
+            make_drives=open_buses,
+            watchdogs_s=_list_watchdogs_s(parts),
+            decimation=max(self.decimation(part.settings) for part in parts),
+        )
 
     @staticmethod
     def decimation(settings: DriveSettings) -> int:
-        """Of the run: how often its buses ask and tell."""
+        """Return the number of control cycles from one reading of a bus to the next."""
         return settings.decimation
 
 
-def buses_of(
+def _are_emulated_here(parts: Sequence[DriverTypePart]) -> bool:
+    return not any(part.ports for part in parts)
+
+
+def _list_watchdogs_s(parts: Sequence[DriverTypePart]) -> list[float]:
+    """Return the watchdog time of every joint, from tail to head."""
+    watchdog_s: dict[int, float] = {}
+    for part in parts:
+        for joint in part.joints:
+            watchdog_s[joint] = part.settings.watchdog_s
+    return [watchdog_s[joint] for joint in range(len(watchdog_s))]
+
+
+def group_by_port(
     joints: Mapping[int, Joint],
     settings: DriveSettings,
     ports: Sequence[str],
-    open_drives: Callable[[str, Sequence[int], Readings], Drives],
-) -> list[Bus]:
-    """A bus for each port that has some of the joints, which a driver type opens by its name."""
-    on = port_of(list(joints.values()), ports)
-    found: list[Bus] = []
-    for number, port in enumerate(ports):
-        mine = tuple(j for j, bus in zip(joints, on, strict=True) if bus == number)
-        if mine:
-            open_these = partial(open_drives, port, mine)
-            found.append(Bus(port, mine, open_these, settings.decimation, settings.watchdog_s))
-    return found
+    open_drives: Callable[[str, Sequence[int], DriveReadings], Drives],
+) -> list[BusSpec]:
+    """Return a bus for each port that has some of the joints.
+
+    Args:
+        joints: The joints of a driver type, by their indices in the robot.
+        settings: Its settings.
+        ports: Names of the ports.
+        open_drives: Opens a port, by its name, for joints with these indices.
+    """
+    port_indices = assign_ports(list(joints.values()), ports)
+    specs: list[BusSpec] = []
+    for port_index, port in enumerate(ports):
+        here = tuple(joint for joint, index in zip(joints, port_indices, strict=True) if index == port_index)
+        if here:
+            specs.append(
+                BusSpec(
+                    name=port,
+                    joints=here,
+                    open=partial(open_drives, port, here),
+                    decimation=settings.decimation,
+                    watchdog_s=settings.watchdog_s,
+                )
+            )
+    return specs

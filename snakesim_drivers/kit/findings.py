@@ -1,48 +1,56 @@
-"""What a driver finds wrong, each thing reported once until the robot's fault is cleared. Pure."""
+"""What a driver finds wrong. Each finding is reported once until the operator resets the fault. Pure."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from snakesim_hal.wire.messages import Fault
 
+MAX_CAUSE_CHARACTERS = 500  # the limit of the message `Fault`
+
 
 @dataclass(frozen=True)
 class Finding:
     """One detected fault."""
 
-    what: str
-    cause: str
-    joint: int | None = None  # index, tail to head
-    alone: bool = False  # whether the other joints are not affected
+    what: str  # its kind, such as drive_silent
+    cause: str  # for the operator
+    joint: int | None = None  # index, tail to head; None: the bus
+    alone: bool = False  # True: the other joints are not affected
 
     @property
     def subject(self) -> tuple[str, int | str, bool]:
-        """Findings with the same subject are reported once."""
-        return self.what, self.cause if self.joint is None else self.joint, self.alone
+        """The key by which a finding is reported once: its kind and joint, or its cause if it has no joint."""
+        place = self.cause if self.joint is None else self.joint
+        return self.what, place, self.alone
 
-    def fault(self, tick: int, joints: Sequence[str]) -> Fault:
-        """As the contract has it. joints: names, tail to head."""
+    def to_fault(self, tick: int, joint_names: Sequence[str]) -> Fault:
+        """Return the finding as a message.
+
+        Args:
+            tick: The control cycle in which it was found.
+            joint_names: Names of all joints, from tail to head.
+        """
         return Fault(
             tick=tick,
             what=self.what,
-            cause=self.cause[:500],
-            joint=None if self.joint is None else joints[self.joint],
+            cause=self.cause[:MAX_CAUSE_CHARACTERS],
+            joint=None if self.joint is None else joint_names[self.joint],
             reach="joint" if self.alone else "robot",
         )
 
 
-class Told:
+class ReportedFindings:
     """Remembers which findings have been reported."""
 
     def __init__(self) -> None:
-        self._told: set[tuple[str, int | str, bool]] = set()
+        self._subjects: set[tuple[str, int | str, bool]] = set()
 
-    def fresh(self, found: Iterable[Finding]) -> list[Finding]:
-        """Those that are new; from now on they are not."""
-        fresh = [finding for finding in found if finding.subject not in self._told]
-        self._told.update(finding.subject for finding in fresh)
-        return fresh
+    def filter_new(self, findings: Iterable[Finding]) -> list[Finding]:
+        """Return the findings that have not been reported, and remember them as reported."""
+        new_findings = [finding for finding in findings if finding.subject not in self._subjects]
+        self._subjects.update(finding.subject for finding in new_findings)
+        return new_findings
 
-    def forget(self) -> None:
-        """The fault was cleared: what persists is reported again."""
-        self._told.clear()
+    def reset(self) -> None:
+        """Forget all findings after a reset of the fault: those that persist are reported again."""
+        self._subjects.clear()

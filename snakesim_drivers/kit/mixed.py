@@ -1,7 +1,8 @@
 """The backend `mixed`: a robot with drives of several types, such as a head of servos on ODrive axes.
 
-The robot file says of each joint of what `driver` it is, and each driver type has its own section in the scenario.
-What concerns the whole robot is in `[backends.mixed]`: motion capture, and the body that emulated drives move together.
+The robot file names the driver type of each joint in `driver`, and each driver type has its own section in the
+scenario. What concerns the whole robot is in `[backends.mixed]`: motion capture, and the body that emulated drives
+move together.
 """
 
 from collections.abc import Collection
@@ -10,7 +11,7 @@ from typing import Any
 import msgspec
 
 from snakesim_drivers.kit.drive_settings import BodySettings
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, Part
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
@@ -25,58 +26,79 @@ class MixedSettings(BodySettings, frozen=True, kw_only=True):
 class MixedBackend(DriverTypeBackend):
     """A `snakesim_hal.backend.Backend` on drives of several driver types, real or emulated."""
 
-    Settings, name = MixedSettings, "mixed"
+    Settings = MixedSettings
+    name = "mixed"
 
     @classmethod
-    def parts(cls, config: RunConfig, settings: MixedSettings) -> list[Part]:
-        """The joints of each driver type, with the settings of its section."""
-        driver_types = {joint.drive.driver: driver_type_of(config.robot, joint) for joint in config.robot.joint_table}
-        parts: list[Part] = []
-        for driver_type_name, driver_type in driver_types.items():
-            name = driver_type_name.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
-            section, given = f"backends.{name}", config.backends.get(name, {})
-            joints = {i: j for i, j in enumerate(config.robot.joint_table) if j.drive.driver == driver_type_name}
-            if others := sorted(given.keys() & {*BodySettings.__struct_fields__}):
-                raise ConfigError(
-                    f"`{section}.{others[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-                    f"say `backends.mixed.{others[0]}`"
-                )
-            own = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
-            parts.append(Part(driver_type, own, section, joints))
-        real = [part for part in parts if part.ports]
-        if real and len(real) < len(parts):
-            without = next(part for part in parts if not part.ports)
-            raise ConfigError(
-                f"`{without.section}` names no bus, and `{real[0].section}` does: drives that are emulated here do not "
-                f"move with those on a bus. Name the buses of all driver types, or of none"
-            )
+    def split_by_driver_type(cls, config: RunConfig, settings: MixedSettings) -> list[DriverTypePart]:
+        """Return the joints of each driver type, with the settings of its section.
+
+        Raises:
+            ConfigError: a driver type is unknown, its section is wrong, or only some driver types have a bus.
+        """
+        driver_types = {joint.drive.driver: find_driver_type(config.robot, joint) for joint in config.robot.joint_table}
+        parts = [_make_part(config, driver, driver_type) for driver, driver_type in driver_types.items()]
+        _check_same_world(parts)
         return parts
 
     @staticmethod
     def as_driven(robot: RobotFile) -> RobotFile:
-        """The robot with the modes that each joint has in its driver type, whatever else its file says."""
+        """Return the robot with only those modes that each joint has in its driver type."""
         joints = dict(robot.joints)
         for joint in robot.joint_table:
-            known: Collection[str] | None = getattr(driver_type_of(robot, joint), "MODES", None)
-            if known is not None:
-                modes = [mode for mode in joint.drive.modes if mode in known]
-                joints[joint.name] = msgspec.structs.replace(joints.get(joint.name, JointExceptions()), modes=modes)
+            known_modes: Collection[str] | None = getattr(find_driver_type(robot, joint), "MODES", None)
+            if known_modes is not None:
+                modes = [mode for mode in joint.drive.modes if mode in known_modes]
+                exceptions = joints.get(joint.name, JointExceptions())
+                joints[joint.name] = msgspec.structs.replace(exceptions, modes=modes)
         return msgspec.structs.replace(robot, joints=joints)
 
 
-def driver_type_of(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
-    """Of a joint. Raises ConfigError."""
-    name = joint.drive.driver
+def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
+    """Return the driver type of a joint.
+
+    Raises:
+        ConfigError: the robot file does not name one, or names something else.
+    """
+    driver = joint.drive.driver
     where = f"robot {robot.name!r}, {joint.name}: `driver`"
     fix = f"say it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
-    if not name:
+    if not driver:
         raise ConfigError(f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}")
     try:
-        found: Any = find_plugin(BACKENDS, name)
+        plugin: Any = find_plugin(BACKENDS, driver)
     except ConfigError as error:
-        raise ConfigError(f"{where} = {name!r}: {error}; {fix}") from None
-    if not (isinstance(found, type) and issubclass(found, DriverTypeBackend)) or issubclass(found, MixedBackend):
+        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}") from None
+    is_driver_type = isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)
+    if not is_driver_type or issubclass(plugin, MixedBackend):
         raise ConfigError(
-            f"{where} = {name!r}, a backend that drives whole robots, and no driver type of drives; {fix}"
+            f"{where} = {driver!r}, a backend that drives whole robots, and no driver type of drives; {fix}"
         )
-    return found
+    return plugin
+
+
+def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBackend]) -> DriverTypePart:
+    """Return the joints of a driver type, and its settings from the scenario."""
+    name = driver.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
+    section = f"backends.{name}"
+    given = config.backends.get(name, {})
+    robot_wide = sorted(given.keys() & {*BodySettings.__struct_fields__})
+    if robot_wide:
+        raise ConfigError(
+            f"`{section}.{robot_wide[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
+            f"say `backends.mixed.{robot_wide[0]}`"
+        )
+    settings = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
+    joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
+    return DriverTypePart(driver_type, settings, section, joints)
+
+
+def _check_same_world(parts: list[DriverTypePart]) -> None:
+    """Raise ConfigError if some drives are emulated here and others are on a bus."""
+    on_bus = [part for part in parts if part.ports]
+    emulated = [part for part in parts if not part.ports]
+    if on_bus and emulated:
+        raise ConfigError(
+            f"`{emulated[0].section}` names no bus, and `{on_bus[0].section}` does: drives that are emulated here do "
+            f"not move with those on a bus. Name the buses of all driver types, or of none"
+        )

@@ -1,7 +1,8 @@
-"""What the drives of a robot said, at their shafts, and when: joint states with ages, supply and heat.
+"""What the drives of a robot measured, at their shafts, and when: joint states with ages, supply and temperatures.
 
-A joint whose drive is silent keeps its last values, and their age grows; nothing is invented. Silence is counted in
-questions without an answer, as a computer that stutters asks late, too. What is not finite was not said.
+A joint whose drive is silent keeps its last values, and their age grows; no value is invented. Silence is counted in
+requests without an answer rather than in time, because a computer that pauses also sends its requests late. A value
+that is not finite is ignored, as if the drive had not sent it.
 """
 
 import math
@@ -10,134 +11,186 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from snakesim_drivers.mounting import Mounting
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import JointState, Power
 
-NEVER = -1
-LONG_AGO_NS = 3600 * 10**9
-LATELY = 2  # questions: a drive that has not answered for longer is not waited for
+NEVER = -1  # the time of a value that no drive has sent yet
+UNKNOWN_AGE_NS = 3600 * 10**9  # of a value that no drive has sent yet: older than any lease
+MAX_AWAITED_REQUESTS = 2  # a drive that left more requests unanswered is not waited for
 
 
-class Readings:
-    """The newest values of every drive, tail to head. `clock_ns` is the time at which a value was read."""
+class DriveReadings:
+    """The newest values of every drive, from tail to head. All methods take the index of a drive as `i`."""
 
     def __init__(self, joints: Sequence[Joint], clock_ns: Callable[[], int]) -> None:
+        """Begin without any value.
+
+        Args:
+            joints: The joints of these drives.
+            clock_ns: The time at which values are read.
+        """
         count = len(joints)
-        self.mounting, self._clock_ns = Mounting(joints), clock_ns
-        self._feels = ["torque" in joint.drive.measures for joint in joints]
-        self.angle_rad, self.velocity_rad_s, self.torque_nm = np.zeros(count), np.zeros(count), np.zeros(count)
-        self._motion_ns, self._torque_ns, self._health_ns = ([NEVER] * count for _ in range(3))
-        self._voltage_v, self._current_a, self._motor_c, self._board_c = ([0.0] * count for _ in range(4))
-        self.serials, self.firmware = [""] * count, [""] * count  # empty: the drive does not say it
-        self._asked = LATELY  # questions so far
-        self._motion_at, self._torque_at = [0] * count, [0] * count  # the newest one that was answered
-        self._doubted: set[int] = set()
+        self.mounting = Mounting(joints)
+        self._clock_ns = clock_ns
+        self._measures_torque = ["torque" in joint.drive.measures for joint in joints]
+        # Motion and torque.
+        self.angle_rad: Floats = np.zeros(count)
+        self.velocity_rad_s: Floats = np.zeros(count)
+        self.torque_nm: Floats = np.zeros(count)
+        self._motion_ns = [NEVER] * count
+        self._torque_ns = [NEVER] * count
+        # Supply and temperatures.
+        self._voltage_v = [0.0] * count
+        self._current_a = [0.0] * count
+        self._motor_c = [0.0] * count
+        self._board_c = [0.0] * count
+        self._health_ns = [NEVER] * count
+        # Identity; empty: the drive does not report it.
+        self.serials = [""] * count
+        self.firmware = [""] * count
+        # Requests, by their number.
+        self._request = MAX_AWAITED_REQUESTS  # the newest one
+        self._motion_request = [0] * count  # the newest one that was answered
+        self._torque_request = [0] * count
+        # Drives that may have switched themselves off.
+        self._to_check: set[int] = set()
 
-    # --- what drives say -------------------------------------------------------------------------------------
+    # --- called by the driver when it sends and receives ------------------------------------------------------
 
-    def identified(self, i: int, *, serial: str = "", firmware: str = "") -> None:
-        """In bring-up a drive has said who it is, as far as it does."""
-        self.serials[i], self.firmware[i] = serial or self.serials[i], firmware or self.firmware[i]
+    def set_identity(self, i: int, *, serial: str = "", firmware: str = "") -> None:
+        """Store the serial number and the firmware version of a drive; empty values change nothing."""
+        self.serials[i] = serial or self.serials[i]
+        self.firmware[i] = firmware or self.firmware[i]
 
-    def ask(self) -> None:
-        """All drives are being asked for motion and torque."""
-        self._asked += 1
+    def count_request(self) -> None:
+        """Note that all drives are requested to send motion and torque."""
+        self._request += 1
 
-    def not_asked(self, i: int) -> None:
-        """But this one could not be: its silence means nothing."""
-        self._motion_at[i] += 1
-        self._torque_at[i] += 1
+    def skip_request(self, i: int) -> None:
+        """Note that the newest request did not reach this drive, so that its silence means nothing."""
+        self._motion_request[i] += 1
+        self._torque_request[i] += 1
 
-    def moved(self, i: int, angle_rad: float, velocity_rad_s: float) -> None:
-        """A drive has said where its shaft is."""
+    def set_motion(self, i: int, angle_rad: float, velocity_rad_s: float) -> None:
+        """Store the angle and the velocity of a drive's shaft."""
         if not (math.isfinite(angle_rad) and math.isfinite(velocity_rad_s)):
             return
-        self.angle_rad[i], self.velocity_rad_s[i], self._motion_ns[i] = angle_rad, velocity_rad_s, self._clock_ns()
-        self._motion_at[i] = self._asked
+        self.angle_rad[i] = angle_rad
+        self.velocity_rad_s[i] = velocity_rad_s
+        self._motion_ns[i] = self._clock_ns()
+        self._motion_request[i] = self._request
 
-    def pushed(self, i: int, torque_nm: float) -> None:
-        """A drive has said its torque, at the shaft."""
-        if math.isfinite(torque_nm):
-            self.torque_nm[i], self._torque_ns[i], self._torque_at[i] = torque_nm, self._clock_ns(), self._asked
+    def set_torque(self, i: int, torque_nm: float) -> None:
+        """Store the torque at a drive's shaft."""
+        if not math.isfinite(torque_nm):
+            return
+        self.torque_nm[i] = torque_nm
+        self._torque_ns[i] = self._clock_ns()
+        self._torque_request[i] = self._request
 
-    def supplied(self, i: int, voltage_v: float, current_a: float) -> None:
-        """A drive has said its supply."""
+    def set_supply(self, i: int, voltage_v: float, current_a: float) -> None:
+        """Store the supply of a drive."""
         if math.isfinite(voltage_v) and math.isfinite(current_a):
-            self._voltage_v[i], self._current_a[i] = voltage_v, current_a
+            self._voltage_v[i] = voltage_v
+            self._current_a[i] = current_a
 
-    def warmed(self, i: int, motor_c: float, board_c: float) -> None:
-        """A drive has said its temperatures; with its supply they are its health."""
+    def set_temperatures(self, i: int, motor_c: float, board_c: float) -> None:
+        """Store the temperatures of a drive. They complete its health, so drivers call `set_supply` before."""
         if math.isfinite(motor_c) and math.isfinite(board_c):
-            self._motor_c[i], self._board_c[i], self._health_ns[i] = motor_c, board_c, self._clock_ns()
+            self._motor_c[i] = motor_c
+            self._board_c[i] = board_c
+            self._health_ns[i] = self._clock_ns()
 
-    def take(self, part: "Readings", at: Sequence[int]) -> None:
-        """All that some of the drives have said to another one, as of when they said it. at: their numbers here."""
-        for i, j in enumerate(at):
-            self.angle_rad[j], self.velocity_rad_s[j] = part.angle_rad[i], part.velocity_rad_s[i]
-            self.torque_nm[j] = part.torque_nm[i]
-            self._motion_ns[j], self._torque_ns[j] = part._motion_ns[i], part._torque_ns[i]
-            self._motion_at[j] = self._asked - part._asked + part._motion_at[i]
-            self._torque_at[j] = self._asked - part._asked + part._torque_at[i]
-            self._voltage_v[j], self._current_a[j] = part._voltage_v[i], part._current_a[i]
-            self._motor_c[j], self._board_c[j] = part._motor_c[i], part._board_c[i]
-            self._health_ns[j] = part._health_ns[i]
-            self.serials[j], self.firmware[j] = part.serials[i], part.firmware[i]
+    def copy_from(self, source: "DriveReadings", indices: Sequence[int]) -> None:
+        """Copy all values of another object, with the times at which they were read.
 
-    # --- whether drives have switched themselves off ----------------------------------------------------------
+        Args:
+            source: Readings of some of these drives.
+            indices: For each drive of `source`, its index here.
+        """
+        request_offset = self._request - source._request
+        for i, j in enumerate(indices):
+            self.angle_rad[j] = source.angle_rad[i]
+            self.velocity_rad_s[j] = source.velocity_rad_s[i]
+            self.torque_nm[j] = source.torque_nm[i]
+            self._motion_ns[j] = source._motion_ns[i]
+            self._torque_ns[j] = source._torque_ns[i]
+            self._motion_request[j] = request_offset + source._motion_request[i]
+            self._torque_request[j] = request_offset + source._torque_request[i]
+            self._voltage_v[j] = source._voltage_v[i]
+            self._current_a[j] = source._current_a[i]
+            self._motor_c[j] = source._motor_c[i]
+            self._board_c[j] = source._board_c[i]
+            self._health_ns[j] = source._health_ns[i]
+            self.serials[j] = source.serials[i]
+            self.firmware[j] = source.firmware[i]
+
+    # --- drives that may have switched themselves off ---------------------------------------------------------
 
     @property
-    def doubted(self) -> frozenset[int]:
-        """Drives that may have switched themselves off since they were read last: a driver reads their state first.
+    def drives_to_check(self) -> frozenset[int]:
+        """The drives that may have switched themselves off since they were read last.
 
-        Until it has, nothing that clears a latched stop may be sent to them.
+        A driver requests their state with the next reading. Until it has the answer, it must not send them anything
+        that clears a latched stop.
         """
-        return frozenset(self._doubted)
+        return frozenset(self._to_check)
 
-    def doubt(self, drives: Iterable[int]) -> None:
-        """The driver was silent, or these drives were, for so long that their watchdogs may have expired."""
-        self._doubted.update(drives)
+    def require_check(self, drives: Iterable[int]) -> None:
+        """Note that the driver or these drives were silent for so long that their watchdogs may have expired."""
+        self._to_check.update(drives)
 
-    def state_was_read(self, i: int) -> None:
-        """A drive has just reported whether it is on, and whether it has stopped by itself."""
-        self._doubted.discard(i)
+    def mark_checked(self, i: int) -> None:
+        """Note that a drive has just reported whether it is on, and whether it has stopped by itself."""
+        self._to_check.discard(i)
 
-    # --- what is known ---------------------------------------------------------------------------------------
+    # --- what is known ----------------------------------------------------------------------------------------
 
-    def known(self, i: int) -> bool:
-        """Whether a drive has ever said all that it measures."""
-        return self._motion_ns[i] != NEVER and (self._torque_ns[i] != NEVER or not self._feels[i])
+    def is_known(self, i: int) -> bool:
+        """Return whether a drive has ever sent everything that it measures."""
+        if self._motion_ns[i] == NEVER:
+            return False
+        return self._torque_ns[i] != NEVER or not self._measures_torque[i]
 
-    def unanswered(self, i: int) -> int:
-        """How many questions in a row a drive has not answered in full."""
-        return self._asked - (min(self._motion_at[i], self._torque_at[i]) if self._feels[i] else self._motion_at[i])
+    def unanswered_requests(self, i: int) -> int:
+        """Return how many requests in a row a drive has not answered completely."""
+        answered = self._motion_request[i]
+        if self._measures_torque[i]:
+            answered = min(answered, self._torque_request[i])
+        return self._request - answered
 
-    def incomplete(self) -> bool:
-        """Whether answers are missing of drives that answered lately: those are worth waiting for."""
-        return any(0 < self.unanswered(i) <= LATELY for i in range(len(self._feels)))
+    def is_incomplete(self) -> bool:
+        """Return whether answers are missing from drives that answered lately: these are worth waiting for."""
+        drive_count = len(self._measures_torque)
+        return any(0 < self.unanswered_requests(i) <= MAX_AWAITED_REQUESTS for i in range(drive_count))
 
     def age_ns(self, i: int) -> int:
-        """Of the older one of motion and torque."""
-        if not self.known(i):
-            return LONG_AGO_NS
-        heard_ns = min(self._motion_ns[i], self._torque_ns[i]) if self._feels[i] else self._motion_ns[i]
-        return max(self._clock_ns() - heard_ns, 0)
+        """Return the age of a drive's motion and torque, of the older one."""
+        if not self.is_known(i):
+            return UNKNOWN_AGE_NS
+        read_ns = self._motion_ns[i]
+        if self._measures_torque[i]:
+            read_ns = min(read_ns, self._torque_ns[i])
+        return max(self._clock_ns() - read_ns, 0)
 
-    def joints(self, tick: int, timestamp_ns: int, lease_ns: int) -> JointState:
-        """The joint state; a value older than the lease is invalid, and a torque that is not measured is 0."""
-        ages, mounting = [self.age_ns(i) for i in range(len(self._feels))], self.mounting
+    def joint_state(self, tick: int, timestamp_ns: int, lease_ns: int) -> JointState:
+        """Return the joint state. Values older than the lease are invalid, and a torque that is not measured is 0."""
+        ages_ns = [self.age_ns(i) for i in range(len(self._measures_torque))]
         return JointState(
             tick=tick,
             timestamp_ns=timestamp_ns,
-            angle_rad=mounting.joint_angle_rad(self.angle_rad).tolist(),
-            velocity_rad_s=mounting.joint_velocity_rad_s(self.velocity_rad_s).tolist(),
-            torque_nm=mounting.joint_torque_nm(self.torque_nm).tolist(),
-            valid=[age <= lease_ns for age in ages],
-            age_ns=ages,
+            angle_rad=self.mounting.joint_angle_rad(self.angle_rad).tolist(),
+            velocity_rad_s=self.mounting.joint_velocity_rad_s(self.velocity_rad_s).tolist(),
+            torque_nm=self.mounting.joint_torque_nm(self.torque_nm).tolist(),
+            valid=[age_ns <= lease_ns for age_ns in ages_ns],
+            age_ns=ages_ns,
         )
 
-    def power(self, tick: int, timestamp_ns: int, lasts_ns: int) -> Power:
-        """Supply and heat; what is older than `lasts_ns` is unknown."""
+    def power(self, tick: int, timestamp_ns: int, max_age_ns: int) -> Power:
+        """Return supply and temperatures; values older than `max_age_ns` are invalid."""
         now_ns = self._clock_ns()
+        valid = [read_ns != NEVER and now_ns - read_ns <= max_age_ns for read_ns in self._health_ns]
         return Power(
             tick=tick,
             timestamp_ns=timestamp_ns,
@@ -146,5 +199,5 @@ class Readings:
             motor_c=list(self._motor_c),
             board_c=list(self._board_c),
             leak=[False] * len(self._health_ns),
-            valid=[heard_ns != NEVER and now_ns - heard_ns <= lasts_ns for heard_ns in self._health_ns],
+            valid=valid,
         )

@@ -44,7 +44,7 @@ class PoseCamera:
         self._noise = np.random.default_rng(seed).standard_normal
         self._sigma = np.repeat([sensor.position_noise_m, 0.5 * sensor.angle_noise_rad], 3)  # quaternions halve angles
 
-    def look(self, timestamp_ns: int) -> MocapSample | None:
+    def capture(self, timestamp_ns: int) -> MocapSample | None:
         """The sample that arrives at this Sync: the base's pose before the delay; None at first, or without a world.
 
         Velocities carry no noise of their own.

@@ -48,7 +48,7 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
         )
 
 
-def receiver(
+def make_receiver(
     config: RunConfig, pose_listen: str | None, *, emulators: bool, clock: Callable[[int], int]
 ) -> "MocapReceiver | None":
     """A receiver, if the robot has a [sensors.pose] and there is an address; emulators send to any free port."""
@@ -91,7 +91,7 @@ class MocapReceiver:
         host, port = self._socket.getsockname()
         return f"{host}:{port}"
 
-    def newest(self, tick: int, timestamp_ns: int) -> Pose | None:
+    def read_newest(self, tick: int, timestamp_ns: int) -> Pose | None:
         """The newest pose since the last call, stamped with the robot time of its capture; None without a valid one."""
         now_ns = self._clock(timestamp_ns)
         sample = self._newest_sample(now_ns)
@@ -99,7 +99,7 @@ class MocapReceiver:
             return None
         before, self._last = self._last, sample
         velocities = self._velocities(before, sample)
-        age_ns = self._times.late_ns(sample.timestamp_ns, now_ns) + self._delay_ns
+        age_ns = self._times.lateness_ns(sample.timestamp_ns, now_ns) + self._delay_ns
         if velocities is None or age_ns > timestamp_ns:  # the latter: captured before the robot's time began
             return None
         # A late tick makes poses that arrived meanwhile seem older; but each was captured after the one before.
@@ -125,7 +125,7 @@ class MocapReceiver:
     def _newest_sample(self, now_ns: int) -> MocapSample | None:
         samples = self._read()
         newest: MocapSample | None = None
-        refusals = self._times.judge([sample.timestamp_ns for sample in samples], now_ns)
+        refusals = self._times.find_refusals([sample.timestamp_ns for sample in samples], now_ns)
         for sample, refusal in zip(samples, refusals, strict=True):
             if refusal is None:
                 newest = sample

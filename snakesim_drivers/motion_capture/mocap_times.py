@@ -35,7 +35,7 @@ class CaptureTimes:
         self._other: _Candidate | None = None
         self.jumps = 0  # of the other clock
 
-    def judge(self, timestamps_ns: Sequence[int], now_ns: int) -> list[Refusal | None]:
+    def find_refusals(self, timestamps_ns: Sequence[int], now_ns: int) -> list[Refusal | None]:
         """Why each of the stamps of one reading is rejected; None for the valid ones."""
         if not timestamps_ns:
             return []
@@ -50,7 +50,7 @@ class CaptureTimes:
             verdicts[strange[-1]] = None
         return verdicts
 
-    def late_ns(self, timestamp_ns: int, now_ns: int) -> int:
+    def lateness_ns(self, timestamp_ns: int, now_ns: int) -> int:
         """Delay of a sample relative to the fastest ones."""
         return max(now_ns - timestamp_ns - self._offset.min_ns, 0)
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.kit.buses import Bus
-from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_drivers.kit.drive_settings import answer_limit_s, body_of, port_of, who
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, buses_of
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, joint_label, make_body
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -55,14 +55,14 @@ class DynamixelBackend(DriverTypeBackend):
         config: RunConfig,
         settings: DynamixelSettings,
         joints: Mapping[int, Joint],
-        clock: Clock,
+        clock: DriverClock,
         body: EmulatedBody | None,
-    ) -> list[Bus]:
-        gap_s = max(MIN_GAP_S, GAP_PER_PERIOD * config.period_ns * 1e-9)
-        log = _open_log(settings.log)
+    ) -> list[BusSpec]:
+        """One for each port, or one of emulated servos."""
+        gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
+        log = _log(settings.log)
 
-        def open_servos(port_name: str, numbers: Sequence[int], readings: Readings) -> Servos:
-            """Open a port with the servos of these joints; emulated servos are on a pseudo terminal."""
+        def open_servos(port: str, mine: Sequence[int], readings: DriveReadings) -> Servos:
             emulator = None
             if body is None:
                 wire = SerialWire(port_name, settings.baud, log)
@@ -73,12 +73,9 @@ class DynamixelBackend(DriverTypeBackend):
             port = Port(wire, gap_s)
             servos = [servo_of(joints[number], port) for number in numbers]
             answer_s = answer_limit_s(config, settings.decimation)
-            return Servos(servos, port, readings, settings, clock.ns, answer_s, emulator)
+            return Servos(servos, on_it, readings, settings, clock.now_ns, answer_s, emulator)
 
-        ports = settings.ports
-        if body is not None:
-            ports = [NAME]
-        return buses_of(joints, settings, ports, open_servos)
+        return group_by_port(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
 
 
 def servo_of(joint: Joint, port: Port) -> Servo:
@@ -117,24 +114,26 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
     for joint in joints:
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
-            raise ConfigError(f"{who(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}")
+            raise ConfigError(
+                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}"
+            )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
-                f"{who(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when it is "
-                f"off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
+                f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when "
+                f"it is off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
                 f"{TURN - 2 * SLACK_RAD:.2f} rad"
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
-                f"{who(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit amperes: "
-                f"take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
+                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
             )
 
 
 def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError when a port cannot carry its servos."""
-    bus_of_joint = port_of(joints, settings.ports)
-    fullest = max(bus_of_joint.count(bus) for bus in set(bus_of_joint))
+    on = assign_ports(joints, settings.ports)
+    fullest = max(on.count(bus) for bus in set(on))
     busy_s = cycle_s(fullest, settings.baud)
     if busy_s * rate_hz > MAX_LOAD:
         raise ConfigError(
@@ -146,7 +145,7 @@ def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joi
 
 
 def emulator_on(
-    config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: Clock, pose: str | None
+    config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: DriverClock, pose: str | None
 ) -> EmulatedDynamixel:
     """Make emulated servos for a whole robot.
 
@@ -158,17 +157,15 @@ def emulator_on(
         pose: where motion capture sends poses, HOST:PORT; None: nowhere.
     """
     joints = config.robot.joint_table
-    body = body_of(config, settings, NAME, pose)
-    pty_of_joint = [ptys[bus] for bus in port_of(joints, settings.ports)]
-    return emulator_of(joints, settings, body, pty_of_joint, clock)
+    each = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
+    return emulator_of(joints, settings, make_body(config, settings, NAME, pose), each, clock)
 
 
 def emulator_of(
-    joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: Clock
+    joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: DriverClock
 ) -> EmulatedDynamixel:
-    """Make emulated servos for joints. ptys: the pseudo terminal of every joint's servo."""
-    constants = [constant_of(joint) for joint in joints]
-    return EmulatedDynamixel(body, ptys, constants, settings.baud, clock.ns)
+    """Emulated servos. ptys: of every joint."""
+    return EmulatedDynamixel(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.now_ns)
 
 
 def _open_log(path: str) -> TextIO | None:

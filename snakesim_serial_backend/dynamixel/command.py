@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_drivers.emulation.emulated_body import serve_until_stopped
-from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
 from snakesim_hal.base.terminal import exit_code, say
@@ -60,7 +60,7 @@ def serve(arguments: argparse.Namespace) -> int:
     settings: DynamixelSettings = backend_settings(config, DynamixelBackend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
     with named(links) as ptys:
-        emulator = emulator_on(config, settings, ptys, Clock(config), arguments.pose)
+        emulator = emulator_on(config, settings, ptys, DriverClock(config), arguments.pose)
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
         ready = f"servos ready: {len(emulator.servos)} on {ends}"
         serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []))

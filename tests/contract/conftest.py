@@ -104,12 +104,12 @@ def cut_off(backend: Any, joint: int) -> None:
 
 def cut_drive_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's drive."""
-    line = next(line for line in backend._drives.lines if joint in line.bus.joints)
-    drives, silent = line.drives, line.bus.joints.index(joint)
-    hear = drives.hear
+    bus = next(bus for bus in backend._drives.buses if joint in bus.spec.joints)
+    drives, silent = bus.drives, bus.spec.joints.index(joint)
+    handle_answer = drives.handle_answer
 
     def heard(i: int, said: Any) -> None:
         if i != silent:
-            hear(i, said)
+            handle_answer(i, said)
 
-    drives.hear = heard
+    drives.handle_answer = heard

@@ -4,9 +4,9 @@ from contextlib import ExitStack
 from typing import Any
 
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
-from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
+from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.emulator import EmulatedOdrive
-from snakesim_can_backend.odrive.protocol import State
+from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
@@ -19,23 +19,23 @@ class DrivesOfAnyFamily:
     """Drives of the driver kit, on one bus or on several: a `snakesim_testing.contract.bench.EmulatedDrives`."""
 
     def __init__(self, backend: Any) -> None:
-        self._backend, self._lines = backend, backend._drives.lines
+        self._backend, self._buses = backend, backend._drives.buses
 
     def enabled(self) -> list[bool]:
         found: dict[int, bool] = {}
-        for line in self._lines:
-            found |= dict(zip(line.bus.joints, enabled_drives(line.drives._emulator), strict=True))
+        for bus in self._buses:
+            found |= dict(zip(bus.spec.joints, enabled_drives(bus.drives._emulator), strict=True))
         return [found[joint] for joint in range(len(found))]
 
     def freeze_driver(self, seconds: float, sleep: Any) -> None:
         with ExitStack() as held:
-            for line in self._lines:
-                if hasattr(line, "_has"):  # a bus in a thread: it can do nothing without this
-                    held.enter_context(line._has)
+            for bus in self._buses:
+                if hasattr(bus, "_condition"):  # a bus in a thread: it can do nothing without this
+                    held.enter_context(bus._condition)
             self._backend._clock.robot_ns += round(seconds * 1e9)
             sleep(seconds)
-            for line in self._lines:
-                line.drives._emulator()
+            for bus in self._buses:
+                bus.drives._emulator()
 
 
 class DrivesOfModules:
@@ -58,7 +58,7 @@ def enabled_drives(emulator: Any) -> list[bool]:
     """Of the emulated drives of one driver type, those that would follow a setpoint."""
     match emulator:
         case EmulatedOdrive():
-            return [axis.state == State.CLOSED_LOOP for axis in emulator.axes]
+            return [axis.state == AxisState.CLOSED_LOOP for axis in emulator.axes]
         case EmulatedMoteus():
             return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
         case EmulatedDynamixel():

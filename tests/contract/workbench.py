@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from snakesim_drivers.kit.braking import AT_REST_RAD_S
-from snakesim_drivers.kit.drive_backend import LATCHED
+from snakesim_drivers.kit.drive_backend import LATCHED_STATES
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
@@ -47,8 +47,8 @@ class DrivesWorkbench(Workbench):
         self.was: LifecycleState = "disarmed"
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        was_latched, self.was = self.was in LATCHED, lifecycle
-        if was_latched and lifecycle not in LATCHED:
+        was_latched, self.was = self.was in LATCHED_STATES, lifecycle
+        if was_latched and lifecycle not in LATCHED_STATES:
             self.tripped[:] = self.reported[:] = False
         match lifecycle:
             case "armed":

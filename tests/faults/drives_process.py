@@ -22,9 +22,9 @@ from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
 from snakesim_drivers.emulation.emulated_body import EmulatedBody, make_physics_model
-from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_drivers.kit.drive_settings import body_of
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, Part
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_settings import make_body
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
 from snakesim_hal.base.terminal import say
@@ -82,9 +82,9 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
     settings = backend_settings(config, backend)
     if backend is CanBackend:
         return _modules(config, settings, pose, opened)
-    parts: list[Part] = backend.parts(config, settings)
-    body, clock = body_of(config, settings, config.backend, pose), Clock(config)
-    emulators = [_emulator(part, body.part(list(part.joints)), clock, opened) for part in parts]
+    parts: list[DriverTypePart] = backend.parts(config, settings)
+    body, clock = make_body(config, settings, config.backend, pose), DriverClock(config)
+    emulators = [_emulator(part, body.select(list(part.joints)), clock, opened) for part in parts]
 
     def run() -> None:
         for emulator in emulators:
@@ -99,14 +99,14 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
     return Drives(run, enabled)
 
 
-def _emulator(part: Part, body: EmulatedBody, clock: Clock, opened: ExitStack) -> Any:
+def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, opened: ExitStack) -> Any:
     """The emulated drives of one driver type, all on its first bus."""
     driver_type: type[DriverTypeBackend] = part.driver_type
     joints = list(part.joints.values())
     if issubclass(driver_type, CanDriveBackend):
         wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
         return opened.enter_context(
-            closing(driver_type.emulator(joints, part.settings, body, [wire] * len(joints), clock.ns))
+            closing(driver_type.emulator_class(joints, part.settings, body, [wire] * len(joints), clock.now_ns))
         )
     ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
     return emulator_of(joints, part.settings, body, ptys * len(joints), clock)

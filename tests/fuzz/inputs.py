@@ -122,7 +122,7 @@ def mocap() -> Iterator[Input]:
             now_ns += 10_000_000
             before = receiver.refused.copy()
             stranger.sendto(payload, (host, int(port)))
-            pose = receiver.newest(now_ns // 10_000_000, now_ns)
+            pose = receiver.read_newest(now_ns // 10_000_000, now_ns)
             if pose is not None:
                 assert Decoder(Pose).decode(encode(pose), encoding_of(Pose)) == pose
                 return "a pose"

@@ -10,9 +10,10 @@ import pytest
 
 from snakesim_can_backend.can_drives import backend as can_family
 from snakesim_can_backend.driver import modules
-from snakesim_drivers.kit.buses import Bus, Buses
-from snakesim_drivers.kit.drive_backend import Clock
-from snakesim_drivers.kit.readings import Readings
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.buses import Buses
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
@@ -79,12 +80,15 @@ def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
     sections = {name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()}
     config = configured(backend, **sections)
     factory = find_plugin(BACKENDS, backend)
-    clock = Clock(config)
-    opened_buses: list[Bus] = []
-    for part in factory.parts(config, backend_settings(config, factory)):
+    clock = DriverClock(config)
+    opened_buses: list[BusSpec] = []
+    for part in factory.split_by_driver_type(config, backend_settings(config, factory)):
         opened_buses += part.driver_type.buses(config, part.settings, part.joints, clock, None)
     in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
-    assert Buses(in_turn, Readings(config.robot.joint_table, clock.ns), opened_buses, clock.ns).emulated == emulated
+    assert (
+        Buses(in_turn, DriveReadings(config.robot.joint_table, clock.now_ns), opened_buses, clock.now_ns).emulated
+        == emulated
+    )
 
 
 def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatch) -> None:

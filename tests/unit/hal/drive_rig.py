@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
 
 def drives_of(backend: Any, bus: int = 0) -> Any:
     """The drives of one of its buses."""
-    return backend._drives.lines[bus].drives
+    return backend._drives.buses[bus].drives
 
 
 class DriveRig:

@@ -12,9 +12,9 @@ import can
 import pytest
 
 from snakesim_can_backend.moteus.backend import MoteusBackend
-from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
+from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
-from snakesim_can_backend.odrive.protocol import State
+from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_serial_backend.dynamixel import registers as at
@@ -53,7 +53,7 @@ FAMILIES = {
     "odrive": Family(
         OdriveBackend,
         lambda emulator: emulator.axes,
-        lambda axis: axis.state == State.CLOSED_LOOP,
+        lambda axis: axis.state == AxisState.CLOSED_LOOP,
         law_of,
         "watchdog_timer_expired",
         "motor_over_temp",
@@ -254,7 +254,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 
     def elsewhere(emulator: Any, *rest: Any) -> None:
         made(emulator, *rest)
-        emulator._at.pop((id(emulator.wires[1]), 2))
+        emulator._index_of_node.pop((id(emulator.wires[1]), 2))
 
     monkeypatch.setattr(twin_class, "__init__", elsewhere)
     with pytest.raises(BackendError, match=rf"joint_2 \(node 2 on .*\) {robot.driver_type.unheard}"):

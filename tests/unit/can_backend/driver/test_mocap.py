@@ -28,7 +28,7 @@ class Mocap(MocapReceiver):
     def read(self) -> Pose | None:
         """A tick later."""
         self.now_ns += 10 * MS
-        return self.newest(7, self.now_ns)
+        return self.read_newest(7, self.now_ns)
 
     def at(self, late_ms: float = 0.0, **more: Any) -> dict[str, Any]:
         """A datagram that was captured at the next tick, by a clock that is 5 s ahead."""
@@ -73,7 +73,7 @@ def test_stamps_go_on_although_a_tick_is_late() -> None:
         first = read(mocap, mocap.at())
         send(mocap, mocap.at())
         mocap.now_ns += 25 * MS  # what came 15 ms ago is read now, in the tick that was due then
-        second = mocap.newest(8, mocap.now_ns - 15 * MS)
+        second = mocap.read_newest(8, mocap.now_ns - 15 * MS)
         assert first is not None and second is not None and second.timestamp_ns == first.timestamp_ns + 1
         third = read(mocap, mocap.at())
         assert third is not None and third.timestamp_ns == mocap.now_ns
@@ -84,7 +84,7 @@ def test_what_was_captured_before_the_robots_time_began_is_no_pose() -> None:
         for timestamp_ns, known in ((0, False), (10 * MS, False), (20 * MS, True)):
             send(mocap, mocap.at())
             mocap.now_ns += 10 * MS
-            pose = mocap.newest(0, timestamp_ns)
+            pose = mocap.read_newest(0, timestamp_ns)
             assert (pose is not None) is known and (pose is None or pose.timestamp_ns == 0)
 
 

@@ -24,10 +24,10 @@ class Camera:
     def read(self, *late_ms: float) -> list[str | None]:
         """One reading, of samples that are late by so much, in their order."""
         self.now_ns += 10 * MS
-        return list(self.times.judge([self.stamp(ms) for ms in late_ms], self.now_ns))
+        return list(self.times.find_refusals([self.stamp(ms) for ms in late_ms], self.now_ns))
 
     def late_ms(self, timestamp_ns: int) -> float:
-        return self.times.late_ns(timestamp_ns, self.now_ns) / MS
+        return self.times.lateness_ns(timestamp_ns, self.now_ns) / MS
 
 
 def running(readings: int = 20) -> Camera:
@@ -88,7 +88,7 @@ def test_one_stamp_for_ever_is_a_duplicate_and_no_jump() -> None:
     timestamp_ns = camera.stamp(0.0)
     for _ in range(100):
         camera.now_ns += 10 * MS
-        assert camera.times.judge([timestamp_ns], camera.now_ns) == ["duplicate"]
+        assert camera.times.find_refusals([timestamp_ns], camera.now_ns) == ["duplicate"]
     assert camera.times.jumps == 0
 
 
@@ -99,6 +99,6 @@ def test_a_clock_that_drifts_stays_known(share: float) -> None:
     for tick in range(60_000):
         now_ns = tick * 10 * MS
         timestamp_ns = round(now_ns * share) + AHEAD_NS
-        assert times.judge([timestamp_ns], now_ns) == [None]
-        assert times.late_ns(timestamp_ns, now_ns) < 5 * MS
+        assert times.find_refusals([timestamp_ns], now_ns) == [None]
+        assert times.lateness_ns(timestamp_ns, now_ns) < 5 * MS
     assert times.jumps == 0

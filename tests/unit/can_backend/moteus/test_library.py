@@ -11,9 +11,9 @@ from moteus.protocol import parse_message, parse_registers
 from snakesim_can_backend.bus.bus import VirtualWire, message_of
 from snakesim_can_backend.moteus import protocol
 from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
-from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION
+from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION, configured_gains
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
@@ -44,8 +44,8 @@ def test_registers_modes_and_faults_have_their_numbers() -> None:
     assert {one.name: moteus.Register[same[one.name]] for one in protocol.Register} == {
         one.name: one.value for one in protocol.Register
     }
-    modes = {one.name: moteus.Mode[one.name].value for one in protocol.Mode}
-    assert modes == {one.name: one.value for one in protocol.Mode}
+    modes = {one.name: moteus.Mode[one.name].value for one in protocol.MoteusMode}
+    assert modes == {one.name: one.value for one in protocol.MoteusMode}
 
 
 @pytest.mark.parametrize(
@@ -69,34 +69,37 @@ def test_a_command_of_ours_is_what_their_library_sends_for_it(law: dict[str, flo
         "accel_limit": -1.0,
     }
     sent = theirs(5, position_resolution=resolution).make_position(**dict[str, Any](rest | law))
-    ours = protocol.framed(
+    ours = protocol.make_frame(
         0,
         5,
-        protocol.part(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.Mode.POSITION),
-        protocol.part(protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *law.values(), 3.0),
-        protocol.part(protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0),
+        protocol.encode_subframe(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.POSITION),
+        protocol.encode_subframe(protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *law.values(), 3.0),
+        protocol.encode_subframe(protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0),
     )
     assert parse_registers(ours.data).command == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
     assert as_frame(sent, 5).id == ours.id and len(ours.data) == 48
-    read = [one for one in protocol.parts(bytes(sent.data)) if one.kind == protocol.WRITE]
+    read = [one for one in protocol.decode_subframes(bytes(sent.data)) if one.kind == protocol.WRITE]
     values = {one.register + k: value for one in read for k, value in enumerate(one.values)}
     assert values == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
 
 
 def test_a_stop_of_ours_is_theirs_and_ids_are_extended_where_theirs_are() -> None:
-    stop = protocol.part(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.Mode.STOPPED)
-    assert protocol.framed(0, 1, stop) == as_frame(theirs().make_stop())
-    asked = protocol.framed(0, 1, *MOTION, reply=True)
+    stop = protocol.encode_subframe(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.STOPPED)
+    assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
+    asked = protocol.make_frame(0, 1, *MOTION, reply=True)
     assert asked.id == as_frame(theirs().make_query()).id == 0x8001
     assert message_of(asked, fd=True).is_extended_id and not message_of(Frame(0x100, b""), fd=True).is_extended_id
-    assert len(protocol.framed(0, 1, *HEALTH).data) == 6 and len(protocol.framed(0, 1, *MOTION).data) == 5
-    assert parse_registers(protocol.framed(0, 1, *IDENTITY).data).query == [(0x102, moteus.INT32), (0x00C, moteus.INT8)]
+    assert len(protocol.make_frame(0, 1, *HEALTH).data) == 6 and len(protocol.make_frame(0, 1, *MOTION).data) == 5
+    assert parse_registers(protocol.make_frame(0, 1, *IDENTITY).data).query == [
+        (0x102, moteus.INT32),
+        (0x00C, moteus.INT8),
+    ]
 
 
 @pytest.fixture
 def bus() -> Any:
     """Emulated controllers of a robot, and their bus."""
-    wire, clock = VirtualWire("moteus-theirs", fd=True), Clock(CONFIG)
+    wire, clock = VirtualWire("moteus-theirs", fd=True), DriverClock(CONFIG)
     emulator = MoteusBackend.emulator_on(CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None)
     with can.Bus(interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD) as ours:
         yield ours, emulator, clock
@@ -126,7 +129,7 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
         said = ask(client.make_custom_query(fields))
         assert said[moteus.Register.MODE] == moteus.Mode.POSITION and said[moteus.Register.FAULT] == 0
         assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
-        assert said[moteus.Register.VOLTAGE] == pytest.approx(emulator.body.supply(2)[0], abs=0.3)
+        assert said[moteus.Register.VOLTAGE] == pytest.approx(emulator.body.read_supply(2)[0], abs=0.3)
     clock.robot_ns += 150_000_000
     emulator()
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
@@ -157,7 +160,7 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
     assert all(one.command or one.query for one in read) and not any(one.errors for one in read)
     command = next(one.command for one in read if len(one.command) > 2)
     motor = CONFIG.robot.joint_table[0].motor
-    kp = command[moteus.Register.COMMAND_KP_SCALE] * drives._kp_nm_per_turn
+    kp = command[moteus.Register.COMMAND_KP_SCALE] * configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
     assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
     assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
     assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5 and joints.valid == [True] * JOINTS

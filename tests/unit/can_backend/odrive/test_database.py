@@ -11,34 +11,43 @@ from typing import Any
 import cantools
 import pytest
 
-from snakesim_can_backend.odrive.protocol import FROM_HOST, PAYLOADS, Control, Message, State, ask, parted, write
+from snakesim_can_backend.odrive.protocol import (
+    FROM_HOST,
+    PAYLOADS,
+    AxisState,
+    ControlMode,
+    MessageId,
+    encode_message,
+    encode_request,
+    split_id,
+)
 from snakesim_can_backend.protocol.definitions import Frame
 
 DATABASE: Any = cantools.database.load_file(Path(__file__).with_name("odrive-cansimple.dbc"))
 SAME = {
-    Message.HEARTBEAT: ("Heartbeat", {"Axis_Error": 5, "Axis_State": 8}),
-    Message.SET_STATE: ("Set_Axis_State", {"Axis_Requested_State": 8}),
-    Message.MOTION: ("Get_Encoder_Estimates", {"Pos_Estimate": 1.5, "Vel_Estimate": -0.25}),
-    Message.SET_MODE: ("Set_Controller_Mode", {"Control_Mode": 3, "Input_Mode": 1}),
-    Message.SET_POSITION: ("Set_Input_Pos", {"Input_Pos": -2.5, "Vel_FF": 0.125, "Torque_FF": -0.5}),
-    Message.SET_VELOCITY: ("Set_Input_Vel", {"Input_Vel": 3.0, "Input_Torque_FF": -0.75}),
-    Message.SET_TORQUE: ("Set_Input_Torque", {"Input_Torque": -1.25}),
-    Message.SET_LIMITS: ("Set_Limits", {"Velocity_Limit": 2.0, "Current_Limit": 7.5}),
-    Message.CURRENT: ("Get_Iq", {"Iq_Setpoint": 1.0, "Iq_Measured": -2.0}),
-    Message.SUPPLY: ("Get_Bus_Voltage_Current", {"Bus_Voltage": 24.0, "Bus_Current": 0.5}),
-    Message.SET_POSITION_GAIN: ("Set_Pos_Gain", {"Pos_Gain": 40.0}),
-    Message.SET_VELOCITY_GAINS: ("Set_Vel_Gains", {"Vel_Gain": 0.5, "Vel_Integrator_Gain": 0.25}),
+    MessageId.HEARTBEAT: ("Heartbeat", {"Axis_Error": 5, "Axis_State": 8}),
+    MessageId.SET_STATE: ("Set_Axis_State", {"Axis_Requested_State": 8}),
+    MessageId.MOTION: ("Get_Encoder_Estimates", {"Pos_Estimate": 1.5, "Vel_Estimate": -0.25}),
+    MessageId.SET_MODE: ("Set_Controller_Mode", {"Control_Mode": 3, "Input_Mode": 1}),
+    MessageId.SET_POSITION: ("Set_Input_Pos", {"Input_Pos": -2.5, "Vel_FF": 0.125, "Torque_FF": -0.5}),
+    MessageId.SET_VELOCITY: ("Set_Input_Vel", {"Input_Vel": 3.0, "Input_Torque_FF": -0.75}),
+    MessageId.SET_TORQUE: ("Set_Input_Torque", {"Input_Torque": -1.25}),
+    MessageId.SET_LIMITS: ("Set_Limits", {"Velocity_Limit": 2.0, "Current_Limit": 7.5}),
+    MessageId.CURRENT: ("Get_Iq", {"Iq_Setpoint": 1.0, "Iq_Measured": -2.0}),
+    MessageId.SUPPLY: ("Get_Bus_Voltage_Current", {"Bus_Voltage": 24.0, "Bus_Current": 0.5}),
+    MessageId.SET_POSITION_GAIN: ("Set_Pos_Gain", {"Pos_Gain": 40.0}),
+    MessageId.SET_VELOCITY_GAINS: ("Set_Vel_Gains", {"Vel_Gain": 0.5, "Vel_Integrator_Gain": 0.25}),
 }
 SCALED = {"Vel_FF": 1000, "Torque_FF": 1000}  # integers by 0.001
 
 
 @pytest.mark.parametrize("message", SAME, ids=lambda message: message.name)
-def test_their_database_reads_what_we_write_and_we_read_what_it_writes(message: Message) -> None:
+def test_their_database_reads_what_we_write_and_we_read_what_it_writes(message: MessageId) -> None:
     name, values = SAME[message]
     theirs = DATABASE.get_message_by_name(f"Axis0_{name}")
     ours = [round(value * SCALED[key]) if key in SCALED else value for key, value in values.items()]
-    spare = [0, 0] if message is Message.HEARTBEAT else []
-    frame = write(0, message, *ours, *spare)
+    spare = [0, 0] if message is MessageId.HEARTBEAT else []
+    frame = encode_message(0, message, *ours, *spare)
     read = theirs.decode(frame.data.ljust(8, b"\0"), decode_choices=False)
     assert frame.id == theirs.frame_id and {key: read[key] for key in values} == pytest.approx(values)
     data = theirs.encode({signal.name: 0 for signal in theirs.signals} | values)
@@ -46,16 +55,18 @@ def test_their_database_reads_what_we_write_and_we_read_what_it_writes(message: 
 
 
 def test_messages_without_data_and_ids_of_other_axes_are_theirs() -> None:
-    assert DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id == write(0, Message.CLEAR_ERRORS).id
-    assert write(0, Message.CLEAR_ERRORS) == Frame(24, b"") and ask(3, Message.MOTION) == Frame(3 << 5 | 9, b"")
-    assert parted(Frame(62 << 5 | 0x1B, b"")) == (62, Message.SET_VELOCITY_GAINS)
+    assert DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id == encode_message(0, MessageId.CLEAR_ERRORS).id
+    assert encode_message(0, MessageId.CLEAR_ERRORS) == Frame(24, b"") and encode_request(3, MessageId.MOTION) == Frame(
+        3 << 5 | 9, b""
+    )
+    assert split_id(Frame(62 << 5 | 0x1B, b"")) == (62, MessageId.SET_VELOCITY_GAINS)
 
 
 def test_states_modes_and_senders_are_theirs() -> None:
     states = DATABASE.get_message_by_name("Axis0_Heartbeat").get_signal_by_name("Axis_State").choices
-    assert (states[State.IDLE].name, states[State.CLOSED_LOOP].name) == ("IDLE", "CLOSED_LOOP_CONTROL")
+    assert (states[AxisState.IDLE].name, states[AxisState.CLOSED_LOOP].name) == ("IDLE", "CLOSED_LOOP_CONTROL")
     modes = DATABASE.get_message_by_name("Axis0_Set_Controller_Mode").get_signal_by_name("Control_Mode").choices
-    assert [modes[one].name for one in Control] == ["TORQUE_CONTROL", "VELOCITY_CONTROL", "POSITION_CONTROL"]
+    assert [modes[one].name for one in ControlMode] == ["TORQUE_CONTROL", "VELOCITY_CONTROL", "POSITION_CONTROL"]
     theirs = {message: DATABASE.get_message_by_name(f"Axis0_{name}") for message, (name, _) in SAME.items()}
     of_hosts = {message for message, described in theirs.items() if "Master" in described.senders}
-    assert of_hosts == FROM_HOST - {Message.ESTOP, Message.CLEAR_ERRORS}
+    assert of_hosts == FROM_HOST - {MessageId.ESTOP, MessageId.CLEAR_ERRORS}

@@ -3,15 +3,16 @@
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from snakesim_can_backend.can_drives.drives import CanDrives
+from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
 from snakesim_can_backend.odrive.backend import MountedAxis, OdriveBackend, OdriveSettings
-from snakesim_can_backend.odrive.endpoints import EMULATED, Setting, read_endpoints
-from snakesim_can_backend.odrive.protocol import Message, parted, read_setting, setting_of
+from snakesim_can_backend.odrive.endpoints import EMULATED, AxisSetting, read_endpoints
+from snakesim_can_backend.odrive.protocol import MessageId, decode_setting_answer, encode_setting_request, split_id
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
@@ -51,7 +52,7 @@ class Robot(DriveRig):
 
     def currents_a(self, joint: int) -> list[float]:
         """Current limits that the driver has sent to an axis."""
-        limits = [frame for frame in self.sent if parted(frame) == (joint + 1, Message.SET_LIMITS)]
+        limits = [frame for frame in self.sent if split_id(frame) == (joint + 1, MessageId.SET_LIMITS)]
         return [struct.unpack("<ff", frame.data)[1] for frame in limits]
 
 
@@ -64,9 +65,9 @@ def robot() -> Iterator[Robot]:
 
 def endpoints_file(path: Path, **changed: Any) -> str:
     """A file as ODrive publishes one, of the emulated axes' firmware, with ids of its own."""
-    types = {Setting.WATCHDOG_ENABLED: "bool"}
+    types = {AxisSetting.WATCHDOG_ENABLED: "bool"}
     endpoints: dict[str, Any] = {
-        setting: {"id": 300 + i, "type": types.get(setting, "float")} for i, setting in enumerate(Setting)
+        setting: {"id": 300 + i, "type": types.get(setting, "float")} for i, setting in enumerate(AxisSetting)
     }
     content = {
         "fw_version": "0.6.11-1",
@@ -137,8 +138,8 @@ def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are
 ) -> None:
     made = CanDrives.__init__
 
-    def as_if_real(drives: Any, *rest: Any, **kit: Any) -> None:
-        made(drives, *rest, **kit | {"emulated": False})
+    def as_if_real(drives: Any, context: CanDrivesContext) -> None:
+        made(drives, replace(context, emulated=False))
 
     monkeypatch.setattr(CanDrives, "__init__", as_if_real)
     monkeypatch.setattr(OdriveBackend, "check_current", lambda *_: None)
@@ -177,7 +178,7 @@ def test_watchdog_and_speed_of_an_axis_are_as_the_robot_needs_them_or_it_is_refu
 
 def test_ids_come_from_the_file_of_the_firmware(tmp_path: Path) -> None:
     path = endpoints_file(tmp_path / "flat_endpoints.json")
-    assert read_endpoints(path).ids[Setting.CURRENT] != EMULATED.ids[Setting.CURRENT]
+    assert read_endpoints(path).ids[AxisSetting.CURRENT] != EMULATED.ids[AxisSetting.CURRENT]
     with pytest.raises(BackendError, match=r"joint_2 .* has a current limit"):
         Robot(endpoints=[path], mounted={"joint_2": MountedAxis(current_soft_max_a=10.0)})
     Robot(endpoints=[path]).backend.close()
@@ -197,7 +198,7 @@ def test_a_file_of_another_firmware_is_refused(tmp_path: Path) -> None:
     [
         ({"endpoints": {}}, "has no endpoint axis0.config.enable_watchdog"),
         (
-            {"endpoints": {s: {"id": 1, "type": "uint8"} for s in Setting}},
+            {"endpoints": {s: {"id": 1, "type": "uint8"} for s in AxisSetting}},
             "enable_watchdog has the type 'uint8', and this driver needs 'bool'",
         ),
         ({"endpoints": []}, r"flat_endpoints.json: .*`\$.endpoints`"),
@@ -222,7 +223,7 @@ def test_an_axis_that_does_not_say_what_it_is_configured_for_is_refused(monkeypa
 
 def test_questions_and_answers_are_those_of_odrives_examples() -> None:
     """Their form is `<BHB` and the value: opcode, endpoint, reserved; `can_param_access.py` of ODriveResources."""
-    assert read_setting(3, 271) == Frame(3 << 5 | 0x04, struct.pack("<BHB", 0, 271, 0))
-    assert setting_of(struct.pack("<BHBf", 0, 271, 0, 12.5)) == (271, struct.pack("<f", 12.5))
+    assert encode_setting_request(3, 271) == Frame(3 << 5 | 0x04, struct.pack("<BHB", 0, 271, 0))
+    assert decode_setting_answer(struct.pack("<BHBf", 0, 271, 0, 12.5)) == (271, struct.pack("<f", 12.5))
     with pytest.raises(struct.error):
-        setting_of(b"\0\1")
+        decode_setting_answer(b"\0\1")

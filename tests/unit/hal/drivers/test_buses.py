@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.odrive.protocol import State
+from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import ClockMode, Mode
@@ -48,7 +48,7 @@ class Robot(DriveRig):
         return [self.joints.angle_rad[i] for i in joints]
 
     def axes_follow(self) -> set[bool]:
-        return {axis.state == State.CLOSED_LOOP for axis in self.axes._emulator.axes}
+        return {axis.state == AxisState.CLOSED_LOOP for axis in self.axes._emulator.axes}
 
     def servos_follow(self) -> set[bool]:
         return {servo.on for servo in self.servos._emulator.servos}
@@ -65,7 +65,7 @@ class Robot(DriveRig):
                 self.run(1, "disarmed")
                 time.sleep(0.05)
                 return False
-            return all(self.enabled()) and self.backend._quiet <= 0
+            return all(self.enabled()) and self.backend._grace_cycles <= 0
 
         wait_until(is_armed, "arms", 20.0)
 

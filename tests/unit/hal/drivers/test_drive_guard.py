@@ -46,7 +46,7 @@ def test_a_pause_of_the_driver_is_remembered_until_states_were_read(bench: Bench
     bench.guard.mark_active()
     bench.guard.mark_active()
     assert bench.guard.was_away
-    bench.guard.states_were_read()
+    bench.guard.mark_states_read()
     assert not bench.guard.was_away
 
 
@@ -81,8 +81,8 @@ def test_what_a_drive_still_reports_right_after_a_reset_costs_nothing(bench: Ben
 
 
 def test_drives_that_the_bus_let_go_by_itself_stay_off_until_a_reset(bench: Bench) -> None:
-    assert not bench.guard.let_go(), "none was driven"
-    assert bench.armed() == BOTH and bench.guard.let_go()
+    assert not bench.guard.release_drives(), "none was driven"
+    assert bench.armed() == BOTH and bench.guard.release_drives()
     assert bench.armed() == NONE and bench.in_fault() == NONE
     bench.guard.reset(BOTH)
     assert bench.armed() == BOTH
@@ -95,17 +95,17 @@ EVERYBODY = frozenset({0, 1, 2})
 def test_a_joint_brakes_until_it_is_at_rest_and_for_its_watchdogs_time_at_most() -> None:
     braking, modes = Braking([100 * MS, 200 * MS, 100 * MS], holds=False), [Mode.VELOCITY] * 3
     for _ in range(2):  # a fault, and the next one
-        assert braking.joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
-        assert braking.joints(EVERYBODY, modes, VELOCITIES, 99 * MS) == {0, 1}
-        assert braking.joints(EVERYBODY, modes, VELOCITIES, 100 * MS) == {1}
-        assert braking.joints(EVERYBODY, modes, 10 * VELOCITIES, 100 * MS) == {1}, "none begins again"
-        assert braking.joints(EVERYBODY, modes, VELOCITIES, 200 * MS) == NONE
+        assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
+        assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 99 * MS) == {0, 1}
+        assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 100 * MS) == {1}
+        assert braking.select_braking_joints(EVERYBODY, modes, 10 * VELOCITIES, 100 * MS) == {1}, "none begins again"
+        assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 200 * MS) == NONE
         braking.reset()
 
 
 def test_what_holds_holds_without_an_end_and_what_is_passive_is_let_go() -> None:
     braking = Braking([100 * MS] * 3, holds=True)
-    assert braking.joints(EVERYBODY, [Mode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
-    assert braking.joints(EVERYBODY, [Mode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
+    assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
+    assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
     modes = [Mode.PASSIVE, Mode.POSITION, Mode.POSITION]
-    assert braking.joints(EVERYBODY, modes, VELOCITIES, 10_000 * MS) == {1, 2}
+    assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 10_000 * MS) == {1, 2}

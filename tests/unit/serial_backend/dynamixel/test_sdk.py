@@ -12,7 +12,7 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
-from snakesim_drivers.kit.drive_backend import Clock
+from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.model.fault_kinds import parse
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import emulator_on
@@ -59,7 +59,7 @@ class Bench:
 
     def __init__(self) -> None:
         config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
-        self.clock, self.pty = Clock(config), Pty()
+        self.clock, self.pty = DriverClock(config), Pty()
         self.emulator: EmulatedDynamixel = emulator_on(
             config, DynamixelSettings(physics_model="inertia"), [self.pty], self.clock, None
         )

@@ -1,0 +1,190 @@
+"""One bus with its drives, operated by the thread that calls it.
+
+Lockstep runs use `InlineBus`; `threaded_bus.ThreadedBus` does the same in a thread of its own.
+
+Drives stop by themselves while a driver is away. After a pause in which a watchdog may have expired, a bus first reads
+the state of every drive, and only then sends anything; see `drive_guard`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from snakesim_drivers.kit.drive_guard import RESET_GRACE_CYCLES, DriveGuard
+from snakesim_drivers.kit.drives import Drives
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.wire.messages import Mode
+
+MAX_GAP_WATCHDOGS = 0.5  # a longer pause, as a fraction of the watchdog's time, may have let watchdogs expire
+MAX_READS_AFTER_PAUSE = 3  # the computer may pause again while the states are read
+
+
+@dataclass(frozen=True)
+class BusSpec:
+    """Drives that share a wire, and how to open it."""
+
+    name: str  # such as can0
+    joints: tuple[int, ...]  # indices in the robot
+    open: Callable[[DriveReadings], Drives]  # gets the readings of these drives; raises ConfigError and BackendError
+    decimation: int = 1  # control cycles from one reading of this bus to the next
+    watchdog_s: float = 0.1  # of its drives
+
+
+class BusCommand(NamedTuple):
+    """SafeSetpoints of the drives of one bus, at their shafts. The fields are the arguments of `Drives.command`."""
+
+    following: frozenset[int]
+    modes: list[Mode]
+    targets: Floats
+    limits_nm: Floats
+    may_enable: bool
+    emergency: bool
+
+
+class InlineBus:
+    """A bus whose methods work at once, in the calling thread. Joints are numbered by their place on the bus."""
+
+    def __init__(self, spec: BusSpec, joints: Sequence[Joint], clock_ns: Callable[[], int], period_ns: int) -> None:
+        """Open the bus.
+
+        Args:
+            spec: The bus.
+            joints: All joints of the robot.
+            clock_ns: The driver's time.
+            period_ns: Duration of the robot's control cycle.
+
+        Raises:
+            ConfigError: the settings do not suit the bus.
+            BackendError: the bus cannot be opened.
+        """
+        self.spec = spec
+        self.readings = DriveReadings([joints[j] for j in spec.joints], clock_ns)
+        self.drives = spec.open(self.readings)
+        self.last_selection: tuple[frozenset[int], bool, bool] | None = None  # following, may_enable, emergency
+        self.injected_delay_s = 0.0  # of every reading; only a bus in a thread can be slow
+
+        gap_ns = round(MAX_GAP_WATCHDOGS * spec.watchdog_s * 1e9)
+        grace_ns = RESET_GRACE_CYCLES * spec.decimation * period_ns
+        self._gap_ns = gap_ns
+        self._guard = DriveGuard(clock_ns, gap_ns=gap_ns, grace_ns=grace_ns)
+        self._early_findings: list[Finding] = []  # found after a pause, before any setpoint was sent
+
+    def start(self) -> None:
+        """Prepare for control cycles. Called in each of them."""
+
+    def request_reading(self) -> bool:
+        """Read all drives. Returns False if the bus is still busy with an earlier request."""
+        if not self._recover_from_pause():
+            self._read_drives()
+        return True
+
+    def wait_for_reading(self, slices: int) -> int:
+        """Wait until the requested reading is complete.
+
+        Args:
+            slices: Slices of time that the host can still wait.
+
+        Returns:
+            The slices that are left.
+        """
+        return slices
+
+    def copy_readings_to(self, robot_readings: DriveReadings) -> None:
+        """Copy the last readings of this bus into those of the robot.
+
+        Raises:
+            BackendError: the bus has failed.
+        """
+        robot_readings.copy_from(self.readings, self.spec.joints)
+
+    def send(self, command: BusCommand) -> None:
+        """Send setpoints. They replace earlier ones that are not sent yet."""
+        self._recover_from_pause()
+        following = self._guard.drives_to_command(command.following, may_enable=command.may_enable)
+        self.drives.command(
+            following,
+            command.modes,
+            command.targets,
+            command.limits_nm,
+            may_enable=command.may_enable,
+            emergency=command.emergency,
+        )
+
+    def reset_faults(self, joints: frozenset[int]) -> None:
+        """Clear the errors of these drives before the next setpoints are sent."""
+        self._recover_from_pause()
+        self._guard.reset(joints)
+        self.drives.reset_faults(joints)
+
+    def poll(self) -> None:
+        """Receive what has arrived."""
+        self.drives.poll()
+
+    def findings(self) -> list[Finding]:
+        """Return what is wrong with the drives and the bus.
+
+        Raises:
+            BackendError: the bus has failed.
+        """
+        return self._collect_findings()
+
+    def request_close(self) -> None:
+        """Announce that `close` follows, so that all buses of a robot can stop at the same time."""
+
+    def close(self, deadline_s: float) -> None:
+        """Switch the drives off and close the bus.
+
+        Args:
+            deadline_s: Time of `time.monotonic` after which a bus that hangs is left alone.
+
+        Raises:
+            BackendError: the bus cannot be closed.
+        """
+        del deadline_s
+        self.drives.close()
+
+    # --- for the thread that operates the bus -----------------------------------------------------------------
+
+    def _recover_from_pause(self) -> bool:
+        """Read after a pause of the driver whether drives have stopped by themselves.
+
+        A stop that a drive has latched would be lost with the next command that switches it off or clears its errors.
+
+        Returns:
+            True if there was a pause, and the drives were read.
+        """
+        self._guard.mark_active()
+        if not self._guard.was_away:
+            return False
+        for _ in range(MAX_READS_AFTER_PAUSE):
+            self._guard.mark_states_read()
+            self.drives.poll()  # drops what drives sent before the pause: it does not tell their present state
+            self.readings.require_check(range(len(self.spec.joints)))
+            self._read_drives()
+            self._guard.mark_active()
+            if not self._guard.was_away:
+                break
+        self._early_findings = self._collect_findings()
+        return True
+
+    def _read_drives(self) -> None:
+        """Read all drives. Drives that have been silent for long are asked for their state as well."""
+        silent = [i for i in range(len(self.spec.joints)) if self.readings.age_ns(i) > self._gap_ns]
+        self.readings.require_check(silent)
+        self.readings.count_request()
+        self.drives.read()
+        self._guard.mark_active()
+
+    def _collect_findings(self) -> list[Finding]:
+        findings = [*self._early_findings, *self.drives.findings()]
+        self._early_findings = []
+        self._guard.note_findings(findings)
+        return findings
+
+
+def bus_findings(findings: list[Finding]) -> list[Finding]:
+    """Return the findings that concern a bus as a whole rather than one drive."""
+    return [finding for finding in findings if finding.joint is None]
