@@ -9,9 +9,9 @@ import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
-from snakesim_operator.features.console.drawing import LONGEST_M, M_PER_N, draw
-from snakesim_operator.features.console.polygon import force_polygon, push_point_table
-from snakesim_operator.features.console.snapshot import RobotSnapshot
+from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
+from snakesim_operator.features.console.scene.drawing import LONGEST_M, M_PER_N, draw
 from tests.unit.hal.rig import description, state
 
 ROBOT = description()
