@@ -23,7 +23,7 @@ from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.joint_step import BACKWARDS, ENTER, FORWARDS, JointStep
 from snakesim_operator.features.console.operations import PageLog
 from snakesim_operator.features.console.page.joint_table import Range, commissioning_html
-from snakesim_operator.features.console.page.page_html import plain
+from snakesim_operator.features.console.page.page_html import escape_text
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import PageAction
@@ -120,10 +120,10 @@ class Commissioning:
         self._table.content = commissioning_html(snapshot, self._config, moved)
         step = self._step
         if step is not None:
-            lines = "".join(f"<div>{plain(line)}</div>" for line in step.lines)
+            lines = "".join(f"<div>{escape_text(line)}</div>" for line in step.lines)
             self._said.content = (
                 f"<div data-step style='margin:.4em .6em;padding:.4em .6em;border:1px solid;border-radius:6px;"
-                f"font-size:.85em'><b>joints {plain(step.verb)}</b>{lines}</div>"
+                f"font-size:.85em'><b>joints {escape_text(step.verb)}</b>{lines}</div>"
             )
         self._typed.content = self._in_a_terminal(snapshot)
 
@@ -146,8 +146,8 @@ class Commissioning:
                 *texts,
             ]
         return "".join(
-            f"<div style='padding:.3em .6em;font-size:.82em'>{plain(what)}"
-            + "".join(f"<pre style='margin:.2em 0;white-space:pre-wrap'>{plain(line)}</pre>" for line in typed)
+            f"<div style='padding:.3em .6em;font-size:.82em'>{escape_text(what)}"
+            + "".join(f"<pre style='margin:.2em 0;white-space:pre-wrap'>{escape_text(line)}</pre>" for line in typed)
             + "</div>"
             for what, typed in texts
         )
@@ -207,7 +207,7 @@ class CommissioningControls:
     def _describe(self) -> None:
         """What the chosen step is, and its inputs alone."""
         verb = self._verb.value
-        self._about.content = f"<div style='padding:.2em .6em;font-size:.85em'>{plain(STEPS[verb])}</div>"
+        self._about.content = f"<div style='padding:.2em .6em;font-size:.85em'>{escape_text(STEPS[verb])}</div>"
         self._joint.visible, self._enter.visible = verb != "zero", verb != "jog"
         for one in (self._speed, self._travel, self._torque, self._forwards, self._backwards):
             one.visible = verb == "jog"

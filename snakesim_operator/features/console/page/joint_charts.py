@@ -1,4 +1,4 @@
-"""Live charts: every joint now, and the last seconds of all joints."""
+"""Live charts of the joints: every joint now, and the last seconds of all joints."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,132 +10,176 @@ import viser
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.scene.drawing import pushing_joint
-from snakesim_operator.features.console.scene.robot_scene import PROPELS
+from snakesim_operator.features.console.scene.drawing import find_propulsion_joint
+from snakesim_operator.features.console.scene.scene_colors import PROPULSION_JOINT
 from snakesim_operator.results.page.palette import joint_colors
 
 HISTORY_S = 10.0
-SAMPLES_MOST = 400
-ANGLE, REFERENCE, LIMIT = "#0067b0", "#c8321f", "#8b95a1"
-PUSH = "#" + bytes(PROPELS).hex()
-
+MAX_SAMPLES = 400  # of one chart's history
+CHART_HEIGHT_PX = 190
+MEASURED = "#0067b0"
+REFERENCE = "#c8321f"
+LIMIT = "#8b95a1"
+PROPULSION = "#" + bytes(PROPULSION_JOINT).hex()
 
 SampleT = TypeVar("SampleT", bound=tuple[Any, ...])
 
 
-def keep(history: deque[SampleT], sample: SampleT) -> None:
-    """Add a sample, of a time and values, if it is later by enough; after going back history begins with it."""
+def add_sample(history: deque[SampleT], sample: SampleT) -> None:
+    """Add a sample of a time in s and values, unless it follows the last one too closely.
+
+    A sample that is earlier than the last one starts the history again.
+    """
     if history and sample[0] < history[-1][0]:
         history.clear()
-    if not history or sample[0] - history[-1][0] >= HISTORY_S / SAMPLES_MOST:
+    if not history or sample[0] - history[-1][0] >= HISTORY_S / MAX_SAMPLES:
         history.append(sample)
 
 
 class JointCharts:
-    """Angles against references and torques against limits, joint by joint; and both over time."""
+    """Angles against references and torques against limits, joint by joint, and both over time."""
 
     def __init__(self, gui: viser.GuiApi, robot: Description) -> None:
-        count = len(robot.joints)
-        self._limits = np.array([joint.torque_limit_nm for joint in robot.joints])
         self._names = [joint.name for joint in robot.joints]
-        self._number = np.arange(1.0, count + 1)
-        self._history: deque[tuple[float, Floats, Floats]] = deque(maxlen=SAMPLES_MOST)
-        angles = np.array([max(-joint.angle_min_rad, joint.angle_max_rad) for joint in robot.joints])
-        unknown = np.full(count, np.nan)
-        self._angles = gui.add_uplot(
-            (self._number, unknown, unknown),
-            ({"label": "joint"}, line("measured", ANGLE, dots=True), line("reference", REFERENCE, dash=True)),
+        self._numbers = np.arange(1.0, len(robot.joints) + 1)
+        self._torque_limits_nm = np.array([joint.torque_limit_nm for joint in robot.joints])
+        self._history: deque[tuple[float, Floats, Floats]] = deque(maxlen=MAX_SAMPLES)  # time, angles, torques
+
+        max_angles_rad = np.array([max(-joint.angle_min_rad, joint.angle_max_rad) for joint in robot.joints])
+        angle_scale = _fixed_scale(max_angles_rad)
+        torque_scale = _fixed_scale(self._torque_limits_nm)
+        self._angle_chart = self._add_angle_chart(gui, angle_scale)
+        self._torque_chart = self._add_torque_chart(gui, torque_scale)
+        self._angle_history_chart = add_history_chart(
+            gui, self._names, "Angle of all joints, last 10 s, rad", angle_scale, legend={"show": False}
+        )
+        self._torque_history_chart = add_history_chart(
+            gui, self._names, "Torque of all joints, last 10 s, N·m", torque_scale, legend={"show": False}
+        )
+
+    def _add_angle_chart(self, gui: viser.GuiApi, scale: dict[str, Any]) -> viser.GuiUplotHandle:
+        unknown = np.full(len(self._names), np.nan)
+        lines = (
+            {"label": "joint"},
+            chart_line("measured", MEASURED, dots=True),
+            chart_line("reference", REFERENCE, dash=True),
+        )
+        return gui.add_uplot(
+            (self._numbers, unknown, unknown),
+            lines,  # pyright: ignore[reportArgumentType] - dictionaries of uPlot's options
             title="Angle of each joint, rad (tail to head)",
-            height=190,
-            scales={"x": {"time": False}, "y": _range(angles)},
+            height=CHART_HEIGHT_PX,
+            scales={"x": {"time": False}, "y": scale},  # pyright: ignore[reportArgumentType]
         )
-        self._torques = gui.add_uplot(
-            (self._number, unknown, self._limits, -self._limits, unknown),
-            (
-                {"label": "joint"},
-                line("measured", ANGLE, dots=True),
-                line("limit", LIMIT, dash=True),
-                line("-limit", LIMIT, dash=True),
-                line("propulsion", PUSH, dots=True, size=12),
-            ),
+
+    def _add_torque_chart(self, gui: viser.GuiApi, scale: dict[str, Any]) -> viser.GuiUplotHandle:
+        unknown = np.full(len(self._names), np.nan)
+        lines = (
+            {"label": "joint"},
+            chart_line("measured", MEASURED, dots=True),
+            chart_line("limit", LIMIT, dash=True),
+            chart_line("-limit", LIMIT, dash=True),
+            chart_line("propulsion", PROPULSION, dots=True, dot_size_px=12),
+        )
+        return gui.add_uplot(
+            (self._numbers, unknown, self._torque_limits_nm, -self._torque_limits_nm, unknown),
+            lines,  # pyright: ignore[reportArgumentType] - dictionaries of uPlot's options
             title="Torque of each joint, N·m",
-            height=190,
-            scales={"x": {"time": False}, "y": _range(self._limits)},
-        )
-        self._angles_then, self._torques_then = (
-            over_time(gui, self._names, title, {"y": _range(most)}, legend={"show": False})
-            for title, most in (
-                ("Angle of all joints, last 10 s, rad", angles),
-                ("Torque of all joints, last 10 s, N·m", self._limits),
-            )
+            height=CHART_HEIGHT_PX,
+            scales={"x": {"time": False}, "y": scale},  # pyright: ignore[reportArgumentType]
         )
 
     def remove(self) -> None:
-        """Take them off the page."""
-        for chart in (self._angles, self._torques, self._angles_then, self._torques_then):
-            chart.remove()
+        """Remove the charts from the page."""
+        self._angle_chart.remove()
+        self._torque_chart.remove()
+        self._angle_history_chart.remove()
+        self._torque_history_chart.remove()
 
-    def take(self, snapshot: RobotSnapshot) -> None:
-        """Keep a sample for the charts over time; each frame."""
-        joints, time_s = snapshot.joints, snapshot.time_s
-        if joints is not None and time_s is not None:
-            keep(self._history, (time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
+    def add_snapshot(self, snapshot: RobotSnapshot) -> None:
+        """Keep a sample for the charts over time; called for each frame."""
+        joints = snapshot.joints
+        if joints is None or snapshot.time_s is None:
+            return
+        add_sample(self._history, (snapshot.time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
 
     def show(self, snapshot: RobotSnapshot) -> None:
-        """Redraw them; a few times a second."""
+        """Redraw all charts; called a few times a second."""
         joints = snapshot.joints
         if joints is None:
             return
-        measured = np.where(joints.valid, joints.angle_rad, np.nan)
-        self._angles.data = (self._number, measured, references_rad(snapshot))
-        derated = {} if snapshot.status is None else snapshot.status.derated
-        limits = np.array([derated.get(name, 1.0) for name in self._names]) * self._limits
-        torque = np.where(joints.valid, joints.torque_nm, np.nan)
-        pushing = pushing_joint(snapshot)
-        marked = np.where(np.arange(len(torque)) == pushing, torque, np.nan)
-        self._torques.data = (self._number, torque, limits, -limits, marked)
+        angles_rad = np.where(joints.valid, joints.angle_rad, np.nan)
+        self._angle_chart.data = (self._numbers, angles_rad, find_references_rad(snapshot))
+        torques_nm = np.where(joints.valid, joints.torque_nm, np.nan)
+        limits_nm = self._find_torque_limits_nm(snapshot)
+        is_propulsion = np.arange(len(torques_nm)) == find_propulsion_joint(snapshot)
+        propulsion_nm = np.where(is_propulsion, torques_nm, np.nan)
+        self._torque_chart.data = (self._numbers, torques_nm, limits_nm, -limits_nm, propulsion_nm)
         if len(self._history) > 1:
-            times = np.array([sample[0] for sample in self._history])
-            kept = times >= times[-1] - HISTORY_S
-            for chart, which in ((self._angles_then, 1), (self._torques_then, 2)):
-                values = np.array([sample[which] for sample in self._history])[kept]
-                chart.data = (times[kept], *np.ascontiguousarray(values.T))
+            self._show_history()
+
+    def _find_torque_limits_nm(self, snapshot: RobotSnapshot) -> Floats:
+        """Return the torque limit of each joint, reduced where the host has derated it."""
+        if snapshot.status is None:
+            return self._torque_limits_nm
+        fractions = [snapshot.status.derated.get(name, 1.0) for name in self._names]
+        return np.array(fractions) * self._torque_limits_nm
+
+    def _show_history(self) -> None:
+        times_s = np.array([time_s for time_s, _, _ in self._history])
+        is_recent = times_s >= times_s[-1] - HISTORY_S
+        angles_rad = np.array([angles for _, angles, _ in self._history])[is_recent]
+        torques_nm = np.array([torques for _, _, torques in self._history])[is_recent]
+        self._angle_history_chart.data = (times_s[is_recent], *np.ascontiguousarray(angles_rad.T))
+        self._torque_history_chart.data = (times_s[is_recent], *np.ascontiguousarray(torques_nm.T))
 
 
-def references_rad(snapshot: RobotSnapshot) -> Floats:
-    """Where each joint is to be: the controller's reference, else the target of joints in position mode; else NaN."""
+def find_references_rad(snapshot: RobotSnapshot) -> Floats:
+    """Return the angle at which each joint is to be, (joints,).
+
+    This is the controller's reference, else the target of joints in position mode, else NaN.
+    """
     count = len(snapshot.robot.joints)
-    control, applied = snapshot.control, snapshot.applied
+    control = snapshot.control
     if control is not None and len(control.reference_rad) == count:
         return np.array(control.reference_rad)
+    applied = snapshot.applied
     if applied is not None and len(applied.target) == len(applied.mode) == count:
         return np.where(np.array(applied.mode) == Mode.POSITION, applied.target, np.nan)
     return np.full(count, np.nan)
 
 
-def _range(most: Floats) -> Any:
-    """A fixed scale up to the limits: one sees how much is left, and values that are unknown do not matter."""
-    return {"range": (-1.05 * float(most.max()), 1.05 * float(most.max()))}
+def _fixed_scale(limits: Floats) -> dict[str, Any]:
+    """Return a scale that ends just beyond the largest limit: viewers see how much is left below it."""
+    end = 1.05 * float(limits.max())
+    return {"range": (-end, end)}
 
 
-def over_time(gui: viser.GuiApi, names: Sequence[str], title: str, scale: Any = None, **more: Any) -> Any:
-    """A chart with a line for each name, still empty. scale: of the values; None: as they come."""
+def add_history_chart(
+    gui: viser.GuiApi, names: Sequence[str], title: str, scale: dict[str, Any] | None = None, **options: Any
+) -> viser.GuiUplotHandle:
+    """Add a chart over time with an empty line for each name. scale: of the values; None adapts it to them."""
     colors = joint_colors(len(names), dark=True).values()
+    lines = [chart_line(name, color) for name, color in zip(names, colors, strict=True)]
+    no_values = [np.full(1, np.nan)] * len(names)
+    scales: dict[str, Any] = {"x": {"time": False}}
+    if scale is not None:
+        scales["y"] = scale
     return gui.add_uplot(
-        (np.zeros(1), *[np.full(1, np.nan)] * len(names)),
-        ({"label": "s"}, *(line(name, color) for name, color in zip(names, colors, strict=True))),
+        (np.zeros(1), *no_values),
+        ({"label": "s"}, *lines),
         title=title,
-        height=190,
-        scales={"x": {"time": False}, **(scale or {})},
-        **more,
+        height=CHART_HEIGHT_PX,
+        scales=scales,
+        **options,
     )
 
 
-def line(label: str, stroke: str, *, dash: bool = False, dots: bool = False, size: int = 5) -> Any:
-    """One line of a chart."""
-    series: dict[str, Any] = {"label": label, "stroke": stroke, "width": 1.5, "points": {"show": False}}
+def chart_line(label: str, color: str, *, dash: bool = False, dots: bool = False, dot_size_px: int = 5) -> Any:
+    """Return the options of one line of a chart."""
+    line: dict[str, Any] = {"label": label, "stroke": color, "width": 1.5, "points": {"show": False}}
     if dash:
-        series["dash"] = [5, 4]
+        line["dash"] = [5, 4]
     if dots:
-        series["points"] = {"show": True, "size": size, "fill": stroke}
-    return series
+        line["points"] = {"show": True, "size": dot_size_px, "fill": color}
+    return line

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import JointDescription
-from snakesim_operator.features.console.page.page_html import BAD, plain
+from snakesim_operator.features.console.page.page_html import BAD, escape_text
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 Range = tuple[float, float]
@@ -30,7 +30,7 @@ def _checked(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     if robot.emulated:
         return "<div>nothing real moves: its joints need no check</div>"
     if status is not None and status.unchecked:
-        return f"<div style='color:{BAD}'>not checked: {plain(status.unchecked)}</div>"
+        return f"<div style='color:{BAD}'>not checked: {escape_text(status.unchecked)}</div>"
     if config is None or status is None:
         return "<div>whether it was checked is not known: its host has not said how it is set up</div>"
     checked = config.robot.checked
@@ -39,7 +39,7 @@ def _checked(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     parts = [f"{name} of {', '.join(joints)}" for name, joints in checked.by_hand.items()]
     by_hand = f"; by hand: {'; '.join(parts)}" if parts else ""
     on = f"{checked.backend} {checked.hardware}".strip()
-    return f"<div>{plain(f'checked by {checked.by} on {checked.on}, on {on}{by_hand}')}</div>"
+    return f"<div>{escape_text(f'checked by {checked.by} on {checked.on}, on {on}{by_hand}')}</div>"
 
 
 def _row(snapshot: RobotSnapshot, i: int, config: RunConfig | None, moved: Sequence[Range]) -> str:
@@ -49,11 +49,10 @@ def _row(snapshot: RobotSnapshot, i: int, config: RunConfig | None, moved: Seque
     built = None if config is None else config.robot.joint_table[i]
     sign, zero = ("?", "?") if built is None else (f"{built.drive.sign:+d}", f"{built.drive.zero_rad:+.4f}")
     cells = "".join(f"<td style='padding-right:.8em'>{cell}</td>" for cell in (now, limits, sign, zero))
-    name = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{plain(described.name)}</td>"
+    name = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{escape_text(described.name)}</td>"
     seen = f"<div>moved from {moved[i][0]:+.3f} to {moved[i][1]:+.3f} rad</div>" if moved else ""
-    below = (
-        f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{plain(_drive(described, built))}{seen}</td>"
-    )
+    drive = escape_text(_drive(described, built))
+    below = f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{seen}</td>"
     return f"<tr>{name}{cells}</tr><tr>{below}</tr>"
 
 

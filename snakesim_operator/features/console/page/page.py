@@ -27,13 +27,13 @@ from snakesim_operator.features.console.page.viewer_controls import (
     KEYS,
     ViewerControls,
     add_appearance,
+    format_viewer,
     set_appearance,
-    viewer_name,
 )
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.scene import robot_scene
 from snakesim_operator.features.console.scene.drawing import Surroundings, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
+from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.message_age import PageAction
 from snakesim_operator.features.console.web.server import PageServer
 
@@ -41,16 +41,6 @@ TEXT_EVERY, CHARTS_EVERY, PICTURES_EVERY = 6, 5, 6  # frames
 ASK_EVERY = 3  # frames between two questions to the page in control: ten a second
 PANEL_PX = 460  # wide enough for all tabs in one line
 VIEW_RAD = 0.75  # vertical angle of view
-LEGEND = (
-    ("obstacle", robot_scene.PEG),
-    ("perceived", robot_scene.SEEN),
-    ("pushed off", robot_scene.PUSHED),
-    ("push-point ahead", robot_scene.AHEAD),
-    ("contact force", robot_scene.FELT),
-    ("solved force; dashed: no contact felt there", robot_scene.SOLVED),
-    ("resultant", robot_scene.RESULTANT),
-    ("propulsion joint", robot_scene.PROPELS),
-)
 
 
 class Page:
@@ -142,7 +132,7 @@ class Page:
                 self._give_controls(client)
             if self._moment is not None:
                 _aim(client, self._moment.robot)
-            self._log.write(f"{viewer_name(client.client_id)} came")
+            self._log.write(f"{format_viewer(client.client_id)} came")
         if client.client_id not in self._server.get_clients():
             self._forget(client.client_id)
 
@@ -168,7 +158,7 @@ class Page:
         """Control returns with the page that had it."""
         self._forget(client.client_id)
         had = self._token.release(client.client_id)
-        self._log.write(f"{viewer_name(client.client_id)} left{', and with it control' if had else ''}")
+        self._log.write(f"{format_viewer(client.client_id)} left{', and with it control' if had else ''}")
         self._control_changed()
 
     def _forget(self, viewer: int) -> None:
@@ -204,7 +194,7 @@ class Page:
     def _estop(self, viewer: int, _action: PageAction) -> None:
         """Stop the robot, however old the press is. A page that cannot draw the scene has no controls, but may stop."""
         assert self._operations is not None
-        stopped = self._operations.stop.request(viewer_name(viewer))
+        stopped = self._operations.stop.request(format_viewer(viewer))
         controls = self._controls.get(viewer)  # without the lock: whoever holds it may wait for this thread
         if controls is not None:
             stopped.add_done_callback(partial(self._show_stop, controls))
@@ -226,11 +216,11 @@ class Page:
                 self._meet(snapshot.robot)
                 self._moment = snapshot
             assert self._charts is not None
-            self._charts.take(snapshot)  # going back forgets
+            self._charts.add_snapshot(snapshot)  # going back forgets
             if self._own_sensors is not None:
-                self._own_sensors.take(snapshot)
+                self._own_sensors.add_snapshot(snapshot)
         if self._stage is not None:
-            self._stage.forget()
+            self._stage.clear_trail()
         self._frames = 0
 
     # --- each frame ------------------------------------------------------------------------------------------
@@ -259,9 +249,9 @@ class Page:
         if drawing is not None:
             with self._server.atomic():
                 self._stage.show(drawing)
-        self._charts.take(snapshot)
+        self._charts.add_snapshot(snapshot)
         if self._own_sensors is not None:
-            self._own_sensors.take(snapshot)
+            self._own_sensors.add_snapshot(snapshot)
         if self._frames % CHARTS_EVERY == 1:
             self._charts.show(snapshot)
             self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
@@ -314,7 +304,7 @@ class Page:
             return
         holder = self._token.holder
         viewers = self._server.viewers()
-        control = f"{viewer_name(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
+        control = f"{format_viewer(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
         if dropped := self._server.admission.dropped.total():
             control += f"; {dropped} message{'' if dropped == 1 else 's'} of browsers dropped"
         self._header.content = page_html.header(snapshot, control=control)

@@ -19,7 +19,7 @@ SIGNALS = (
 )
 
 
-def plain(text: object) -> str:
+def escape_text(text: object) -> str:
     """Text from anywhere, harmless in a page."""
     return escape(printable(str(text)))
 
@@ -40,16 +40,20 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
         return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
     if snapshot.expected:
         return _bar(
-            "WAITING FOR THE ROBOT", RECORDED, f"{plain(snapshot.robot.robot)}, drawn as its scenario places it"
+            "WAITING FOR THE ROBOT", RECORDED, f"{escape_text(snapshot.robot.robot)}, drawn as its scenario places it"
         )
     words, color = backend_in_words(snapshot.robot)
-    where = f"{plain(snapshot.robot.robot)}{' · ' + plain(snapshot.robot.hardware) if snapshot.robot.hardware else ''}"
+    where = escape_text(snapshot.robot.robot)
+    if snapshot.robot.hardware:
+        where += f" · {escape_text(snapshot.robot.hardware)}"
     status = snapshot.status
     if recorded:
-        words, color, where = f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}"
+        words = f"RECORDING OF: {words}"
+        color = RECORDED
+        where += f" · {escape_text(recorded)}"
     lines = [_bar(words, color, where)]
     if status is not None and status.paused_by is not None:
-        lines.append(_bar("PAUSED", RECORDED, f"by {plain(status.paused_by)}; robot time stands"))
+        lines.append(_bar("PAUSED", RECORDED, f"by {escape_text(status.paused_by)}; robot time stands"))
     if len(snapshot.hosts) > 1:
         lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
     if snapshot.silent_s > SILENT_S:
@@ -59,7 +63,7 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
     if (said := snapshot.control) is not None:
         lines.append(_state(said.state, STATE_COLOURS[said.state], said.reason, ".35em"))
     if control:
-        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{plain(control)}</div>")
+        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
 
 
@@ -68,14 +72,14 @@ def _state(word: str, color: str, why: str, above: str) -> str:
     return (
         f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{above}'>"
         f"<span style='background:{color};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
-        f"white-space:nowrap'>{plain(word)}</span><span>{plain(why)}</span></div>"
+        f"white-space:nowrap'>{escape_text(word)}</span><span>{escape_text(why)}</span></div>"
     )
 
 
 def _bar(words: str, color: str, below: str) -> str:
     return (
         f"<div style='background:{color};color:#fff;border-radius:6px;padding:.35em .6em;margin:.3em .6em .3em .3em'>"
-        f"<div style='font-size:1.3em;font-weight:700;letter-spacing:.03em'>{plain(words)}</div>"
+        f"<div style='font-size:1.3em;font-weight:700;letter-spacing:.03em'>{escape_text(words)}</div>"
         f"<div style='opacity:.9'>{below}</div></div>"
     )
 
@@ -83,71 +87,90 @@ def _bar(words: str, color: str, below: str) -> str:
 def _warning(text: str) -> str:
     return (
         f"<div style='border:2px solid {BAD};color:{BAD};border-radius:6px;padding:.3em .6em;margin-top:.4em;"
-        f"font-weight:600'>{plain(text)}</div>"
+        f"font-weight:600'>{escape_text(text)}</div>"
     )
 
 
 def state_table(snapshot: RobotSnapshot) -> str:
-    """Lease, commands, faults, warnings, health."""
-    status = snapshot.status
+    """Return a table of lease, commands, warnings and health, and the list of faults below it."""
     rows: list[tuple[str, str]] = []
-    if status is not None:
-        time_s = "" if snapshot.time_s is None else f"{snapshot.time_s:.2f} s · "
-        rows = [
-            ("robot time", f"{time_s}tick {status.tick}, {status.clock_mode} at {status.rate_hz:g} Hz"),
-            ("lease", f"{plain(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
-            ("alive", plain(", ".join(status.alive) or "none")),
-            ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed"),
-            ("rejected", _counts(status.commands_rejected)),
-            ("limited", _counts(status.commands_limited)),
-            ("overruns", f"{status.overruns}"),
-        ]
-        rows += [("speed", _speed(status))] if status.real_time_factor is not None else []
-        rows += [("waiting for", plain(", ".join(status.waiting_for)))] if status.waiting_for else []
-        rows += [("derated", plain(f"{joint}: {100 * share:.0f} %")) for joint, share in sorted(status.derated.items())]
-        rows += [("isolated", plain(", ".join(status.isolated)))] if status.isolated else []
-        rows += [("not checked", plain(status.unchecked))] if status.unchecked else []
-        rows += [("injected", plain(what)) for what in status.injected]
-        rows += [("real time", plain(what)) for what in status.realtime_warnings]
-    return table([*rows, *_health(snapshot)]) + faults(status)
+    if snapshot.status is not None:
+        rows += _status_rows(snapshot.status, snapshot.time_s)
+        rows += _warning_rows(snapshot.status)
+    rows += _health_rows(snapshot)
+    return table(rows) + faults(snapshot.status)
 
 
-def _speed(status: Status) -> str:
+def _status_rows(status: Status, time_s: float | None) -> list[tuple[str, str]]:
+    """Return the rows that every status has."""
+    robot_time = "" if time_s is None else f"{time_s:.2f} s · "
+    return [
+        ("robot time", f"{robot_time}tick {status.tick}, {status.clock_mode} at {status.rate_hz:g} Hz"),
+        ("lease", f"{escape_text(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
+        ("alive", escape_text(", ".join(status.alive) or "none")),
+        ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed"),
+        ("rejected", _format_counts(status.commands_rejected)),
+        ("limited", _format_counts(status.commands_limited)),
+        ("overruns", f"{status.overruns}"),
+    ]
+
+
+def _warning_rows(status: Status) -> list[tuple[str, str]]:
+    """Return the rows that are shown only when they have something to report."""
+    rows: list[tuple[str, str]] = []
+    if status.real_time_factor is not None:
+        rows.append(("speed", _format_speed(status)))
+    if status.waiting_for:
+        rows.append(("waiting for", escape_text(", ".join(status.waiting_for))))
+    for joint, fraction in sorted(status.derated.items()):
+        rows.append(("derated", escape_text(f"{joint}: {100 * fraction:.0f} %")))
+    if status.isolated:
+        rows.append(("isolated", escape_text(", ".join(status.isolated))))
+    if status.unchecked:
+        rows.append(("not checked", escape_text(status.unchecked)))
+    rows += [("injected", escape_text(fault)) for fault in status.injected]
+    rows += [("real time", escape_text(warning)) for warning in status.realtime_warnings]
+    return rows
+
+
+def _format_speed(status: Status) -> str:
     wanted = f", {status.speed:g} wanted" if status.speed != 1.0 else ""
     return f"{status.real_time_factor:.2f} of the wall clock{wanted}"
 
 
 def faults(status: Status | None) -> str:
-    """The faults since the last clear."""
+    """Return the faults since the last reset as a list; empty when there are none."""
     if status is None or not status.faults:
         return ""
-    items = [
-        f"<li><b>{plain(fault.what)}</b>{' at ' + plain(fault.joint) if fault.joint else ''}, tick {fault.tick}: "
-        f"{plain(fault.cause)}</li>"
-        for fault in status.faults
-    ]
-    more = f"<li>and {status.faults_left_out} more</li>" if status.faults_left_out else ""
-    return f"<div style='padding:0 .6em;font-size:.85em;color:{BAD}'>Faults<ul>{''.join(items)}{more}</ul></div>"
+    items: list[str] = []
+    for fault in status.faults:
+        place = f" at {escape_text(fault.joint)}" if fault.joint else ""
+        cause = escape_text(fault.cause)
+        items.append(f"<li><b>{escape_text(fault.what)}</b>{place}, tick {fault.tick}: {cause}</li>")
+    if status.faults_left_out:
+        items.append(f"<li>and {status.faults_left_out} more</li>")
+    style = f"padding:0 .6em;font-size:.85em;color:{BAD}"
+    return f"<div style='{style}'>Faults<ul>{''.join(items)}</ul></div>"
 
 
-def _health(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
+def _health_rows(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
     power, joints = snapshot.power, snapshot.robot.joints
     if power is None or not power.motor_c:
         return []
     hottest = max(range(len(joints)), key=lambda i: power.motor_c[i])
     rows = [
-        ("hottest motor", f"{plain(joints[hottest].name)}: {power.motor_c[hottest]:.1f} °C"),
+        ("hottest motor", f"{escape_text(joints[hottest].name)}: {power.motor_c[hottest]:.1f} °C"),
         ("boards", f"up to {max(power.board_c):.1f} °C"),
         ("supply", f"{min(power.voltage_v):.1f} V at least, {sum(power.current_a):.2f} A in sum"),
     ]
     wet = [joint.name for joint, leak in zip(joints, power.leak, strict=True) if leak]
-    return [*rows, ("WATER", plain(", ".join(wet)))] if wet else rows
+    return [*rows, ("WATER", escape_text(", ".join(wet)))] if wet else rows
 
 
 def stream_table(snapshot: RobotSnapshot) -> str:
     """Rates and ages of all keys."""
     rows = [
-        (plain(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
+        (escape_text(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
         for key, stream in sorted(snapshot.streams.items())
     ]
     return table(rows)
@@ -155,21 +178,21 @@ def stream_table(snapshot: RobotSnapshot) -> str:
 
 def log(lines: Iterable[str]) -> str:
     """The newest lines first."""
-    items = "".join(f"<div style='padding:.1em 0'>{plain(line)}</div>" for line in lines)
+    items = "".join(f"<div style='padding:.1em 0'>{escape_text(line)}</div>" for line in lines)
     return f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
 
 
 def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
     """What the colors of the scene mean."""
     marks = "".join(
-        f"<span style='white-space:nowrap'><span style='color:rgb{color}'>&#9632;</span> {plain(what)}</span> "
+        f"<span style='white-space:nowrap'><span style='color:rgb{color}'>&#9632;</span> {escape_text(what)}</span> "
         for what, color in entries
     )
     return f"<div style='padding:.2em .6em .9em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
 
 
-def _counts(numbers: dict[str, int]) -> str:
-    return plain(", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none")
+def _format_counts(numbers: dict[str, int]) -> str:
+    return escape_text(", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none")
 
 
 def table(rows: Iterable[tuple[str, str]]) -> str:

@@ -17,7 +17,7 @@ from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.features.console.page.commissioning_tab import Commissioning, CommissioningControls
-from snakesim_operator.features.console.page.page_html import BAD, plain
+from snakesim_operator.features.console.page.page_html import BAD, escape_text
 from snakesim_operator.features.console.page.settings_form import SettingsForm
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission, in_words
@@ -119,7 +119,7 @@ class ViewerControls:
     @property
     def who(self) -> str:
         """The viewer's name."""
-        return viewer_name(self.viewer)
+        return format_viewer(self.viewer)
 
     def show(self) -> None:
         """Enable what this viewer may use now."""
@@ -128,7 +128,7 @@ class ViewerControls:
         self._take.color = "gray" if mine else "blue"
         self._take.disabled = holder is not None and not mine
         taken = holder not in (None, self.viewer)
-        self._take.hint = f"{viewer_name(holder)} has control, and may release it" if taken else None
+        self._take.hint = f"{format_viewer(holder)} has control, and may release it" if taken else None
         for one in (self._lifecycle, self._heading, self._speed, self._drive, self._faults):
             one.visible = mine
         snapshot = self._moment()
@@ -162,7 +162,7 @@ class ViewerControls:
     def _take_or_release(self) -> None:
         if not self._token.release(self.viewer):
             if not self._token.take(self.viewer):
-                self.tell("Not in control", f"{viewer_name(self._token.holder)} has it", bad=True)
+                self.tell("Not in control", f"{format_viewer(self._token.holder)} has it", bad=True)
             elif (body_w_rad := self._body_w_rad()) is not None:
                 self._heading.value = _degrees(body_w_rad)  # straight on, until asked to turn
         self._changed()
@@ -195,7 +195,9 @@ class ViewerControls:
     def _show_unchecked(self, snapshot: RobotSnapshot | None) -> None:
         why = "" if snapshot is None or snapshot.status is None else snapshot.status.unchecked
         self._offers_unchecked &= bool(why)
-        self._why_unchecked.content = f"<div style='padding:.3em .6em;font-size:.85em;color:{BAD}'>{plain(why)}</div>"
+        self._why_unchecked.content = (
+            f"<div style='padding:.3em .6em;font-size:.85em;color:{BAD}'>{escape_text(why)}</div>"
+        )
         self._why_unchecked.visible = self._arm_unchecked.visible = self._offers_unchecked
 
     def _change_time(self, action: str) -> None:
@@ -296,7 +298,7 @@ def _degrees(angle_rad: float) -> int:
     return 5 * round(math.degrees(angle_rad) / 5)
 
 
-def viewer_name(viewer: int | None) -> str:
+def format_viewer(viewer: int | None) -> str:
     """A viewer in words."""
     return "nobody" if viewer is None else f"viewer {viewer + 1}"
 

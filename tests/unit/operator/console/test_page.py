@@ -14,9 +14,9 @@ from snakesim_operator.base.console_port import address_of, open_port
 from snakesim_operator.base.page_origin import why_refused
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.page import page_html
-from snakesim_operator.features.console.page.page import LEGEND
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, expected_snapshot
 from snakesim_operator.features.console.scene.drawing import draw
+from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.server import page_server
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description, status

@@ -16,15 +16,17 @@ def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
     point = contact((0.0, 10.0, 0.0))
     control = pushing([point], [10.0])
     with page_server(open_port(None)) as (server, _):
-        stage = RobotScene(server.scene, description(), None)
+        scene = RobotScene(server.scene, description(), None)
         for felt in ([], [point], []):
             snapshot = RobotSnapshot(robot=description(), body=joints(), world=world(felt, []), control=control)
             drawing = draw(snapshot, None)
             assert drawing is not None
-            stage.show(drawing)
-            solved = stage._arrows.get("forces/solved")
-            assert stage._asked.visible is not bool(felt) and (solved is not None and solved.visible) is bool(felt)
-        ends = stage._asked.points.reshape(-1, 3)
+            scene.show(drawing)
+            desired = scene._arrows.get("forces/desired")
+            assert scene._dashed_forces.visible is not bool(felt) and (desired is not None and desired.visible) is bool(
+                felt
+            )
+        ends = scene._dashed_forces.points.reshape(-1, 3)
         assert len(ends) == 10 and ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
 
 
@@ -35,11 +37,11 @@ def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
         Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), felt=True),
     ]
     with page_server(open_port(None)) as (server, _):
-        stage = RobotScene(server.scene, description(), None)
+        scene = RobotScene(server.scene, description(), None)
         for obstacles in (found, []):
             drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world([], obstacles)), None)
             assert drawing is not None
-            stage.show(drawing)
-            shown = [batch for name, batch in stage._shapes.items() if name.startswith("perceived")]
+            scene.show(drawing)
+            shown = list(scene._perceived_obstacles.meshes.batches.values())
             assert [batch.visible for batch in shown] == [bool(obstacles)] * 3
             assert sorted(float(batch.batched_positions[0, 0]) for batch in shown) == [1.0, 2.0, 3.0]
