@@ -20,12 +20,12 @@ SIGNALS = (
 
 
 def escape_text(text: object) -> str:
-    """Text from anywhere, harmless in a page."""
+    """Return text from any source such that it is harmless in a page."""
     return escape(printable(str(text)))
 
 
 def backend_in_words(robot: Description) -> tuple[str, str]:
-    """Returns what moves, in large letters, and its color."""
+    """Return the words that name what moves, and their color."""
     kind = robot.backend.upper()[:12]
     if not robot.emulated:  # whatever the backend is called
         return f"REAL ROBOT ON {kind}", REAL
@@ -35,42 +35,61 @@ def backend_in_words(robot: Description) -> tuple[str, str]:
 
 
 def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:
-    """The top of the page: which backend, which state, and why. control: who has it."""
+    """Return the top of the page: which backend, which state, and the reason for the state.
+
+    Args:
+        snapshot: None while no robot is known.
+        recorded: Name of the recording that is shown; empty for a live robot.
+        control: Text that names the viewer in control; empty to leave it out.
+    """
     if snapshot is None:
         return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
     if snapshot.expected:
-        return _bar(
-            "WAITING FOR THE ROBOT", RECORDED, f"{escape_text(snapshot.robot.robot)}, drawn as its scenario places it"
-        )
-    words, color = backend_in_words(snapshot.robot)
-    where = escape_text(snapshot.robot.robot)
-    if snapshot.robot.hardware:
-        where += f" · {escape_text(snapshot.robot.hardware)}"
+        name = escape_text(snapshot.robot.robot)
+        return _bar("WAITING FOR THE ROBOT", RECORDED, f"{name}, drawn as its scenario places it")
+    lines = [_backend_bar(snapshot.robot, recorded), *_alarm_lines(snapshot)]
     status = snapshot.status
+    if status is not None:
+        lines.append(_state(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle], status.why, ".45em"))
+    control_state = snapshot.control
+    if control_state is not None:
+        state_color = STATE_COLOURS[control_state.state]
+        lines.append(_state(control_state.state, state_color, control_state.reason, ".35em"))
+    if control:
+        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
+    return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
+
+
+def _backend_bar(robot: Description, recorded: str) -> str:
+    """Return the bar that tells a real robot from an emulated one, and a recording from a live robot."""
+    words, color = backend_in_words(robot)
+    place = escape_text(robot.robot)
+    if robot.hardware:
+        place += f" · {escape_text(robot.hardware)}"
     if recorded:
         words = f"RECORDING OF: {words}"
         color = RECORDED
-        where += f" · {escape_text(recorded)}"
-    lines = [_bar(words, color, where)]
+        place += f" · {escape_text(recorded)}"
+    return _bar(words, color, place)
+
+
+def _alarm_lines(snapshot: RobotSnapshot) -> list[str]:
+    """Return what a viewer must know before trusting the rest of the page."""
+    lines: list[str] = []
+    status = snapshot.status
     if status is not None and status.paused_by is not None:
         lines.append(_bar("PAUSED", RECORDED, f"by {escape_text(status.paused_by)}; robot time stands"))
     if len(snapshot.hosts) > 1:
         lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
     if snapshot.silent_s > SILENT_S:
         lines.append(_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
-    if status is not None:
-        lines.append(_state(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle], status.why, ".45em"))
-    if (said := snapshot.control) is not None:
-        lines.append(_state(said.state, STATE_COLOURS[said.state], said.reason, ".35em"))
-    if control:
-        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
-    return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
+    return lines
 
 
-def _state(word: str, color: str, why: str, above: str) -> str:
-    """A word on a color, and why."""
+def _state(word: str, color: str, why: str, margin_top: str) -> str:
+    """Return a state as a word on a color, with the reason beside it. margin_top: CSS length above it."""
     return (
-        f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{above}'>"
+        f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{margin_top}'>"
         f"<span style='background:{color};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
         f"white-space:nowrap'>{escape_text(word)}</span><span>{escape_text(why)}</span></div>"
     )
@@ -168,7 +187,7 @@ def _health_rows(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
 
 
 def stream_table(snapshot: RobotSnapshot) -> str:
-    """Rates and ages of all keys."""
+    """Return a table of the rate and the age of each key."""
     rows = [
         (escape_text(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
         for key, stream in sorted(snapshot.streams.items())
@@ -177,13 +196,13 @@ def stream_table(snapshot: RobotSnapshot) -> str:
 
 
 def log(lines: Iterable[str]) -> str:
-    """The newest lines first."""
+    """Return the lines of the log as HTML, in the order given."""
     items = "".join(f"<div style='padding:.1em 0'>{escape_text(line)}</div>" for line in lines)
     return f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
 
 
 def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
-    """What the colors of the scene mean."""
+    """Return the legend of the scene's colors."""
     marks = "".join(
         f"<span style='white-space:nowrap'><span style='color:rgb{color}'>&#9632;</span> {escape_text(what)}</span> "
         for what, color in entries
@@ -196,7 +215,7 @@ def _format_counts(numbers: dict[str, int]) -> str:
 
 
 def table(rows: Iterable[tuple[str, str]]) -> str:
-    """Names and values, which are HTML."""
+    """Return a table of names and values; both are HTML already."""
     cells = "".join(
         f"<tr><td style='opacity:.7;padding-right:.8em;white-space:nowrap;vertical-align:top'>{name}</td>"
         f"<td style='overflow-wrap:anywhere'>{value}</td></tr>"
