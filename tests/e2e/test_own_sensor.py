@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 import snakesim
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
-from snakesim_operator.features.console.own_sensors import sensor_table
-from snakesim_operator.features.console.watch import Watch
+from snakesim_operator.features.console.page.custom_sensors import sensor_table
+from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.recording.decoder import DecoderFactory
 from tests.e2e.command import Ended, call, environment, running
 from tests.e2e.command import snakesim as command
@@ -56,7 +56,7 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             assert 0 <= live.age_s(bent) < 1.0
             namespace = live.description.robot
         with open_session(Link(endpoint=started.endpoint, namespace=namespace)) as session:
-            watch = Watch(session)
+            watch = LiveRobot(session)
 
             def shown() -> bool:
                 snapshot = watch.snapshot()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snakesim_operator.features.console.drawing import Surroundings, draw
-from snakesim_operator.features.console.recorded import RecordedRun
+from snakesim_operator.features.console.robot_data.recorded_run import RecordedRun
+from snakesim_operator.features.console.scene.drawing import Surroundings, draw
 from tests.whole.command import run_to_summary, snakesim
 
 

@@ -1,13 +1,15 @@
-"""The console: a robot in the browser, live or from a recording.
+"""The console: a robot in the browser, live or from a recording. Needs the extra `console` (viser).
 
-`snapshot` is what there is to show of one instant; `watch` takes it from the network, `recorded` from a run's folder,
-with `heard` for what a record's rows do not have. `signals` is every number over time, live, `recorded_signals` of a
-run; `signals_page` answers the page `signals.js` with them.
-`drawing` turns it into poses, arrows and lines in the world, without any I/O. `stage` draws those with viser (shapes
-from `meshes`), `page` and `charts` show the rest, `controls` has the buttons of one viewer. `token` decides who has
-control. `port` is open at once, `front` accepts there and has the second stop, `server` serves pages behind it;
-`admission` is what a `browser` may say to them. `console` is the loop around them, `command` the
-entry points.
+`command` has the entry points, `display_loop` the loop: it takes one snapshot a frame and hands it to the page.
 
-It is a client of the robot like any other: nothing of the robot waits for it. Needs the extra `console` (viser).
+- `robot_data`: snapshots of a robot, from the network (`live_robot`) or from a recording (`recorded_run`), and every
+  number over time (`signals`).
+- `scene`: what is drawn of a snapshot (`drawing`, without any I/O), and the nodes of viser that show it.
+- `page`: the panel beside the scene, with texts and charts for all viewers and the controls of each viewer.
+- `web`: accepts connections and has the second stop (`connection_acceptor`), serves pages behind it (`server`), and
+  checks what browsers send (`admission`).
+
+`operations` sends a viewer's commands to the robot, and `control_token` decides which viewer has control.
+
+The console is a client of the robot like any other: nothing in the robot waits for it.
 """

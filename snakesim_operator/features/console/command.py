@@ -32,7 +32,7 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
         extras.check("commission", "commissioning")
         decode(read_part(str(commission), "robots"), RobotFile)
     raise_open_files(MAX_OPEN_FILES)
-    from snakesim_operator.features.console.console import show_live
+    from snakesim_operator.features.console.display_loop import show_live
 
     link = only_robot(where, "console")
     show_live(link, _surroundings(link), open_port(port), _until_signal(), commission=commission)
@@ -43,14 +43,14 @@ def show_record(folder: Path, at_s: float, port: int | None) -> int:
     """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
     extras.check("console", "the console")
     raise_open_files(MAX_OPEN_FILES)
-    from snakesim_operator.features.console.console import show_recorded
+    from snakesim_operator.features.console.display_loop import show_recorded
 
     return show_recorded(folder, at_s, open_port(port), _until_signal())
 
 
 def _surroundings(link: Link):
     """The true surroundings of a robot that runs on this computer, by its run's configuration; else None."""
-    from snakesim_operator.features.console.drawing import Surroundings
+    from snakesim_operator.features.console.scene.drawing import Surroundings
 
     for robot in local_robots():
         if (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace) and robot.config is not None:
@@ -79,11 +79,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = process_options(parser.parse_args(argv))
     extras.check("console", "the console")
     raise_open_files(MAX_OPEN_FILES)
-    from snakesim_operator.features.console.console import show_live
-    from snakesim_operator.features.console.drawing import Surroundings
-    from snakesim_operator.features.console.snapshot import expected_of
+    from snakesim_operator.features.console.display_loop import show_live
+    from snakesim_operator.features.console.robot_data.snapshot import expected_snapshot
+    from snakesim_operator.features.console.scene.drawing import Surroundings
 
     listening = socket.socket(fileno=given.arguments.listening)
-    expected = expected_of(given.config)
+    expected = expected_snapshot(given.config)
     show_live(given.link, Surroundings(given.config), listening, _until_signal(), expected)
     return 0

@@ -27,7 +27,7 @@ LOG_LINES = 200
 BUTTON_NS, KEY_NS = 700_000_000, 1_000_000_000
 
 
-class Log:
+class PageLog:
     """The newest lines of what viewers did and what became of the robot; newest first."""
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class Log:
 class Operations:
     """The robot at a link, as far as one can act on it."""
 
-    def __init__(self, link: Link, log: Log) -> None:
+    def __init__(self, link: Link, log: PageLog) -> None:
         self.link = link
         self._where = RobotSelection(link.endpoint, link.namespace, link.session)
         self._log = log

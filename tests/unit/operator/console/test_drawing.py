@@ -9,9 +9,9 @@ import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
-from snakesim_operator.features.console.drawing import LONGEST_M, M_PER_N, draw
-from snakesim_operator.features.console.polygon import force_polygon, push_point_table
-from snakesim_operator.features.console.snapshot import RobotSnapshot
+from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
+from snakesim_operator.features.console.scene.drawing import LONGEST_M, M_PER_N, draw
 from tests.unit.hal.rig import description, state
 
 ROBOT = description()
@@ -67,8 +67,10 @@ def test_forces_and_their_resultant():
     control = pushing([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
     seen = world([point, point], [])
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=seen, control=control), None)
-    assert drawing is not None and drawing.pushing == COUNT - 1 and drawing.pushed == {"peg"}
-    spans = [arrows[:, 1] - arrows[:, 0] for arrows in (drawing.forces, drawing.resultant, drawing.solved)]
+    assert drawing is not None and drawing.propulsion_joint == COUNT - 1 and drawing.pushed_obstacles == {"peg"}
+    spans = [
+        arrows[:, 1] - arrows[:, 0] for arrows in (drawing.measured_forces, drawing.resultant, drawing.desired_forces)
+    ]
     assert [len(span) for span in spans] == [2, 1, 1]
     assert spans[0][0] == pytest.approx([0.0, 10 * M_PER_N, 0.0])
     assert spans[1][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
@@ -80,9 +82,13 @@ def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
     control = pushing(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
     drawing = draw(snapshot, None)
-    assert drawing is not None and drawing.pushed == {"felt"}
-    assert drawing.solved[:, 0, 0] == pytest.approx([0.1]) and drawing.asked[:, 0, 0] == pytest.approx([0.3])
-    assert drawing.asked[0, 1] - drawing.asked[0, 0] == pytest.approx([0.0, LONGEST_M, 0.0])
+    assert drawing is not None and drawing.pushed_obstacles == {"felt"}
+    assert drawing.desired_forces[:, 0, 0] == pytest.approx([0.1]) and drawing.forces_without_contact[
+        :, 0, 0
+    ] == pytest.approx([0.3])
+    assert drawing.forces_without_contact[0, 1] - drawing.forces_without_contact[0, 0] == pytest.approx(
+        [0.0, LONGEST_M, 0.0]
+    )
     table = push_point_table(control)
     assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table and "<td>clear</td><td>30.0</td><td>0.0</td>" in table
     assert push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
@@ -92,7 +98,7 @@ def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
     point = contact((0.0, 500.0, 0.0))
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([point], [])), None)
     assert drawing is not None
-    start, end = drawing.forces[0]
+    start, end = drawing.measured_forces[0]
     assert end - start == pytest.approx([0.0, LONGEST_M, 0.0]) and start[2] > ROBOT.links[0].radius_m
     assert drawing.contacts_w[0] == pytest.approx(point.position_w)
 

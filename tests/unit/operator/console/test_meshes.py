@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_operator.features.console.meshes import Mesh, box, capsule, cylinder, sphere
+from snakesim_operator.features.console.scene.meshes import Mesh, box, capsule, cylinder, sphere
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from snakesim_operator.base.console_port import open_port
-from snakesim_operator.features.console.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
-from snakesim_operator.features.console.message_age import MAX_UNANSWERED, MessageAge, PageAction
-from snakesim_operator.features.console.server import page_server
+from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
+from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, MessageAge, PageAction
+from snakesim_operator.features.console.web.server import page_server
 from tests.attack.means.page import Page
 from tests.harness.wait import wait_until
 from tests.unit.operator.console.rig import ReadyStop

@@ -6,7 +6,7 @@ from typing import Any
 import viser
 
 from snakesim_operator.base.console_port import open_port
-from snakesim_operator.features.console.server import page_server
+from snakesim_operator.features.console.web.server import page_server
 from tests.viewer import ASKED, Viewer, viewing
 
 CHANGES = 200

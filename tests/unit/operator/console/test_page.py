@@ -12,12 +12,12 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import capsules_at_start, load
 from snakesim_operator.base.console_port import address_of, open_port
 from snakesim_operator.base.page_origin import why_refused
-from snakesim_operator.features.console import texts
-from snakesim_operator.features.console.drawing import draw
-from snakesim_operator.features.console.page import LEGEND
-from snakesim_operator.features.console.server import page_server
-from snakesim_operator.features.console.snapshot import RobotSnapshot, expected_of
-from snakesim_operator.features.console.token import ControlToken
+from snakesim_operator.features.console.control_token import ControlToken
+from snakesim_operator.features.console.page import page_html
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, expected_snapshot
+from snakesim_operator.features.console.scene.drawing import draw
+from snakesim_operator.features.console.scene.scene_colors import LEGEND
+from snakesim_operator.features.console.web.server import page_server
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description, status
 from tests.viewer import watch
@@ -75,25 +75,25 @@ def test_text_from_the_network_is_no_markup():
     named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
     reported = status(lifecycle="fault", why=evil, commands_rejected={evil[:40]: 1}, **named)
     snapshot = RobotSnapshot(robot=robot, status=reported)
-    shown = texts.header(snapshot) + texts.state_table(snapshot) + texts.log([evil])
+    shown = page_html.header(snapshot) + page_html.state_table(snapshot) + page_html.log([evil])
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
 
 
 def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
-    shown = texts.header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
+    shown = page_html.header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
     assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
-    assert "PAUSED" not in texts.header(RobotSnapshot(robot=description(), status=status()))
+    assert "PAUSED" not in page_html.header(RobotSnapshot(robot=description(), status=status()))
 
 
 def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
     config = load("triplet").config
-    snapshot = expected_of(config)
+    snapshot = expected_snapshot(config)
     drawing = draw(snapshot, None)
     assert drawing is not None
     start = capsules_at_start(config)
     middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
     assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
-    assert "WAITING FOR THE ROBOT" in texts.header(snapshot) and "SIMULATOR" not in texts.header(snapshot)
+    assert "WAITING FOR THE ROBOT" in page_html.header(snapshot) and "SIMULATOR" not in page_html.header(snapshot)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_
 )
 def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
     robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
-    assert f">{words}<" in texts.header(RobotSnapshot(robot=robot))
+    assert f">{words}<" in page_html.header(RobotSnapshot(robot=robot))
 
 
 def test_the_legend_has_a_colour_for_each_thing():

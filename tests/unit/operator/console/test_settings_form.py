@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_hal.wire.messages import ControlSettings
-from snakesim_operator.features.console.settings_form import Field, fields_of
+from snakesim_operator.features.console.page.settings_form import InputField, list_input_fields
 
 SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
     "push_n": {"type": "number", "unit": "N", "description": "a bound", "exclusiveMinimum": 0, "maximum": 10000},
@@ -20,8 +20,8 @@ def settings(values: str, schema: str) -> ControlSettings:
 
 
 def test_each_setting_has_an_input_within_its_bounds():
-    push, share, bend, mode, on = fields_of(settings(VALUES, SCHEMA))
-    assert push == Field("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N")
+    push, share, bend, mode, on = list_input_fields(settings(VALUES, SCHEMA))
+    assert push == InputField("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N")
     assert (share.low, share.high) == (0.0, 1.0)
     assert (bend.low, bend.high) == (-0.8, 0.8)
     assert mode.choices == ("a", "b") and on.value is True
@@ -29,4 +29,4 @@ def test_each_setting_has_an_input_within_its_bounds():
 
 @pytest.mark.parametrize("schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000])
 def test_a_schema_that_cannot_be_read_gives_no_form(schema: str):
-    assert fields_of(settings(VALUES, schema)) == []
+    assert list_input_fields(settings(VALUES, schema)) == []

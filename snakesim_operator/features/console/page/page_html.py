@@ -1,0 +1,224 @@
+"""The texts of the console, as HTML. Everything that comes from the network is escaped. Pure."""
+
+from collections.abc import Iterable
+from html import escape
+
+from snakesim_hal.base.terminal import printable
+from snakesim_hal.wire.messages import Description, Status
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
+
+SILENT_S = 1.0
+LIFECYCLE_COLOURS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
+STATE_COLOURS = {"Locomoting": "#1a7f4b", "NotLocomoting": "#b26a00", "Idle": "#6b7683", "PowerOff": "#59626d"}
+BAD = "#d64541"  # of text, on a light and on a dark page
+SIMULATED, EMULATED, REAL, RECORDED = "#0067b0", "#7a3fa8", "#b3261e", "#59626d"
+
+SIGNALS = (
+    "<iframe src='/signals?within' title='Signals' loading='lazy' style='border:0;width:100%;height:60vh'></iframe>"
+    "<a href='/signals' target='_blank' style='padding:0 .6em;font-size:.85em'>Signals in a page of their own</a>"
+)
+
+
+def escape_text(text: object) -> str:
+    """Return text from any source such that it is harmless in a page."""
+    return escape(printable(str(text)))
+
+
+def backend_in_words(robot: Description) -> tuple[str, str]:
+    """Return the words that name what moves, and their color."""
+    kind = robot.backend.upper()[:12]
+    if not robot.emulated:  # whatever the backend is called
+        return f"REAL ROBOT ON {kind}", REAL
+    if robot.backend == "sim":
+        return "EMULATED BY A SIMULATOR", SIMULATED
+    return f"EMULATED ROBOT ON {kind}", EMULATED
+
+
+def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:
+    """Return the top of the page: which backend, which state, and the reason for the state.
+
+    Args:
+        snapshot: None while no robot is known.
+        recorded: Name of the recording that is shown; empty for a live robot.
+        control: Text that names the viewer in control; empty to leave it out.
+    """
+    if snapshot is None:
+        return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
+    if snapshot.expected:
+        name = escape_text(snapshot.robot.robot)
+        return _bar("WAITING FOR THE ROBOT", RECORDED, f"{name}, drawn as its scenario places it")
+    lines = [_backend_bar(snapshot.robot, recorded), *_alarm_lines(snapshot)]
+    status = snapshot.status
+    if status is not None:
+        lines.append(_state(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle], status.why, ".45em"))
+    control_state = snapshot.control
+    if control_state is not None:
+        state_color = STATE_COLOURS[control_state.state]
+        lines.append(_state(control_state.state, state_color, control_state.reason, ".35em"))
+    if control:
+        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
+    return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
+
+
+def _backend_bar(robot: Description, recorded: str) -> str:
+    """Return the bar that tells a real robot from an emulated one, and a recording from a live robot."""
+    words, color = backend_in_words(robot)
+    place = escape_text(robot.robot)
+    if robot.hardware:
+        place += f" · {escape_text(robot.hardware)}"
+    if recorded:
+        words = f"RECORDING OF: {words}"
+        color = RECORDED
+        place += f" · {escape_text(recorded)}"
+    return _bar(words, color, place)
+
+
+def _alarm_lines(snapshot: RobotSnapshot) -> list[str]:
+    """Return what a viewer must know before trusting the rest of the page."""
+    lines: list[str] = []
+    status = snapshot.status
+    if status is not None and status.paused_by is not None:
+        lines.append(_bar("PAUSED", RECORDED, f"by {escape_text(status.paused_by)}; robot time stands"))
+    if len(snapshot.hosts) > 1:
+        lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
+    if snapshot.silent_s > SILENT_S:
+        lines.append(_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
+    return lines
+
+
+def _state(word: str, color: str, why: str, margin_top: str) -> str:
+    """Return a state as a word on a color, with the reason beside it. margin_top: CSS length above it."""
+    return (
+        f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{margin_top}'>"
+        f"<span style='background:{color};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
+        f"white-space:nowrap'>{escape_text(word)}</span><span>{escape_text(why)}</span></div>"
+    )
+
+
+def _bar(words: str, color: str, below: str) -> str:
+    return (
+        f"<div style='background:{color};color:#fff;border-radius:6px;padding:.35em .6em;margin:.3em .6em .3em .3em'>"
+        f"<div style='font-size:1.3em;font-weight:700;letter-spacing:.03em'>{escape_text(words)}</div>"
+        f"<div style='opacity:.9'>{below}</div></div>"
+    )
+
+
+def _warning(text: str) -> str:
+    return (
+        f"<div style='border:2px solid {BAD};color:{BAD};border-radius:6px;padding:.3em .6em;margin-top:.4em;"
+        f"font-weight:600'>{escape_text(text)}</div>"
+    )
+
+
+def state_table(snapshot: RobotSnapshot) -> str:
+    """Return a table of lease, commands, warnings and health, and the list of faults below it."""
+    rows: list[tuple[str, str]] = []
+    if snapshot.status is not None:
+        rows += _status_rows(snapshot.status, snapshot.time_s)
+        rows += _warning_rows(snapshot.status)
+    rows += _health_rows(snapshot)
+    return table(rows) + faults(snapshot.status)
+
+
+def _status_rows(status: Status, time_s: float | None) -> list[tuple[str, str]]:
+    """Return the rows that every status has."""
+    robot_time = "" if time_s is None else f"{time_s:.2f} s · "
+    return [
+        ("robot time", f"{robot_time}tick {status.tick}, {status.clock_mode} at {status.rate_hz:g} Hz"),
+        ("lease", f"{escape_text(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
+        ("alive", escape_text(", ".join(status.alive) or "none")),
+        ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed"),
+        ("rejected", _format_counts(status.commands_rejected)),
+        ("limited", _format_counts(status.commands_limited)),
+        ("overruns", f"{status.overruns}"),
+    ]
+
+
+def _warning_rows(status: Status) -> list[tuple[str, str]]:
+    """Return the rows that are shown only when they have something to report."""
+    rows: list[tuple[str, str]] = []
+    if status.real_time_factor is not None:
+        rows.append(("speed", _format_speed(status)))
+    if status.waiting_for:
+        rows.append(("waiting for", escape_text(", ".join(status.waiting_for))))
+    for joint, fraction in sorted(status.derated.items()):
+        rows.append(("derated", escape_text(f"{joint}: {100 * fraction:.0f} %")))
+    if status.isolated:
+        rows.append(("isolated", escape_text(", ".join(status.isolated))))
+    if status.unchecked:
+        rows.append(("not checked", escape_text(status.unchecked)))
+    rows += [("injected", escape_text(fault)) for fault in status.injected]
+    rows += [("real time", escape_text(warning)) for warning in status.realtime_warnings]
+    return rows
+
+
+def _format_speed(status: Status) -> str:
+    wanted = f", {status.speed:g} wanted" if status.speed != 1.0 else ""
+    return f"{status.real_time_factor:.2f} of the wall clock{wanted}"
+
+
+def faults(status: Status | None) -> str:
+    """Return the faults since the last reset as a list; empty when there are none."""
+    if status is None or not status.faults:
+        return ""
+    items: list[str] = []
+    for fault in status.faults:
+        place = f" at {escape_text(fault.joint)}" if fault.joint else ""
+        cause = escape_text(fault.cause)
+        items.append(f"<li><b>{escape_text(fault.what)}</b>{place}, tick {fault.tick}: {cause}</li>")
+    if status.faults_left_out:
+        items.append(f"<li>and {status.faults_left_out} more</li>")
+    style = f"padding:0 .6em;font-size:.85em;color:{BAD}"
+    return f"<div style='{style}'>Faults<ul>{''.join(items)}</ul></div>"
+
+
+def _health_rows(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
+    power, joints = snapshot.power, snapshot.robot.joints
+    if power is None or not power.motor_c:
+        return []
+    hottest = max(range(len(joints)), key=lambda i: power.motor_c[i])
+    rows = [
+        ("hottest motor", f"{escape_text(joints[hottest].name)}: {power.motor_c[hottest]:.1f} °C"),
+        ("boards", f"up to {max(power.board_c):.1f} °C"),
+        ("supply", f"{min(power.voltage_v):.1f} V at least, {sum(power.current_a):.2f} A in sum"),
+    ]
+    wet = [joint.name for joint, leak in zip(joints, power.leak, strict=True) if leak]
+    return [*rows, ("WATER", escape_text(", ".join(wet)))] if wet else rows
+
+
+def stream_table(snapshot: RobotSnapshot) -> str:
+    """Return a table of the rate and the age of each key."""
+    rows = [
+        (escape_text(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
+        for key, stream in sorted(snapshot.streams.items())
+    ]
+    return table(rows)
+
+
+def log(lines: Iterable[str]) -> str:
+    """Return the lines of the log as HTML, in the order given."""
+    items = "".join(f"<div style='padding:.1em 0'>{escape_text(line)}</div>" for line in lines)
+    return f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
+
+
+def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
+    """Return the legend of the scene's colors."""
+    marks = "".join(
+        f"<span style='white-space:nowrap'><span style='color:rgb{color}'>&#9632;</span> {escape_text(what)}</span> "
+        for what, color in entries
+    )
+    return f"<div style='padding:.2em .6em .9em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
+
+
+def _format_counts(numbers: dict[str, int]) -> str:
+    return escape_text(", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none")
+
+
+def table(rows: Iterable[tuple[str, str]]) -> str:
+    """Return a table of names and values; both are HTML already."""
+    cells = "".join(
+        f"<tr><td style='opacity:.7;padding-right:.8em;white-space:nowrap;vertical-align:top'>{name}</td>"
+        f"<td style='overflow-wrap:anywhere'>{value}</td></tr>"
+        for name, value in rows
+    )
+    return f"<table style='font-size:.85em;margin:0 .6em;line-height:1.4'>{cells}</table>"

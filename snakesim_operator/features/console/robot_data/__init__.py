@@ -1,0 +1,1 @@
+"""What the console knows of a robot at one instant: from the network, or from a recording."""

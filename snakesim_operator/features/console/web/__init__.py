@@ -1,0 +1,1 @@
+"""The web server of the console: accepts connections, checks what browsers send, and has the second stop."""
