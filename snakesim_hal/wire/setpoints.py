@@ -7,7 +7,7 @@ from snakesim_hal.wire.messages import Mode
 
 @dataclass(frozen=True)
 class RequestedSetpoints:
-    """SafeSetpoints of all joints, tail to head, as a controller or a client requests them, before any limit is applied.
+    """Setpoints of all joints, tail to head, as a controller or a client requests them, before any limit is applied.
 
     A backend never receives them. The HAL host's limiter turns them into `snakesim_hal.backend.SafeSetpoints`.
     """

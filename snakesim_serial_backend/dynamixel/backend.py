@@ -58,11 +58,11 @@ class DynamixelBackend(DriverTypeBackend):
         clock: DriverClock,
         body: EmulatedBody | None,
     ) -> list[BusSpec]:
-        """One for each port, or one of emulated servos."""
-        gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
-        log = _log(settings.log)
+        gap_s = max(MIN_GAP_S, GAP_PER_PERIOD * config.period_ns * 1e-9)
+        log = _open_log(settings.log)
 
-        def open_servos(port: str, mine: Sequence[int], readings: DriveReadings) -> Servos:
+        def open_servos(port_name: str, numbers: Sequence[int], readings: DriveReadings) -> Servos:
+            """Open a port with the servos of these joints; emulated servos are on a pseudo terminal."""
             emulator = None
             if body is None:
                 wire = SerialWire(port_name, settings.baud, log)
@@ -73,9 +73,12 @@ class DynamixelBackend(DriverTypeBackend):
             port = Port(wire, gap_s)
             servos = [servo_of(joints[number], port) for number in numbers]
             answer_s = answer_limit_s(config, settings.decimation)
-            return Servos(servos, on_it, readings, settings, clock.now_ns, answer_s, emulator)
+            return Servos(servos, port, readings, settings, clock.now_ns, answer_s, emulator)
 
-        return group_by_port(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
+        ports = settings.ports
+        if body is not None:
+            ports = [NAME]
+        return group_by_port(joints, settings, ports, open_servos)
 
 
 def servo_of(joint: Joint, port: Port) -> Servo:
@@ -115,7 +118,7 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}"
+                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are at most {LAST_ID}"
             )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
@@ -125,15 +128,15 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
-                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit amperes: "
+                f"take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
             )
 
 
 def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError when a port cannot carry its servos."""
-    on = assign_ports(joints, settings.ports)
-    fullest = max(on.count(bus) for bus in set(on))
+    bus_of_joint = assign_ports(joints, settings.ports)
+    fullest = max(bus_of_joint.count(bus) for bus in set(bus_of_joint))
     busy_s = cycle_s(fullest, settings.baud)
     if busy_s * rate_hz > MAX_LOAD:
         raise ConfigError(
@@ -157,15 +160,17 @@ def emulator_on(
         pose: where motion capture sends poses, HOST:PORT; None: nowhere.
     """
     joints = config.robot.joint_table
-    each = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
-    return emulator_of(joints, settings, make_body(config, settings, NAME, pose), each, clock)
+    body = make_body(config, settings, NAME, pose)
+    pty_of_joint = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
+    return emulator_of(joints, settings, body, pty_of_joint, clock)
 
 
 def emulator_of(
     joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: DriverClock
 ) -> EmulatedDynamixel:
-    """Emulated servos. ptys: of every joint."""
-    return EmulatedDynamixel(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.now_ns)
+    """Make emulated servos for joints. ptys: the pseudo terminal of every joint's servo."""
+    constants = [constant_of(joint) for joint in joints]
+    return EmulatedDynamixel(body, ptys, constants, settings.baud, clock.now_ns)
 
 
 def _open_log(path: str) -> TextIO | None:

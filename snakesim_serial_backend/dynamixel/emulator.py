@@ -6,7 +6,7 @@ position law's gains is assumed, as the driver's is.
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from snakesim_drivers.emulation.emulated_body import DriveEmulator, EmulatedBody
@@ -138,10 +138,11 @@ class EmulatedDynamixel(DriveEmulator):
 
     # --- packets ----------------------------------------------------------------------------------------------
 
-    def _take(self, port: Pty, packet: Packet) -> None:
-        mine = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)]
-        by_id = {self.servos[i].id: i for i in mine}
-        for i in mine:
+    def _handle_packet(self, port: Pty, packet: Packet) -> None:
+        """Handle a packet for one servo or for several servos of a port."""
+        listening = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)]
+        index_of_id = {self.servos[i].id: i for i in listening}
+        for i in listening:
             self.servos[i].fed_us = self.body.now_us
         parameters = packet.parameters
         match packet.instruction:
@@ -178,11 +179,28 @@ class EmulatedDynamixel(DriveEmulator):
             case _:
                 self._answer(i, b"", Refusal.INSTRUCTION)
 
-    def _read_all(self, port: Pty, instruction: int, what: bytes, asked: Sequence[int | None]) -> None:
-        """In the order of their ids in the packet: each waits for the one before it, for ever."""
-        parts: list[tuple[int, int, bytes]] = []
-        seconds: list[tuple[int, int, bytes]] = []  # the same, with what a second servo of an id puts there
-        for i in asked:
+    def _write_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+        """Execute a sync write: address, size, and an id with data for each servo."""
+        address, size = struct.unpack_from("<HH", parameters)
+        for start in range(4, len(parameters), size + 1):
+            i = index_of_id.get(parameters[start])
+            if i is not None:
+                self._write(i, address, parameters[start + 1 : start + 1 + size])
+
+    def _read_several(self, port: Pty, instruction: int, registers: bytes, indices: Sequence[int | None]) -> None:
+        """Answer a sync read in the order of its ids.
+
+        Each servo waits for the one before it without end, so the first one that is silent ends the answer.
+
+        Args:
+            port: the port of the servos.
+            instruction: SYNC_READ or FAST_SYNC_READ.
+            registers: address and size, as in the packet.
+            indices: the servo of each id in the packet; None for an id that no servo has.
+        """
+        parts: list[tuple[int, int, bytes]] = []  # error, id and data of each servo
+        second_parts: list[tuple[int, int, bytes]] = []  # the same, with the data of a second servo with its id
+        for i in indices:
             if i is None or self.body.is_silent(i):
                 break
             data, refusal = self._read(i, registers)
@@ -196,8 +214,8 @@ class EmulatedDynamixel(DriveEmulator):
         if parts:
             port.send(collide(fast_status(parts, len(indices)), fast_status(second_parts, len(indices))))
 
-    def _answer(self, i: int, data: bytes, refusal: int = 0, second: bytes | None = None) -> None:
-        """Give a servo's status. second: the data of a second servo with its id, where they differ."""
+    def _answer(self, i: int, data: bytes, refusal: int = 0, second_data: bytes | None = None) -> None:
+        """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
         if self.body.is_silent(i):
             return
         servo = self.servos[i]
@@ -238,12 +256,17 @@ class EmulatedDynamixel(DriveEmulator):
         return bytes(table[address : address + size])
 
     def _measure(self, i: int) -> None:
-        servo, (angle_rad, velocity_rad_s, torque_nm) = self.servos[i], self.body.read_shaft(i)
-        servo.put("h", at.PRESENT, max(min(round(torque_nm / servo.unit_nm), 32767), -32768))
-        servo.put("i", at.PRESENT + 2, round(velocity_rad_s / at.SPEED))
-        servo.put("i", at.PRESENT + 6, round(angle_rad / at.RAD) - servo.from_counts)
-        servo.put("H", at.VOLTAGE, round(self.body.read_supply(i)[0] / at.VOLTS))
-        servo.table[at.TEMPERATURE] = min(max(round(self.body.read_temperatures(i)[0]), 0), 255)
+        """Update the registers of what a servo measures."""
+        servo = self.servos[i]
+        angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
+        voltage_v = self.body.read_supply(i)[0]
+        temperature_c = self.body.read_temperatures(i)[0]
+        current = max(min(round(torque_nm / servo.unit_nm), 32767), -32768)
+        servo.write_register("h", at.PRESENT, current)
+        servo.write_register("i", at.PRESENT_VELOCITY, round(velocity_rad_s / at.SPEED))
+        servo.write_register("i", at.PRESENT_POSITION, round(angle_rad / at.RAD) - servo.from_counts)
+        servo.write_register("H", at.VOLTAGE, round(voltage_v / at.VOLTS))
+        servo.table[at.TEMPERATURE] = min(max(round(temperature_c), 0), 255)
 
     def _write(self, i: int, address: int, data: bytes) -> int:
         """Set registers, all of them or none, and return the refusal, 0 for none."""
@@ -290,10 +313,12 @@ class EmulatedDynamixel(DriveEmulator):
         """Reset all registers from address 64 on, and forget whole revolutions."""
         servo = self.servos[i]
         servo.table[at.TORQUE_ENABLE :] = bytes(at.SIZE - at.TORQUE_ENABLE)
-        servo.table[at.STATUS_LEVEL], servo.held_counts = 2, None
-        servo.put("H", at.GAINS + 4, 800)
-        servo.put("h", at.GOALS, servo.get("H", at.CURRENT_LIMIT))
-        servo.from_counts = round(self.body.read_shaft(i)[0] / at.RAD) // at.COUNTS * at.COUNTS
+        servo.table[at.STATUS_LEVEL] = 2
+        servo.held_counts = None
+        servo.write_register("H", at.P_GAIN, 800)
+        servo.write_register("h", at.GOALS, servo.read_register("H", at.CURRENT_LIMIT))
+        counts = round(self.body.read_shaft(i)[0] / at.RAD)
+        servo.from_counts = counts // at.COUNTS * at.COUNTS
         self._measure(i)
         servo.write_register("i", at.GOAL_POSITION, servo.read_register("i", at.PRESENT_POSITION))
         self._drive(i)
@@ -307,36 +332,40 @@ class EmulatedDynamixel(DriveEmulator):
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
         mode = servo.table[at.OPERATING_MODE]
         if servo.on and mode == at.CURRENT_BASED_POSITION:
-            self.body.drive_motor(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
-        elif servo.on and mode == 0:
+            d_gain = servo.read_register("H", at.GAINS)
+            p_gain = servo.read_register("H", at.P_GAIN)
+            stiffness, damping = at.law(d_gain, p_gain, servo.unit_nm)
+            goal_counts = servo.held_counts
+            if goal_counts is None:
+                goal_counts = servo.read_register("i", at.GOAL_POSITION) + servo.from_counts
+            self.body.drive_motor(i, Mode.POSITION, goal_counts * at.RAD, limit_nm, stiffness, damping, speed_rad_s)
+        elif servo.on and mode == at.CURRENT_CONTROL:
             self.body.drive_motor(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
         else:
             self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
     def on_step(self, now_us: float) -> None:
-        """Watchdogs, heat and supply."""
+        """Let watchdogs expire, and detect servos that are too hot or have too little supply voltage."""
         for i, servo in enumerate(self.servos):
             watchdog = servo.table[at.WATCHDOG]
             if servo.on and 0 < watchdog != at.TRIPPED and now_us - servo.fed_us > watchdog * at.WATCHDOG_S * 1e6:
                 servo.table[at.WATCHDOG] = at.TRIPPED
                 servo.held_counts = round(self.body.read_shaft(i)[0] / at.RAD)
                 self._drive(i)
-            hot = at.HardwareError.OVERHEATING if self.body.is_too_hot(i) else 0
-            weak = self.body.read_supply(i)[0] < servo.get("H", at.LEAST_VOLTAGE) * at.VOLTS
-            found = hot | (at.HardwareError.INPUT_VOLTAGE if weak else 0)
-            if found & ~servo.table[at.HARDWARE_ERROR]:
-                servo.table[at.HARDWARE_ERROR] |= found
-                if found & SHUTDOWN_BY:
+            errors = self._detect_errors(i)
+            if errors & ~servo.table[at.HARDWARE_ERROR]:
+                servo.table[at.HARDWARE_ERROR] |= errors
+                if errors & SHUTDOWN_ERRORS:
                     servo.table[at.TORQUE_ENABLE] = 0
                     self._drive(i)
 
     def _detect_errors(self, i: int) -> int:
         """Return the bits of the hardware errors that a servo has now."""
         errors = 0
-        if self.body.too_hot(i):
+        if self.body.is_too_hot(i):
             errors |= at.HardwareError.OVERHEATING
         min_voltage_v = self.servos[i].read_register("H", at.MIN_VOLTAGE) * at.VOLTS
-        if self.body.supply(i)[0] < min_voltage_v:
+        if self.body.read_supply(i)[0] < min_voltage_v:
             errors |= at.HardwareError.INPUT_VOLTAGE
         return errors
 

@@ -1,4 +1,4 @@
-"""Dynamixel X servos as a driver type of drives: a `snakesim_drivers.kit.drives.Drives`.
+"""Dynamixel X servos as a driver type: a `snakesim_drivers.kit.drives.Drives`.
 
 In every tick all servos report current, velocity and position in one fast sync read, one of them reports its health,
 and all get goal current and goal position in one sync write.
@@ -73,40 +73,32 @@ class Servos:
         self._may_write = False  # until bring-up has checked that these are the servos of the robot
 
     def bring_up(self) -> None:
-        """Find all, check what they keep, write what differs. Torque is off, and stays so."""
-        found = bring_up(self.servos, self._port, self._settings)
-        self._ours = True
-        for i, (present, health) in enumerate(found):
-            self.handle_answer(i, present)
-            self._check(i, health)
+        """Find all servos, check the registers that they keep, and write what differs. Torque is off, and stays off."""
+        answers = bring_up(self.servos, self._port, self._settings)
+        self._may_write = True
+        for i, (present, health) in enumerate(answers):
+            self._take_over_motion(i, present)
+            self._take_over_health(i, health)
 
     # --- reading ----------------------------------------------------------------------------------------------
 
     def read(self) -> None:
-        """Ask all at once, one that was silent, and one for its health."""
-        self._end_s = time.monotonic() + self._answer_s
-        self._turn += 1
-        everybody = range(len(self.servos))
-        steady, silent = [i for i in everybody if i not in self._lost], sorted(self._lost)
-        self._read_states([i for i in steady if i in self._readings.drives_to_check])
-        self._ask(steady)
+        """Read all servos at once, one of the silent ones alone, and the health of one."""
+        self._read_deadline_s = time.monotonic() + self._answer_s
+        self._cycle += 1
+        silent = sorted(self._silent)
+        answering = [i for i in range(len(self.servos)) if i not in self._silent]
+        self._read_states([i for i in answering if i in self._readings.drives_to_check])
+        self._read_motion(answering)
         if silent:
             self._read_silent(silent[self._cycle % len(silent)])
         self._read_next_health([i for i in answering if i not in self._silent])
         for i, servo in enumerate(self.servos):
-            if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOTS_WITHIN_NS:
+            if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOT_NS:
                 self._readings.skip_request(i)
 
-    def _ask(self, left: list[int]) -> None:
-        """All of these; without whoever is the first that is silent, as often as time allows."""
-        while left and time.monotonic() < self._end_s:
-            answers = self._port.read_all([self.servos[i].id for i in left], at.PRESENT, at.present_form.size)
-            for i in left:
-                if (answer := answers.get(self.servos[i].id)) is not None:
-                    self.handle_answer(i, answer)
-            left = [i for i in left if self.servos[i].id not in answers]
-            if left:
-                self._lost.add(left.pop(0))
+    def _read_motion(self, indices: list[int]) -> None:
+        """Read the motion of these servos at once.
 
         A silent servo silences all behind it. So the first one without an answer is left out, and the others are read
         again, as often as time allows.
@@ -136,11 +128,11 @@ class Servos:
         else:
             servo.garbled = 0
         if len(answers.statuses) == 1:
-            self._lost.clear()  # perhaps others are back, too
-            self.handle_answer(i, answers.statuses[0])
+            self._silent.clear()  # perhaps others answer again, too
+            self._take_over_motion(i, answers.statuses[0])
 
-    def handle_answer(self, i: int, said: Packet) -> None:
-        """What a servo measures."""
+    def _take_over_motion(self, i: int, status: Packet) -> None:
+        """Put what a servo measures into the readings."""
         servo = self.servos[i]
         current, velocity, position = at.present_form.unpack(status.data)
         angle_rad = position * at.RAD
@@ -150,7 +142,8 @@ class Servos:
             servo.errors = 0
         if not servo.follows:  # it may have restarted, and lost count of its revolutions
             turns = at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD)
-            servo.turns = servo.turns if turns is None else turns
+            if turns is not None:
+                servo.turns = turns
         self._readings.set_motion(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
         self._readings.set_torque(i, current * servo.unit_nm)
         servo.current_a = abs(current) * servo.unit_nm / servo.constant
@@ -175,13 +168,13 @@ class Servos:
         if status is not None:
             self._take_over_health(i, status)
 
-    def _check(self, i: int, said: Packet) -> None:
-        """What a servo says of its health."""
-        servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
-        self._take_state(i, said)
-        volts = struct.unpack_from("<H", data, at.VOLTAGE - first)[0] * at.VOLTS
-        self._readings.set_supply(i, volts, servo.current_a)
-        temperature_c = float(data[at.TEMPERATURE - first])
+    def _take_over_health(self, i: int, status: Packet) -> None:
+        """Put a servo's supply and temperature into the readings, and store its state."""
+        self._take_over_state(i, status)
+        data = status.data  # registers from TORQUE_ENABLE on
+        (voltage,) = struct.unpack_from("<H", data, at.VOLTAGE - at.TORQUE_ENABLE)
+        self._readings.set_supply(i, voltage * at.VOLTS, self.servos[i].current_a)
+        temperature_c = float(data[at.TEMPERATURE - at.TORQUE_ENABLE])
         self._readings.set_temperatures(i, temperature_c, temperature_c)
 
     def _take_over_state(self, i: int, status: Packet) -> None:
@@ -195,8 +188,10 @@ class Servos:
         self._readings.mark_checked(i)
 
     def poll(self) -> None:
-        """Emulated servos."""
-        self._port.wire.let_run()
+        """Let servos that are emulated in this process run up to the present time."""
+        self._port.wire.run_emulated_drives()
+
+    # --- commands ---------------------------------------------------------------------------------------------
 
     def command(
         self,
@@ -257,7 +252,7 @@ class Servos:
         self._port.write_all(address, [(self.servos[i].id, data) for i in indices])
 
     def reset_faults(self, joints: frozenset[int]) -> None:
-        """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second.
+        """Restart servos with a hardware error, as nothing else clears it; a restart takes about half a second.
 
         A watchdog that has stopped its servo is cleared by writing 0.
         """

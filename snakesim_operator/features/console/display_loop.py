@@ -71,7 +71,7 @@ def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: thr
     # What only recordings need would delay the page of a run that starts.
     from snakesim_operator.features.console.robot_data.recorded_run import RecordedRun
     from snakesim_operator.features.console.robot_data.recorded_signals import RecordedSignals
-    from snakesim_operator.results.incomplete import exit_code
+    from snakesim_operator.results.missing_data import exit_code
 
     recorded, log = RecordedRun(folder), PageLog()
     for lack in recorded.record.lacks:

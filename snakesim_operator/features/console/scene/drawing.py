@@ -16,7 +16,7 @@ from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.physics.hills import hills
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.results.force_tracking import is_measured
+from snakesim_operator.results.metrics.force_tracking import is_measured
 
 M_PER_N = 0.02  # length of a force arrow
 LONGEST_M = 0.5  # of a force arrow
