@@ -17,8 +17,8 @@ from typing import Any
 
 import can
 
-from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface, message_of
-from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
+from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface, to_python_can
+from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, did_you_mean
@@ -176,7 +176,7 @@ class AdapterWire:
     def send(self, frame: Frame) -> bool:
         """Send a frame; False when the adapter did not take it."""
         try:
-            self._bus.send(message_of(frame, fd=self._fd), timeout=0)
+            self._bus.send(to_python_can(frame, fd=self._fd), timeout=0)
         except can.CanError as error:
             self._found.append(BusError("not_sent", self.channel, str(error)))
             return False
@@ -227,7 +227,7 @@ class AdapterWire:
 
     def _errors_in(self, message: can.Message) -> list[BusError]:
         if _parted(self.channel)[0] == "socketcan":
-            return bus_errors_of(message.arbitration_id, bytes(message.data).ljust(8, b"\0"), self.channel)
+            return decode_error_frame(message.arbitration_id, bytes(message.data).ljust(8, b"\0"), self.channel)
         return [BusError("error_frames", self.channel, "an error frame")]
 
     def _is_wanted(self, message: can.Message, frame: Frame) -> bool:

@@ -22,7 +22,7 @@ import can
 from can.interfaces.socketcan.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
+from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.bus_faults import VirtualFaults, inject_into_interface
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
@@ -115,7 +115,7 @@ class SocketCanWire:
         """All received frames."""
         frames: list[Frame] = []
         try:
-            drain(self._socket, self._buffer, frames, self._note_error)
+            drain_socket(self._socket, self._buffer, frames, self._note_error)
         except OSError as error:
             self._note_failure(error)
         return frames
@@ -158,7 +158,7 @@ class SocketCanWire:
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
 
     def _note_error(self, identifier: int, data: bytes) -> None:
-        self._found.extend(bus_errors_of(identifier, data, self.channel))
+        self._found.extend(decode_error_frame(identifier, data, self.channel))
 
     def _note_failure(self, error: OSError) -> None:
         if error.errno in (errno.ENOBUFS, errno.EAGAIN):  # the interface's queue, or this socket's share of it
@@ -190,7 +190,7 @@ class SocketCanWire:
         return struct.unpack("=9I", raw)[MEMINFO_DROPS] if len(raw) == MEMINFO_BYTES else 0
 
 
-def message_of(frame: Frame, *, fd: bool = False) -> can.Message:
+def to_python_can(frame: Frame, *, fd: bool = False) -> can.Message:
     """As python-can has it. An id that does not fit 11 bits has 29."""
     extended = frame.id > LAST_STANDARD_ID
     return can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=extended, is_fd=fd, bitrate_switch=fd)
@@ -212,7 +212,7 @@ class VirtualPeer(Protocol):
         ...
 
 
-def virtual_channel() -> str:
+def make_virtual_channel() -> str:
     """A name that no other virtual bus has. Its last digits are a channel: log files take them for one, as of can0."""
     return f"virtual-{uuid.uuid4().hex[:8]}-0"
 
@@ -233,7 +233,7 @@ class VirtualWire:
         if self._faults.on and (taken := self._faults.stops_sending()) is not None:
             return taken
         try:
-            self._bus.send(message_of(frame, fd=self._fd))
+            self._bus.send(to_python_can(frame, fd=self._fd))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot send: {error}") from error
         return True
@@ -275,7 +275,7 @@ class VirtualWire:
             raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
 
-def drain(
+def drain_socket(
     source: socket.socket, buffer: bytearray, frames: list[Frame], on_error: Callable[[int, bytes], None]
 ) -> None:
     """Append all frames of a non-blocking raw CAN socket; error frames of the kernel go to `on_error`."""
@@ -312,7 +312,7 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     return True
 
 
-def arrivals(wires: Sequence[Wire], limit_s: float = MOMENT_S) -> Iterator[tuple[Wire, Frame]]:
+def receive_frames(wires: Sequence[Wire], limit_s: float = MOMENT_S) -> Iterator[tuple[Wire, Frame]]:
     """What has come after a moment at most; for the time before ticks begin."""
     if not wait(wires, min(limit_s, MOMENT_S)):
         time.sleep(PAUSE_S)

@@ -35,7 +35,7 @@ class BusError:
     detail: str
 
 
-def bus_errors_of(identifier: int, data: bytes, channel: str) -> list[BusError]:
+def decode_error_frame(identifier: int, data: bytes, channel: str) -> list[BusError]:
     """The bus errors in an error frame of the kernel."""
     kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
     if identifier & 0x04:

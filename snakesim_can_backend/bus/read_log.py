@@ -96,7 +96,7 @@ class BusLog:
         for number, line in self._lines():
             if not line.strip():
                 continue
-            message = read_line(line)
+            message = parse_line(line)
             if message is None:
                 self._drop(f"line {number}", line)
                 continue
@@ -109,7 +109,7 @@ class BusLog:
 
     def _times_are_steps(self) -> bool:
         """Whether times are since the frame before, as `candump -t d` prints them: they go back now and then."""
-        read = (read_line(line) for _, line in islice(self._lines(), LOOKED_AT))
+        read = (parse_line(line) for _, line in islice(self._lines(), LOOKED_AT))
         times = [message.timestamp for message in read if message is not None]
         self.has_times = not times or any(times)
         return any(after < before for before, after in pairwise(times))
@@ -156,7 +156,7 @@ class BusLog:
         return ConfigError(f"{self.path} cannot be read as a log of a CAN bus ({KINDS}): {why}")
 
 
-def read_line(line: str) -> can.Message | None:
+def parse_line(line: str) -> can.Message | None:
     """Return the frame of a line of candump; None if it is not whole. A time of 0: the line has none."""
     whole = line.endswith("\n")
     if found := COMPACT.fullmatch(line):

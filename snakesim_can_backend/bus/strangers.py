@@ -9,15 +9,15 @@ from dataclasses import dataclass
 
 import can
 
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     WITH_CHECKSUM,
     Frame,
     Opcode,
-    intact,
-    node_of,
-    opcode_of,
+    has_valid_checksum,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.base.errors import BackendError
 
@@ -27,21 +27,21 @@ MAX_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
-class Stranger:
+class UnknownFrames:
     """Frames of one id that are not of our protocol."""
 
     id: int
     extended: bool
     length: int  # bytes, of the newest
     frames: int
-    told: str  # whose it may be; empty: unknown
+    origin: str  # whose it may be; empty: unknown
 
     def __str__(self) -> str:
         digits = f"0x{self.id:08X}" if self.extended else f"0x{self.id:03X}"
-        return f"{digits}  {self.length} B  {self.frames} frames  {self.told or 'unknown'}"
+        return f"{digits}  {self.length} B  {self.frames} frames  {self.origin or 'unknown'}"
 
 
-def strangers(bus: can.BusABC, seconds: float) -> list[Stranger]:
+def listen_for_unknown_frames(bus: can.BusABC, seconds: float) -> list[UnknownFrames]:
     """Those heard on a bus within a time, by id. Raises BackendError."""
     heard: Counter[tuple[int, bool]] = Counter()
     newest: dict[tuple[int, bool], can.Message] = {}
@@ -49,28 +49,31 @@ def strangers(bus: can.BusABC, seconds: float) -> list[Stranger]:
     try:
         while (left_s := end - time.monotonic()) > 0 and heard.total() < MAX_FRAMES:
             message = bus.recv(left_s)
-            if message is None or message.is_error_frame or is_ours(message):
+            if message is None or message.is_error_frame or matches_protocol(message):
                 continue
             key = message.arbitration_id, message.is_extended_id
             heard[key] += 1
             newest[key] = message
     except (OSError, ValueError, can.CanError) as error:
         raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}") from error
-    return [Stranger(*key, len(newest[key].data), count, whose(newest[key])) for key, count in sorted(heard.items())]
+    return [
+        UnknownFrames(*key, len(newest[key].data), count, guess_origin(newest[key]))
+        for key, count in sorted(heard.items())
+    ]
 
 
-def is_ours(message: can.Message) -> bool:
+def matches_protocol(message: can.Message) -> bool:
     """Whether a frame has an id, a length and, where there is one, a checksum of the joint modules' protocol."""
     if message.is_extended_id or message.is_remote_frame or message.is_fd:
         return False
     frame = Frame(message.arbitration_id, bytes(message.data))
-    opcode, layouts = opcode_of(frame.id), codec()
-    if opcode not in layouts or node_of(frame.id) > LAST_NODE or len(frame.data) != layouts[Opcode(opcode)].length:
+    opcode, layouts = parse_opcode(frame.id), load_layouts()
+    if opcode not in layouts or parse_node(frame.id) > LAST_NODE or len(frame.data) != layouts[Opcode(opcode)].length:
         return False
-    return opcode not in WITH_CHECKSUM or intact(frame)
+    return opcode not in WITH_CHECKSUM or has_valid_checksum(frame)
 
 
-def whose(message: can.Message) -> str:
+def guess_origin(message: can.Message) -> str:
     """What a foreign frame looks like; empty: unknown."""
     identifier, data = message.arbitration_id, bytes(message.data)
     if message.is_fd:

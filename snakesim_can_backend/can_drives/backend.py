@@ -7,8 +7,8 @@ from typing import Annotated, Any, ClassVar
 from msgspec import Meta
 
 from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
-from snakesim_can_backend.bus.bus import VirtualWire, Wire, virtual_channel
-from snakesim_can_backend.bus.load import mbit, worst_s
+from snakesim_can_backend.bus.bus import VirtualWire, Wire, make_virtual_channel
+from snakesim_can_backend.bus.load import format_bit_rate, worst_frame_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.can_drives.drives import CanDrives
 from snakesim_can_backend.can_drives.emulator import CanEmulator
@@ -90,12 +90,16 @@ class CanDriveBackend(DriverTypeBackend):
     def load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> Load:
         """Of the fullest bus."""
         on = port_of(joints, settings.channels)
-        return load_of(cls.traffic, on, rate_hz, lambda length: worst_s(length, settings.bit_rate, settings.fd_rate))
+        return load_of(
+            cls.traffic, on, rate_hz, lambda length: worst_frame_s(length, settings.bit_rate, settings.fd_rate)
+        )
 
     @staticmethod
     def rates(settings: Any) -> str:
         """Bit rates, in words."""
-        return mbit(settings.bit_rate) + (f" with data at {mbit(settings.fd_rate)}" if settings.fd_rate else "")
+        return format_bit_rate(settings.bit_rate) + (
+            f" with data at {format_bit_rate(settings.fd_rate)}" if settings.fd_rate else ""
+        )
 
     @classmethod
     def emulator_on(
@@ -140,5 +144,5 @@ class CanDriveBackend(DriverTypeBackend):
                 clock_ns=clock.ns,
             )
 
-        channels = [virtual_channel()] if body is not None else settings.channels
+        channels = [make_virtual_channel()] if body is not None else settings.channels
         return buses_of(joints, settings, channels, open_drives)

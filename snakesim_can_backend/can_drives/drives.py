@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
-from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_into, wait
+from snakesim_can_backend.bus.bus import VirtualPeer, Wire, inject_into, receive_frames, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import FAULTS
@@ -289,5 +289,5 @@ class CanDrives(ABC):
                 for i in range(len(self.nodes)):
                     ask(i)
                 ask_at = now + ASK_EVERY_S
-            for _, frame in arrivals([self.wire]):
+            for _, frame in receive_frames([self.wire]):
                 self.take(frame)

@@ -1,11 +1,11 @@
 """The backend `can`: joint modules as a driver type of the driver kit, with sensors of their own."""
 
 from snakesim_can_backend.bus.adapter import check_channels
-from snakesim_can_backend.bus.load import check_load, reports_of
-from snakesim_can_backend.driver.modules import Modules
+from snakesim_can_backend.bus.load import check_load, plan_reports
+from snakesim_can_backend.driver.modules import JointModules
 from snakesim_can_backend.driver.own_emulators import check_emulators, check_faults
 from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog
-from snakesim_can_backend.driver.sensors import Sensors, described
+from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import check_mounted
 from snakesim_drivers.kit.drive_backend import Clock, DriveBackend
@@ -25,8 +25,8 @@ class CanBackend(DriveBackend):
 
     Settings = CanSettings
     clear_grace = 0  # the monitor has its own, for what takes a while to be over
-    modules: Modules
-    _sensors: Sensors
+    modules: JointModules
+    _sensors: SampleBuilder
 
     @staticmethod
     def check(config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
@@ -50,12 +50,12 @@ class CanBackend(DriveBackend):
         self.check(config, settings)
         clock, emulators = Clock(config), settings.emulators_run != "none"
         mocap = receiver(config, settings.pose_listen, emulators=emulators, clock=lambda _timestamp_ns: clock.ns())
-        self._reports = reports_of(config, settings)
+        self._reports = plan_reports(config, settings)
 
-        def make_modules(readings: Readings) -> Modules:
+        def make_modules(readings: Readings) -> JointModules:
             pose = mocap.address if mocap is not None else None
-            self.modules = Modules(config, settings, clock, pose, readings)
-            self._sensors = Sensors(config, self._reports, self.modules.reading, mocap)
+            self.modules = JointModules(config, settings, clock, pose, readings)
+            self._sensors = SampleBuilder(config, self._reports, self.modules.reading, mocap)
             return self.modules
 
         watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
@@ -65,10 +65,10 @@ class CanBackend(DriveBackend):
         self.modules.announce(lifecycle, isolated)
 
     def _samples(self, tick: int, timestamp_ns: int) -> Samples:
-        return self._sensors.sample(tick, timestamp_ns)
+        return self._sensors.make_samples(tick, timestamp_ns)
 
     def _silent(self) -> list[Finding]:
         return []  # the monitor finds it, by the answers to Syncs
 
     def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
-        return described(config, self._reports, pose_delay_s=pose_delay_s)
+        return describe_sensors(config, self._reports, pose_delay_s=pose_delay_s)

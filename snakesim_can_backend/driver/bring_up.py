@@ -8,20 +8,20 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from snakesim_can_backend.bus.bus import Wire, arrivals
+from snakesim_can_backend.bus.bus import Wire, receive_frames
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
-    VERSION,
-    Action,
+    PROTOCOL_VERSION,
+    CommandAction,
     Frame,
+    ModuleParameter,
     Opcode,
-    Operation,
-    Parameter,
-    Result,
-    node_of,
-    opcode_of,
+    ParameterOperation,
+    ParameterResult,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.base.errors import BackendError
 
@@ -30,7 +30,7 @@ LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id m
 
 
 @dataclass(frozen=True)
-class Identity:
+class ModuleIdentity:
     """A module's answer to `identify`."""
 
     node: int
@@ -43,17 +43,19 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Bus:
+class ModuleBus:
     """One wire, and the nodes that belong on it."""
 
     wire: Wire
     nodes: range
 
 
-def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None] | None = None) -> list[Identity]:
+def find_modules(
+    buses: Sequence[ModuleBus], limit_s: float, on_frame: Callable[[Frame], None] | None = None
+) -> list[ModuleIdentity]:
     """Send `identify` until all expected nodes have answered, or the timeout. Two modules may share an id."""
-    read = codec()[Opcode.IDENTITY].values
-    found: dict[tuple[str, int, int], Identity] = {}
+    read = load_layouts()[Opcode.IDENTITY].decode
+    found: dict[tuple[str, int, int], ModuleIdentity] = {}
     wanted = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
     end = time.monotonic() + limit_s
@@ -62,11 +64,11 @@ def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None]
     while (now := time.monotonic()) < end:
         if now >= ask_at:
             for wire in wires:
-                wire.send(commands.command(Action.IDENTIFY))
+                wire.send(commands.make_command(CommandAction.IDENTIFY))
             ask_at = now + ASK_EVERY_S
-        for wire, frame in arrivals(wires, end - now):
-            if opcode_of(frame.id) == Opcode.IDENTITY and len(frame.data) == codec()[Opcode.IDENTITY].length:
-                identity = _identity(wire.channel, node_of(frame.id), read(frame.data))
+        for wire, frame in receive_frames(wires, end - now):
+            if parse_opcode(frame.id) == Opcode.IDENTITY and len(frame.data) == load_layouts()[Opcode.IDENTITY].length:
+                identity = _identity(wire.channel, parse_node(frame.id), read(frame.data))
                 found[identity.channel, identity.node, identity.serial] = identity
             elif on_frame is not None:
                 on_frame(frame)
@@ -76,12 +78,12 @@ def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None]
 
 
 def discovery_errors(
-    buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence[str], *, lockstep: bool
+    buses: Sequence[ModuleBus], found: Sequence[ModuleIdentity], joints: Sequence[str], *, lockstep: bool
 ) -> list[str]:
     """Errors of the discovered nodes; empty when the robot is complete."""
     wrong: list[str] = []
     home = {node: bus.wire.channel for bus in buses for node in bus.nodes}
-    by_node: dict[int, list[Identity]] = defaultdict(list)
+    by_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
     for identity in found:
         by_node[identity.node].append(identity)
     for node, channel in home.items():
@@ -98,8 +100,10 @@ def discovery_errors(
             f"{who} is duplicated on {i.channel}, serial {i.serial:08X}: give that one another node id" for i in strays
         ]
         for identity in here:
-            if identity.protocol != VERSION:
-                wrong.append(f"{who} has protocol version {identity.protocol}, this driver {VERSION}: update one")
+            if identity.protocol != PROTOCOL_VERSION:
+                wrong.append(
+                    f"{who} has protocol version {identity.protocol}, this driver {PROTOCOL_VERSION}: update one"
+                )
             if lockstep and not identity.stepped:
                 wrong.append(f"{who} does not support lockstep: use --clock-mode realtime")
             if identity.stepped and not lockstep:
@@ -112,21 +116,21 @@ def discovery_errors(
     return wrong
 
 
-def configure(
-    buses: Sequence[Bus],
-    wanted: Mapping[int, Mapping[Parameter, float]],
+def configure_modules(
+    buses: Sequence[ModuleBus],
+    wanted: Mapping[int, Mapping[ModuleParameter, float]],
     limit_s: float,
     on_frame: Callable[[Frame], None] | None = None,
-) -> dict[int, dict[Parameter, float]]:
+) -> dict[int, dict[ModuleParameter, float]]:
     """Write each node's parameters, read the others, and return the present values. Raises BackendError."""
     wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
-    due = {node: list(Parameter) for node in wanted}
-    in_force: dict[int, dict[Parameter, float]] = {node: {} for node in wanted}
+    due = {node: list(ModuleParameter) for node in wanted}
+    in_force: dict[int, dict[ModuleParameter, float]] = {node: {} for node in wanted}
     asked_at: dict[int, float] = {}
     wires = [bus.wire for bus in buses]
     end = time.monotonic() + limit_s
-    request, answers = codec()[Opcode.PARAMETER_REQUEST], codec()[Opcode.PARAMETER_ANSWER]
-    read, answer_length = answers.values, answers.length
+    request, answers = load_layouts()[Opcode.PARAMETER_REQUEST], load_layouts()[Opcode.PARAMETER_ANSWER]
+    read, answer_length = answers.decode, answers.length
     while due:
         now = time.monotonic()
         if now > end:
@@ -134,13 +138,13 @@ def configure(
         for node, left in due.items():
             if now - asked_at.get(node, -1.0) > ASK_EVERY_S:
                 value = wanted[node].get(left[0])
-                operation = Operation.READ if value is None else Operation.WRITE
-                frame = request.frame(node, index=left[0], operation=operation, value=value or 0.0)
+                operation = ParameterOperation.READ if value is None else ParameterOperation.WRITE
+                frame = request.encode(node, index=left[0], operation=operation, value=value or 0.0)
                 if wire_of[node].send(frame):
                     asked_at[node] = now
-        for _, frame in arrivals(wires):
-            node = node_of(frame.id)
-            known = opcode_of(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
+        for _, frame in receive_frames(wires):
+            node = parse_node(frame.id)
+            known = parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
             if not known or not due.get(node):
                 if on_frame is not None:
                     on_frame(frame)
@@ -156,19 +160,21 @@ def configure(
     return in_force
 
 
-def _check(node: int, parameter: Parameter, asked: float | None, result: int) -> None:
-    if result == Result.DONE:
+def _check(node: int, parameter: ModuleParameter, asked: float | None, result: int) -> None:
+    if result == ParameterResult.DONE:
         return
     allowed = PARAMETERS[parameter]
-    why = Result(result).name.lower().replace("_", " ") if result < len(Result) else f"result {result}"
+    why = (
+        ParameterResult(result).name.lower().replace("_", " ") if result < len(ParameterResult) else f"result {result}"
+    )
     raise BackendError(
         f"node {node} refuses parameter {parameter.name.lower()} = {asked} {allowed.unit}: "
         f"{why} (allowed: {allowed.low:g} to {allowed.high:g})"
     )
 
 
-def _identity(channel: str, node: int, values: Mapping[str, float]) -> Identity:
-    return Identity(
+def _identity(channel: str, node: int, values: Mapping[str, float]) -> ModuleIdentity:
+    return ModuleIdentity(
         node=node,
         channel=channel,
         serial=int(values["serial"]),

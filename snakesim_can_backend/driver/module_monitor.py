@@ -7,7 +7,7 @@ cleared; a persistent one is then reported again.
 from collections.abc import Iterable, Sequence, Set
 
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS, BusError
-from snakesim_can_backend.driver.reports import Module, Reading
+from snakesim_can_backend.driver.reports import ModuleReports, ModuleStatus
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
 from snakesim_drivers.kit.findings import Finding, Told
 from snakesim_hal.wire.messages import LifecycleState
@@ -25,7 +25,7 @@ NEVER_ARMED = "module_never_armed"
 CONCERNS_ALL = {"duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED}
 
 
-class Watch:
+class ModuleMonitor:
     """Remembers which findings have been reported."""
 
     def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float) -> None:
@@ -45,17 +45,17 @@ class Watch:
         self._restarted: set[int] = set()  # joints, until a clear
         self._changed: set[int] = set()  # joints whose parameters may have changed
         self._was_armed: set[int] = set()  # joints, in this arming
-        self.seen: dict[str, int] = {}  # bus errors that are not faults, counted
+        self.minor_error_counts: dict[str, int] = {}  # bus errors that are not faults, counted
 
-    def forget(self, sync: int) -> None:
+    def reset(self, sync: int) -> None:
         """The fault was cleared: report persistent findings again once the modules have followed."""
         self._told.forget()
         self._restarted.clear()
         self._quiet_until = sync + CLEAR_GRACE
 
-    def look(
+    def find_faults(
         self,
-        reading: Reading,
+        reading: ModuleReports,
         lifecycle: LifecycleState,
         errors: Iterable[BusError] = (),
         unsent: Iterable[str] = (),
@@ -89,12 +89,12 @@ class Watch:
 
     # --- one module -------------------------------------------------------------------------------------------
 
-    def _finding(self, i: int, module: Module, what: str, cause: str, *also: str) -> Finding:
+    def _finding(self, i: int, module: ModuleStatus, what: str, cause: str, *also: str) -> Finding:
         """also: further kinds that apply."""
         who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
         return Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also)))
 
-    def _of_answers(self, i: int, module: Module, reading: Reading) -> list[Finding]:
+    def _of_answers(self, i: int, module: ModuleStatus, reading: ModuleReports) -> list[Finding]:
         """Findings about its frames, or that there are none."""
         found: list[Finding] = []
 
@@ -130,7 +130,7 @@ class Watch:
         return found
 
     def _of_state(
-        self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState, *, aside: bool
+        self, i: int, module: ModuleStatus, reading: ModuleReports, lifecycle: LifecycleState, *, aside: bool
     ) -> list[Finding]:
         """Findings about faults that it reports, or that it does not follow."""
         state = module.state.name.lower()
@@ -147,7 +147,7 @@ class Watch:
             return [self._finding(i, module, "module_not_armed", f"is not armed any more: it is {state}")]
         return [self._finding(i, module, "module_not_armed", f"does not arm: it is {state}", NEVER_ARMED)]
 
-    def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
+    def _has_restarted(self, i: int, module: ModuleStatus, reading: ModuleReports) -> bool:
         """A second module with the same id also makes the uptime decrease, but then every Sync is answered twice."""
         if module.restarts > self._restarts[i]:
             self._restarts[i] = module.restarts
@@ -157,7 +157,7 @@ class Watch:
         del self._restart_at[i]
         return True
 
-    def _refuses_to_arm(self, i: int, module: Module, reading: Reading) -> bool:
+    def _refuses_to_arm(self, i: int, module: ModuleStatus, reading: ModuleReports) -> bool:
         if self._armed_sync is None:
             return False
         if module.state == ModuleState.ARMED:
@@ -190,7 +190,7 @@ class Watch:
             if advice is not None:
                 found.append(Finding(error.kind, f"{error.channel}: {error.detail}; {advice}"))
             else:
-                self.seen[error.kind] = self.seen.get(error.kind, 0) + 1
+                self.minor_error_counts[error.kind] = self.minor_error_counts.get(error.kind, 0) + 1
         self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
         for channel, ticks in self._unsent.items():
             if ticks >= IN_A_ROW:
@@ -202,13 +202,13 @@ class Watch:
                 found.append(Finding("bus_stuck", cause))
         return found
 
-    def _of_strangers(self, reading: Reading) -> list[Finding]:
+    def _of_strangers(self, reading: ModuleReports) -> list[Finding]:
         found: list[Finding] = []
-        self._strangers = {node: self._strangers.get(node, 0) + n for node, n in reading.strangers.items()}
+        self._strangers = {node: self._strangers.get(node, 0) + n for node, n in reading.unknown_nodes.items()}
         for node, frames in self._strangers.items():
             if frames >= STRANGER_FRAMES:
                 found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
-        reading.strangers.clear()
+        reading.unknown_nodes.clear()
         others = reading.from_other_host
         if others[Opcode.EMERGENCY]:
             found.append(Finding("emergency", "a node on the bus sent an Emergency"))
@@ -219,7 +219,7 @@ class Watch:
         return found
 
 
-def _alive(module: Module, reading: Reading) -> str:
+def _alive(module: ModuleStatus, reading: ModuleReports) -> str:
     if module.heartbeat_sync > module.sync:
         return "; it still sends heartbeats, so it receives no Sync or its main loop hangs"
     if reading.sync < 0 or module.uptime_ms < 0:

@@ -10,17 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from snakesim_can_backend.bus.adapter import open_wire
-from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, virtual_channel, wait
-from snakesim_can_backend.bus.load import reports_of, shares, worst_bits
+from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, make_virtual_channel, wait
+from snakesim_can_backend.bus.load import joints_per_bus, plan_reports, worst_frame_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
-from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
-from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Watch
-from snakesim_can_backend.driver.own_emulators import EmulatorProcess, emulators_here, modules_know
-from snakesim_can_backend.driver.parameters import check_ratings, parameters_of
-from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.driver.bring_up import ModuleBus, configure_modules, discovery_errors, find_modules
+from snakesim_can_backend.driver.module_monitor import ARM_GRACE, ModuleMonitor
+from snakesim_can_backend.driver.own_emulators import EmulatorProcess, start_local_emulators, supports_fault
+from snakesim_can_backend.driver.parameters import check_ratings, plan_parameters
+from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.driver.sensors import contacts_due
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.kit.drive_backend import Clock
 from snakesim_drivers.kit.findings import Finding
@@ -52,7 +52,7 @@ class ArmSession:
     done: set[int] = field(default_factory=set[int])
 
 
-class Modules:
+class JointModules:
     """All joint modules of a robot; joint i is node i + 1."""
 
     emulated = False  # until they have said so
@@ -67,9 +67,9 @@ class Modules:
         self._readings = readings
         self._config, self._settings, self._clock = config, settings, clock
         self._lockstep = config.clock_mode == "lockstep"
-        self._reports = reports_of(config, settings)
+        self._reports = plan_reports(config, settings)
         self._names = [joint.name for joint in config.robot.joint_table]
-        self.reading = Reading(len(self._names))
+        self.reading = ModuleReports(len(self._names))
         self.wires: list[Wire] = []
         self.local_emulators: VirtualPeer | None = None
         self._emulators: EmulatorProcess | None = None
@@ -84,20 +84,20 @@ class Modules:
         self._arms = self._all_cleared = False  # of this tick's change of the lifecycle
         self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else FIRST_STATE_PAUSE_S
         try:
-            self._buses = self._open_buses(shares(config, settings), pose)
+            self._buses = self._open_buses(joints_per_bus(config, settings), pose)
         except BaseException:
             self.close()
             raise
         self._wire_of = [bus.wire for bus in self._buses for _ in bus.nodes]
         channels = [wire.channel for wire in self._wire_of]
-        self.watch = Watch(self._names, channels, config.period_ns * 1e-9)
+        self.monitor = ModuleMonitor(self._names, channels, config.period_ns * 1e-9)
 
     # --- Drives -----------------------------------------------------------------------------------------------
 
     def bring_up(self) -> None:
         """Find every module, check it, write its parameters; nothing is enabled."""
         limit_s = self._settings.bring_up_limit_s
-        found = find(self._buses, limit_s, self.reading.take)
+        found = find_modules(self._buses, limit_s, self.reading.process_frame)
         if self.reading.from_other_host:
             raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
         wrong = discovery_errors(self._buses, found, self._names, lockstep=self._lockstep)
@@ -107,7 +107,7 @@ class Modules:
         self.emulated = all(identity.emulated for identity in found)
         for identity in found:
             self._readings.identified(identity.node - 1, serial=f"{identity.serial:08X}", firmware=identity.firmware)
-        self._broadcast(commands.command(Action.DISARM))
+        self._broadcast(commands.make_command(CommandAction.DISARM))
         self._configure(limit_s)
         self._await_first_states()
         self._forgive_old_faults()
@@ -119,8 +119,8 @@ class Modules:
         time_us = self._clock.ns() // 1000
         self._receive()
         due = contacts_due(self._reports, reading.sync + 1)
-        reading.begin(reading.sync + 1, contacts=due, tail=self._reports.tail, questions=len(questions))
-        frame = commands.sync(reading.sync, time_us)
+        reading.begin_sync(reading.sync + 1, contacts=due, tail=self._reports.tail, questions=len(questions))
+        frame = commands.make_sync(reading.sync, time_us)
         self._unsent = [wire.channel for wire in self.wires if not wire.send(frame)]
         for wire, question in questions:
             wire.send(question)
@@ -139,24 +139,24 @@ class Modules:
             self._remind(lifecycle)
         elif lifecycle == "armed":
             self._arm_session = ArmSession(self.reading.sync)
-        frames = commands.on_change(before, lifecycle)
-        self._arms = any(map(commands.is_arming, frames))
+        frames = commands.make_transition_frames(before, lifecycle)
+        self._arms = any(map(commands.is_arm_command, frames))
         self._all_cleared = before in commands.LATCHED
         for frame in frames:
-            if not commands.is_arming(frame):
+            if not commands.is_arm_command(frame):
                 self._broadcast(frame)
         fresh, self._isolated = isolated - self._isolated, isolated
         for i in sorted(fresh):
-            self._wire_of[i].send(commands.command(Action.DISARM, i + 1))
+            self._wire_of[i].send(commands.make_command(CommandAction.DISARM, i + 1))
 
     def clear(self, joints: frozenset[int]) -> None:
         """Modules whose parameters may have changed are configured again, once, while motors are off.
 
         A module that is not configured then is reported as a fault, and nothing is armed.
         """
-        self.watch.forget(self.reading.sync)
+        self.monitor.reset(self.reading.sync)
         for i in sorted(joints) if not self._all_cleared else ():
-            self._wire_of[i].send(commands.command(Action.CLEAR, i + 1))
+            self._wire_of[i].send(commands.make_command(CommandAction.CLEAR, i + 1))
         if self._unconfigured:
             try:
                 self._configure(CONFIGURE_LIMIT_S)
@@ -180,24 +180,26 @@ class Modules:
         if self._lifecycle != "armed":
             return
         points = Setpoints(modes, targets.tolist(), limits_nm.tolist(), self._isolated)
-        for i, frame in enumerate(self._setpoints.frames(points)):
+        for i, frame in enumerate(self._setpoints.encode(points)):
             if i not in following:
                 continue
             if self._wire_of[i].send(frame):
-                self._setpoints.sent(i)
+                self._setpoints.confirm_sent(i)
             else:  # the queue is full or the interface down: the next setpoint replaces it
                 self._unsent.append(self._wire_of[i].channel)
 
     def findings(self) -> list[Finding]:
         """Reported by the modules and the buses, or detected by the monitor."""
         errors = [error for wire in self.wires for error in wire.errors()]
-        found = self.watch.look(self.reading, self._lifecycle, errors, self._unsent, self._unconfigured, self._isolated)
-        self._unconfigured |= self.watch.take_changed()
+        found = self.monitor.find_faults(
+            self.reading, self._lifecycle, errors, self._unsent, self._unconfigured, self._isolated
+        )
+        self._unconfigured |= self.monitor.take_changed()
         return found
 
     def let_run(self) -> None:
         """Process frames received meanwhile."""
-        if self._emulators is not None and (how := self._emulators.how_it_ended()) is not None:
+        if self._emulators is not None and (how := self._emulators.describe_exit()) is not None:
             raise BackendError(how)
         self._receive()
 
@@ -206,7 +208,7 @@ class Modules:
         if inject_into(self.wires, injection, begins=begins):
             return True
         emulators = self._emulators or self.local_emulators
-        if emulators is None or not modules_know(injection, len(self._wire_of)):
+        if emulators is None or not supports_fault(injection, len(self._wire_of)):
             return False
         emulators.inject(injection, begins=begins)
         return True
@@ -224,7 +226,7 @@ class Modules:
         """Motors off, and the bus closed, as far as it still works; errors do not prevent closing the other buses."""
         try:
             if self._ours:
-                wire.send(commands.command(Action.DISARM))
+                wire.send(commands.make_command(CommandAction.DISARM))
             wire.idle()
         except BackendError as error:
             _log.warning("closing: %s", error)
@@ -233,22 +235,22 @@ class Modules:
         except BackendError as error:
             _log.warning("closing: %s", error)
 
-    def _open_buses(self, joints_of: list[int], pose: str | None) -> list[Bus]:
+    def _open_buses(self, joints_of: list[int], pose: str | None) -> list[ModuleBus]:
         settings = self._settings
         if settings.emulators_run == "process":
             self._emulators = EmulatorProcess(self._config, settings, pose, stepped=self._lockstep)
-        for name in settings.channels or [virtual_channel()]:
+        for name in settings.channels or [make_virtual_channel()]:
             if settings.channels:
                 self.wires.append(open_wire(name, bit_rate=settings.bit_rate))
             else:
-                self.local_emulators = emulators_here(self._config, settings, name, pose, stepped=self._lockstep)
+                self.local_emulators = start_local_emulators(self._config, settings, name, pose, stepped=self._lockstep)
                 self.wires.append(VirtualWire(name, self.local_emulators))
         if settings.log:
             log = open_log(Path(settings.log))
             self.wires = [LoggedWire(wire, log) for wire in self.wires]
         buses, first = [], 1
         for wire, count in zip(self.wires, joints_of, strict=True):
-            buses.append(Bus(wire, range(first, first + count)))
+            buses.append(ModuleBus(wire, range(first, first + count)))
             first += count
         return buses
 
@@ -263,14 +265,14 @@ class Modules:
             faults = module.fault_names()
             if module.state == ModuleState.FAULT and faults and set(faults) <= LEFT_BEHIND:
                 _log.warning("node %d: clearing an earlier fault: %s", module.node, ", ".join(faults))
-                wire.send(commands.command(Action.CLEAR, module.node))
+                wire.send(commands.make_command(CommandAction.CLEAR, module.node))
 
     def _configure(self, limit_s: float) -> None:
         """Write the parameters of every module that needs them. Raises BackendError."""
-        wanted = parameters_of(self._config.robot, self._settings, self._reports)
+        wanted = plan_parameters(self._config.robot, self._settings, self._reports)
         due = {joint + 1: wanted[joint + 1] for joint in self._unconfigured}
         try:
-            check_ratings(self._config.robot, configure(self._buses, due, limit_s, self.reading.take))
+            check_ratings(self._config.robot, configure_modules(self._buses, due, limit_s, self.reading.process_frame))
         finally:
             self.reading.forget_frames()  # they arrived over more than one period
         self._unconfigured.clear()
@@ -279,7 +281,7 @@ class Modules:
         for _ in range(FIRST_STATE_SYNCS):
             self.read()
             if all(module.sync >= 0 for module in self.reading.modules):
-                self.reading.strangers.clear()
+                self.reading.unknown_nodes.clear()
                 return
         silent = [name for name, module in zip(self._names, self.reading.modules, strict=True) if module.sync < 0]
         raise BackendError(f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled")
@@ -294,11 +296,11 @@ class Modules:
         asked: dict[str, tuple[Wire, Frame]] = {}
         for module, wire in zip(self.reading.modules, self._wire_of, strict=True):
             if module.sync >= 0 and module.sync == self.reading.sync:
-                asked.setdefault(wire.channel, (wire, commands.question(module.node)))
+                asked.setdefault(wire.channel, (wire, commands.make_query(module.node)))
         return list(asked.values())
 
     def _receive(self) -> None:
-        take = self.reading.take
+        take = self.reading.process_frame
         for wire in self.wires:
             for frame in wire.receive():
                 take(frame)
@@ -321,29 +323,29 @@ class Modules:
         for i, module in enumerate(self.reading.modules):
             if lifecycle == "armed" and i in self._isolated:
                 if module.state in (ModuleState.ARMED, ModuleState.STOPPING):
-                    self._wire_of[i].send(commands.command(Action.DISARM, module.node))
+                    self._wire_of[i].send(commands.make_command(CommandAction.DISARM, module.node))
                 continue
             if lifecycle == "armed" and module.state == ModuleState.ARMED:
                 arm_session.done.add(i)
-            frame = commands.reminder(lifecycle, module.state, module.node)
+            frame = commands.make_reminder(lifecycle, module.state, module.node)
             if frame is not None and (lifecycle != "armed" or (in_time and i not in arm_session.done)):
                 self._wire_of[i].send(frame)
 
     def _arm(self) -> None:
         """Send arm to all modules, except isolated ones."""
         if not self._isolated:
-            self._broadcast(commands.command(Action.ARM))
+            self._broadcast(commands.make_command(CommandAction.ARM))
             return
         for i, wire in enumerate(self._wire_of):
             if i not in self._isolated:
-                wire.send(commands.command(Action.ARM, i + 1))
+                wire.send(commands.make_command(CommandAction.ARM, i + 1))
 
 
 def answer_limit_s(config: RunConfig, settings: CanSettings) -> float:
     """How long all answers to a Sync may take on the fullest bus; the rest of the period is for the controller."""
     if config.clock_mode == "lockstep":
         return LOCKSTEP_ANSWER_S
-    reports = reports_of(config, settings)
-    frames = max(shares(config, settings)) * (1 + (reports.contact_every > 0)) + reports.tail
-    bus_s = frames * worst_bits(8) / reports.bit_rate
+    reports = plan_reports(config, settings)
+    frames = max(joints_per_bus(config, settings)) * (1 + (reports.contact_every > 0)) + reports.tail
+    bus_s = frames * worst_frame_bits(8) / reports.bit_rate
     return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MAX_OF_PERIOD / reports.rate_hz)

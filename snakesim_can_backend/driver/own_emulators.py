@@ -27,7 +27,7 @@ POLL_S = 0.02
 
 def check_emulators(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError for impossible settings of the emulators."""
-    from snakesim_can_backend.emulator.faults import parse
+    from snakesim_can_backend.emulator.faults import parse_fault
 
     if settings.emulators_run == "here" and settings.channels:
         raise ConfigError(
@@ -44,37 +44,41 @@ def check_emulators(config: RunConfig, settings: CanSettings) -> None:
     if settings.faults and settings.emulators_run == "none":
         raise ConfigError("`backends.can.faults` are for emulators; give them to `snakesim modules --fault` instead")
     for text in settings.faults:
-        parse(text, config.robot.chain.modules)
+        parse_fault(text, config.robot.chain.modules)
 
 
 def check_faults(config: RunConfig, settings: CanSettings) -> None:
     """Check that the planned faults of joints and buses are possible. Raises ConfigError."""
-    from snakesim_can_backend.emulator.faults import ABOUT
+    from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
 
     own, virtual = settings.emulators_run != "none", not settings.channels
-    does = {*KINDS["bus"]} - {"slow", "" if virtual else "full"} | ({*ABOUT} if own else set())
-    because = f"its modules support {', '.join(ABOUT)}" if own else "its modules are not the driver's own emulators"
+    does = {*KINDS["bus"]} - {"slow", "" if virtual else "full"} | ({*FAULT_DESCRIPTIONS} if own else set())
+    because = (
+        f"its modules support {', '.join(FAULT_DESCRIPTIONS)}"
+        if own
+        else "its modules are not the driver's own emulators"
+    )
     because += "" if virtual else "; and a program cannot fill the queue of a kernel interface"
     check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)
 
 
-def modules_know(injection: Injection, joints: int) -> bool:
+def supports_fault(injection: Injection, joints: int) -> bool:
     """Whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
-    from snakesim_can_backend.emulator.faults import ABOUT, checked
+    from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS, check_fault
 
-    if injection.target_type != "joint" or injection.kind not in ABOUT:
+    if injection.target_type != "joint" or injection.kind not in FAULT_DESCRIPTIONS:
         return False
-    checked(injection, joints)
+    check_fault(injection, joints)
     return True
 
 
-def emulators_here(
+def start_local_emulators(
     config: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
 ) -> VirtualPeer:
     """Emulators at the other end of a virtual bus; the returned function runs them."""
-    from snakesim_can_backend.emulator.server import here
+    from snakesim_can_backend.emulator.server import make_local_emulators
 
-    return here(config, settings, channel, pose, stepped=stepped)
+    return make_local_emulators(config, settings, channel, pose, stepped=stepped)
 
 
 class EmulatorProcess:
@@ -108,18 +112,18 @@ class EmulatorProcess:
                 start_new_session=True,
             )
 
-    def how_it_ended(self) -> str | None:
+    def describe_exit(self) -> str | None:
         """Its exit as text; None while it runs."""
         code = self._process.poll()
         return None if code is None else f"the emulated joint modules have ended, with exit code {code}"
 
     def inject(self, fault: Injection, *, begins: bool) -> None:
         """Begin or end a fault of a module. Raises BackendError when the child is gone."""
-        from snakesim_can_backend.emulator.faults import typed
+        from snakesim_can_backend.emulator.faults import format_typed_fault
 
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(f"{typed(fault, begins=begins)}\n".encode())
+            self._process.stdin.write(f"{format_typed_fault(fault, begins=begins)}\n".encode())
             self._process.stdin.flush()
         except (OSError, ValueError) as error:  # the latter when it was stopped
             raise BackendError(f"the emulated joint modules do not accept {fault}: {error}") from error

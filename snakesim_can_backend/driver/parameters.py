@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 
-from snakesim_can_backend.bus.load import Reports
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Opcode, Parameter, SafeMotion
+from snakesim_can_backend.bus.load import ReportSchedule
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Drive, Joint
@@ -15,27 +15,29 @@ MIN_PERIODS = 2.2  # in a watchdog's time: one setpoint may be lost, and the nex
 SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
 
 
-def parameters_of(robot: RobotFile, settings: CanSettings, reports: Reports) -> dict[int, dict[Parameter, float]]:
+def plan_parameters(
+    robot: RobotFile, settings: CanSettings, reports: ReportSchedule
+) -> dict[int, dict[ModuleParameter, float]]:
     """The parameters to write to each node."""
     safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
     common = {
-        Parameter.WATCHDOG: settings.watchdog_s,
-        Parameter.STOP_MODE: float(safe),
-        Parameter.CONTACT_EVERY: float(reports.contact_every),
-        Parameter.IMU_EVERY: float(reports.imu_every),
+        ModuleParameter.WATCHDOG: settings.watchdog_s,
+        ModuleParameter.STOP_MODE: float(safe),
+        ModuleParameter.CONTACT_EVERY: float(reports.contact_every),
+        ModuleParameter.IMU_EVERY: float(reports.imu_every),
     }
-    found: dict[int, dict[Parameter, float]] = {}
+    found: dict[int, dict[ModuleParameter, float]] = {}
     for node, joint in enumerate(robot.joint_table, start=1):
         motor, gear = joint.motor, joint.drive.gear
         found[node] = {
-            Parameter.STIFFNESS: motor.stiffness_nm_per_rad / gear**2,
-            Parameter.DAMPING: motor.damping_nm_s_per_rad / gear**2,
-            Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
-            Parameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
-            Parameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
-            Parameter.ANGLE_LIMIT: _furthest_rad(joint),  # the limiter keeps to the nearer side
+            ModuleParameter.STIFFNESS: motor.stiffness_nm_per_rad / gear**2,
+            ModuleParameter.DAMPING: motor.damping_nm_s_per_rad / gear**2,
+            ModuleParameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
+            ModuleParameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
+            ModuleParameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
+            ModuleParameter.ANGLE_LIMIT: _furthest_rad(joint),  # the limiter keeps to the nearer side
             **common,
-            Parameter.TAIL: float(node == 1 and reports.tail),
+            ModuleParameter.TAIL: float(node == 1 and reports.tail),
         }
     return found
 
@@ -67,10 +69,10 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
             )
 
 
-def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:
+def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[ModuleParameter, float]] | None = None) -> None:
     """Raise ConfigError or BackendError when the robot file exceeds the protocol's range or a module's rating."""
-    signals = codec()[Opcode.JOINT_STATE].signals
-    joints, hottest_c = robot.joint_table, codec()[Opcode.HEALTH].signals["motor_temperature"].high
+    signals = load_layouts()[Opcode.JOINT_STATE].signals
+    joints, hottest_c = robot.joint_table, load_layouts()[Opcode.HEALTH].signals["motor_temperature"].high
     for joint in joints:
         limits, gear = joint.limits, joint.drive.gear
         for what, value, most, unit in (
@@ -86,7 +88,7 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
                     f"bus protocol, which ends at {most:.3g} {unit}"
                 )
     reach_m = max(robot.link_lengths_m) + robot.module.radius_m
-    along_m = codec()[Opcode.CONTACT].signals["along"].high
+    along_m = load_layouts()[Opcode.CONTACT].signals["along"].high
     if robot.sensors.contacts is not None and reach_m > along_m:
         raise ConfigError(
             f"robot {robot.name!r}: a contact at a link's end, {reach_m:.3g} m from its joint (`module.length_m` + "
@@ -99,8 +101,8 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
         )
     for node, values in (in_force or {}).items():
         for parameter, asked, unit in (
-            (Parameter.RATED_TORQUE, joints[node - 1].limits.torque_nm / joints[node - 1].drive.gear, "N·m"),
-            (Parameter.RATED_SPEED, joints[node - 1].limits.speed_rad_s * joints[node - 1].drive.gear, "rad/s"),
+            (ModuleParameter.RATED_TORQUE, joints[node - 1].limits.torque_nm / joints[node - 1].drive.gear, "N·m"),
+            (ModuleParameter.RATED_SPEED, joints[node - 1].limits.speed_rad_s * joints[node - 1].drive.gear, "rad/s"),
         ):
             if not values[parameter] >= asked * 0.999:  # also rejects a rating of NaN, which the bus can carry
                 raise BackendError(

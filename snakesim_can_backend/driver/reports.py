@@ -11,21 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
-    COUNTS,
+    COUNTER_MODULUS,
     FROM_HOST,
     MAX_UPTIME_MS,
     UPTIME_RANGE_MS,
-    Action,
+    CommandAction,
     Frame,
     LastStop,
     ModuleFault,
     ModuleState,
     Opcode,
     frame_id,
-    node_of,
-    opcode_of,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.base.arrays import Floats
 
@@ -40,7 +40,7 @@ STOPPED = (ModuleState.FAULT, ModuleState.EMERGENCY)  # until a Clear
 
 
 @dataclass
-class Module:
+class ModuleStatus:
     """The state of one module. Numbers of Syncs are not modulo."""
 
     node: int
@@ -78,51 +78,51 @@ class Module:
         return [fault.name.lower() for fault in ModuleFault if self.faults >> fault & 1]
 
 
-class Reading:
+class ModuleReports:
     """The reports of all modules of a robot so far; joint i is node i + 1."""
 
     def __init__(self, joints: int) -> None:
-        self.modules = [Module(node) for node in range(1, joints + 1)]
+        self.modules = [ModuleStatus(node) for node in range(1, joints + 1)]
         self.sync = -1  # the newest one sent
         self.states_missing = joints
         self.contacts_missing = 0
         self.answers_missing = 0  # to parameter requests
-        self.strangers: Counter[int] = Counter()  # frames of unexpected nodes, since the last tick
+        self.unknown_nodes: Counter[int] = Counter()  # frames of unexpected nodes, since the last tick
         self.from_other_host: Counter[Opcode] = Counter()
         self.malformed = 0
-        layouts = codec()
+        layouts = load_layouts()
         self._joint = [(0,) * 5 for _ in range(joints)]  # as returned by `_read_state`
         self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: no report yet
         self._gyro: list[tuple[int, ...] | None] = [None] * joints
         self._acceleration: list[tuple[int, ...] | None] = [None] * joints
         self._health: list[tuple[int, ...] | None] = [None] * joints
         self.shaft_raw: list[int | None] = [None] * joints
-        self._read_state = layouts[Opcode.JOINT_STATE].reader("angle", "velocity", "torque", "count", "state")
+        self._read_state = layouts[Opcode.JOINT_STATE].make_reader("angle", "velocity", "torque", "count", "state")
         signals = layouts[Opcode.JOINT_STATE].signals
         self._state_scale = np.array([[signals[name].scale] for name in ("angle", "velocity", "torque")])
         contact = layouts[Opcode.CONTACT]
-        self._read_contact = contact.reader("force_x", "force_y", "force_z", "along", "bearing")
-        self._read_touch = contact.reader("count", "touched")
-        self._read_gyro = layouts[Opcode.GYRO].reader("rate_x", "rate_y", "rate_z", "count")
+        self._read_contact = contact.make_reader("force_x", "force_y", "force_z", "along", "bearing")
+        self._read_touch = contact.make_reader("count", "touched")
+        self._read_gyro = layouts[Opcode.GYRO].make_reader("rate_x", "rate_y", "rate_z", "count")
         names = ("acceleration_x", "acceleration_y", "acceleration_z", "count")
-        self._read_acceleration = layouts[Opcode.ACCELEROMETER].reader(*names)
+        self._read_acceleration = layouts[Opcode.ACCELEROMETER].make_reader(*names)
         names = ("voltage", "current", "motor_temperature", "board_temperature", "leak")
-        self._read_health = layouts[Opcode.HEALTH].reader(*names)
-        self._read_shaft = layouts[Opcode.SHAFT_LOAD].reader("torque")
+        self._read_health = layouts[Opcode.HEALTH].make_reader(*names)
+        self._read_shaft = layouts[Opcode.SHAFT_LOAD].make_reader("torque")
         command = layouts[Opcode.COMMAND]
-        self._read_action, self._command_length = command.reader("action"), command.length
+        self._read_action, self._command_length = command.make_reader("action"), command.length
         faults = [f"fault_{fault.name.lower()}" for fault in ModuleFault]
-        self._read_heartbeat = layouts[Opcode.HEARTBEAT].reader("state", "last_stop", "uptime", *faults)
+        self._read_heartbeat = layouts[Opcode.HEARTBEAT].make_reader("state", "last_stop", "uptime", *faults)
         # Functions rather than bound methods, which would keep this object until the garbage collector comes.
         takers = {
-            Opcode.JOINT_STATE: Reading._take_state,
-            Opcode.CONTACT: Reading._take_contact,
-            Opcode.TAIL_CONTACT: Reading._take_tail_contact,
-            Opcode.HEARTBEAT: Reading._take_heartbeat,
-            Opcode.GYRO: Reading._take_gyro,
-            Opcode.ACCELEROMETER: Reading._take_acceleration,
-            Opcode.SHAFT_LOAD: Reading._take_shaft,
-            Opcode.HEALTH: Reading._take_health,
+            Opcode.JOINT_STATE: ModuleReports._take_state,
+            Opcode.CONTACT: ModuleReports._take_contact,
+            Opcode.TAIL_CONTACT: ModuleReports._take_tail_contact,
+            Opcode.HEARTBEAT: ModuleReports._take_heartbeat,
+            Opcode.GYRO: ModuleReports._take_gyro,
+            Opcode.ACCELEROMETER: ModuleReports._take_acceleration,
+            Opcode.SHAFT_LOAD: ModuleReports._take_shaft,
+            Opcode.HEALTH: ModuleReports._take_health,
         }
         self._known = {
             frame_id(opcode, module.node): (take, module, layouts[opcode].length)
@@ -130,7 +130,7 @@ class Reading:
             for module in self.modules
         }
 
-    def begin(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
+    def begin_sync(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
         """A Sync is sent. Only modules that have answered recently are waited for.
 
         contacts, tail: whether force reports are due, and whether the tail link sends one of its own.
@@ -151,7 +151,7 @@ class Reading:
         """Whether all awaited modules have answered."""
         return self.states_missing <= 0 and self.contacts_missing <= 0 and self.answers_missing <= 0
 
-    def take(self, frame: Frame) -> None:
+    def process_frame(self, frame: Frame) -> None:
         """Process one frame."""
         known = self._known.get(frame.id)
         if known is None:
@@ -165,20 +165,20 @@ class Reading:
             self.malformed += 1
 
     def _take_other(self, frame: Frame) -> None:
-        opcode, node = opcode_of(frame.id), node_of(frame.id)
+        opcode, node = parse_opcode(frame.id), parse_node(frame.id)
         if opcode in FROM_HOST:
             if not self._only_asks(frame):
                 self.from_other_host[Opcode(opcode)] += 1
         elif not 1 <= node <= len(self.modules):
-            self.strangers[node] += 1
+            self.unknown_nodes[node] += 1
         else:
             self.modules[node - 1].frames += 1
             self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
     def _only_asks(self, frame: Frame) -> bool:
         """Whether it is only an `identify` of another host."""
-        is_command = opcode_of(frame.id) == Opcode.COMMAND and len(frame.data) == self._command_length
-        return is_command and self._read_action(frame.data) == (Action.IDENTIFY,)
+        is_command = parse_opcode(frame.id) == Opcode.COMMAND and len(frame.data) == self._command_length
+        return is_command and self._read_action(frame.data) == (CommandAction.IDENTIFY,)
 
     def forget_frames(self) -> None:
         """Reset the frame counts, which cover more than one period."""
@@ -187,15 +187,15 @@ class Reading:
 
     # --- joint states, in SI units ----------------------------------------------------------------------------
 
-    def joints(self) -> Floats:
+    def shaft_values(self) -> Floats:
         """Angle, velocity and torque of every module's shaft, (3, n_joints)."""
         return np.array(self._joint).T[:COUNT_AT] * self._state_scale
 
-    def links_touched(self) -> list[tuple[int, tuple[int, ...]]]:
+    def list_contacts(self) -> list[tuple[int, tuple[int, ...]]]:
         """(link, raw force x y z, place along and bearing) of every link that reported a contact at this Sync."""
         return [(link, self._read_contact(data)) for link, data in enumerate(self._contact) if data]
 
-    def imus(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
+    def take_imu_reports(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
         """(link, raw rates, raw accelerations) of every link whose IMU has reported since the last call."""
         found = []
         for i, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
@@ -210,7 +210,7 @@ class Reading:
 
     # --- one kind of frame each ---------------------------------------------------------------------------------
 
-    def _take_state(self, module: Module, frame: Frame) -> None:
+    def _take_state(self, module: ModuleStatus, frame: Frame) -> None:
         identifier, data = frame
         if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `intact`, without a call
             module.corrupt += 1
@@ -219,7 +219,7 @@ class Reading:
         count = numbers[COUNT_AT]
         module.repeats = module.repeats + 1 if count == module.last_count else 0
         module.last_count = count
-        late = (self.sync - count) % COUNTS
+        late = (self.sync - count) % COUNTER_MODULUS
         if late > LATE_SYNCS:
             module.wrong_counts += 1
             return
@@ -236,24 +236,24 @@ class Reading:
         if late == 0:
             self.states_missing -= module.awaited
 
-    def _answered_twice(self, module: Module) -> None:
+    def _answered_twice(self, module: ModuleStatus) -> None:
         if module.twice_at < self.sync:
             module.twice = module.twice + 1 if module.twice_at == self.sync - 1 else 1
             module.twice_at = self.sync
 
-    def _take_contact(self, module: Module, frame: Frame) -> None:
+    def _take_contact(self, module: ModuleStatus, frame: Frame) -> None:
         self._take_link(module, module.node, frame.data)
 
-    def _take_tail_contact(self, module: Module, frame: Frame) -> None:
+    def _take_tail_contact(self, module: ModuleStatus, frame: Frame) -> None:
         self._take_link(module, module.node - 1, frame.data)
 
-    def _take_link(self, module: Module, link: int, data: bytes) -> None:
+    def _take_link(self, module: ModuleStatus, link: int, data: bytes) -> None:
         count, touched = self._read_touch(data)
-        if (self.sync - count) % COUNTS == 0 and self._contact[link] is None:
+        if (self.sync - count) % COUNTER_MODULUS == 0 and self._contact[link] is None:
             self._contact[link] = data if touched else UNTOUCHED
             self.contacts_missing -= module.awaited
 
-    def _take_heartbeat(self, module: Module, frame: Frame) -> None:
+    def _take_heartbeat(self, module: ModuleStatus, frame: Frame) -> None:
         state, last_stop, uptime_ms, *bits = self._read_heartbeat(frame.data)
         goes_on = 0 <= uptime_ms - module.uptime_ms < ONE_CLOCK_MS
         if module.went_back and goes_on and uptime_ms < module.uptime_before_ms:
@@ -265,16 +265,16 @@ class Reading:
         module.last_stop = LastStop(last_stop) if last_stop < len(LastStop) else LastStop.NONE
         module.state = STATES[state]
 
-    def _take_gyro(self, module: Module, frame: Frame) -> None:
+    def _take_gyro(self, module: ModuleStatus, frame: Frame) -> None:
         self._gyro[module.node - 1] = self._read_gyro(frame.data)
 
-    def _take_acceleration(self, module: Module, frame: Frame) -> None:
+    def _take_acceleration(self, module: ModuleStatus, frame: Frame) -> None:
         self._acceleration[module.node - 1] = self._read_acceleration(frame.data)
 
-    def _take_shaft(self, module: Module, frame: Frame) -> None:
+    def _take_shaft(self, module: ModuleStatus, frame: Frame) -> None:
         self.shaft_raw[module.node - 1] = self._read_shaft(frame.data)[0]
 
-    def _take_health(self, module: Module, frame: Frame) -> None:
+    def _take_health(self, module: ModuleStatus, frame: Frame) -> None:
         self._health[module.node - 1] = self._read_health(frame.data)
         module.health_sync = self.sync
 

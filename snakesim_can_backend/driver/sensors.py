@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_can_backend.bus.load import Reports
-from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.bus.load import ReportSchedule
+from snakesim_can_backend.driver.reports import ModuleReports
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, Opcode
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_drivers.mounting import Mounting
@@ -28,17 +28,19 @@ HEALTH_LASTS_S = 2.5 * HEALTH_PERIOD_S  # one report may be lost
 NO_TORQUE = (0.0, 0.0, 0.0)
 
 
-class Sensors:
+class SampleBuilder:
     """Makes messages from a `Reading`."""
 
-    def __init__(self, config: RunConfig, reports: Reports, reading: Reading, mocap: MocapReceiver | None) -> None:
+    def __init__(
+        self, config: RunConfig, reports: ReportSchedule, reading: ModuleReports, mocap: MocapReceiver | None
+    ) -> None:
         self._reading, self._reports, self._mocap = reading, reports, mocap
         self._mounting = Mounting(config.robot.joint_table)
         self._period_ns, self._lease_ns = config.period_ns, config.lease_ns
         self._radius_m, self._lengths_m = config.robot.module.radius_m, config.robot.link_lengths_m
         self._threshold_n = config.robot.sensors.contacts.threshold_n if config.robot.sensors.contacts else 0.0
         self._felt = FeltForce(max(reports.contact_every, 1) * config.period_ns * 1e-9)
-        layouts = codec()
+        layouts = load_layouts()
         contact = layouts[Opcode.CONTACT].signals
         self._contact_scales = [contact[name].scale for name in ("force_x", "along", "bearing")]
         self._rate_scale = layouts[Opcode.GYRO].signals["rate_x"].scale
@@ -48,7 +50,7 @@ class Sensors:
         self._health_every = max(round(HEALTH_PERIOD_S * config.rate_hz), 1)
         self._health_lasts = round(HEALTH_LASTS_S * config.rate_hz)  # Syncs
 
-    def sample(self, tick: int, timestamp_ns: int) -> Samples:
+    def make_samples(self, tick: int, timestamp_ns: int) -> Samples:
         """All new samples at `tick`."""
         others: dict[str, Message] = {}
         if contacts_due(self._reports, self._reading.sync):
@@ -81,14 +83,14 @@ class Sensors:
         )
 
     def _contacts(self, tick: int, timestamp_ns: int) -> Contacts:
-        felt = [self._contact(link, raw) for link, raw in self._reading.links_touched()]
+        felt = [self._contact(link, raw) for link, raw in self._reading.list_contacts()]
         strong = [contact for contact in felt if math.hypot(*contact.force_l) >= self._threshold_n]
         self._felt.add({contact.link: math.hypot(*contact.force_l) for contact in felt})
         return Contacts(tick=tick, timestamp_ns=timestamp_ns, contacts=strong, measured_force_n=self._felt.max_n)
 
     def _contact(self, link: int, raw: tuple[int, ...]) -> Contact:
         newton, metre, radian = self._contact_scales
-        outward, position = on_surface(raw[3] * metre, raw[4] * radian, self._lengths_m[link], self._radius_m)
+        outward, position = locate_on_capsule(raw[3] * metre, raw[4] * radian, self._lengths_m[link], self._radius_m)
         normal = (-outward[0], -outward[1], -outward[2])
         tangent_1, tangent_2 = tangents(normal)
         return Contact(
@@ -103,7 +105,7 @@ class Sensors:
         )
 
     def _imu(self, tick: int, timestamp_ns: int) -> Imu | None:
-        found = self._reading.imus()
+        found = self._reading.take_imu_reports()
         if not found:
             return None
         return Imu(
@@ -117,7 +119,7 @@ class Sensors:
     def _power(self, tick: int, timestamp_ns: int) -> Power:
         rows = self._reading.health()
         columns = [
-            [0.0 if row is None else signal.value(row[i]) for row in rows] for i, signal in enumerate(self._health)
+            [0.0 if row is None else signal.decode(row[i]) for row in rows] for i, signal in enumerate(self._health)
         ]
         return Power(
             tick=tick,
@@ -134,9 +136,9 @@ class Sensors:
         )
 
 
-def joint_values(reading: Reading, mounting: Mounting) -> Floats:
+def joint_values(reading: ModuleReports, mounting: Mounting) -> Floats:
     """Angle, velocity and torque of every joint, (3, n_joints): the modules' shafts, behind sign, zero and gear."""
-    angle, velocity, torque = reading.joints()
+    angle, velocity, torque = reading.shaft_values()
     at_joints = (
         mounting.joint_angle_rad(angle),
         mounting.joint_velocity_rad_s(velocity),
@@ -145,12 +147,14 @@ def joint_values(reading: Reading, mounting: Mounting) -> Floats:
     return np.stack(at_joints)
 
 
-def contacts_due(reports: Reports, sync: int) -> bool:
+def contacts_due(reports: ReportSchedule, sync: int) -> bool:
     """Whether the modules report forces at a Sync."""
     return reports.contact_every > 0 and (sync & 0xFF) % reports.contact_every == 0
 
 
-def described(config: RunConfig, reports: Reports, *, pose_delay_s: float | None) -> list[SensorDescription]:
+def describe_sensors(
+    config: RunConfig, reports: ReportSchedule, *, pose_delay_s: float | None
+) -> list[SensorDescription]:
     """The sensors of this robot's modules, with their rates; pose_delay_s: of motion capture, None without it."""
     rate = config.rate_hz
     sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate, delay_s=0.0)]
@@ -164,7 +168,7 @@ def described(config: RunConfig, reports: Reports, *, pose_delay_s: float | None
     return sensors
 
 
-def on_surface(along_m: float, bearing_rad: float, length_m: float, radius_m: float) -> tuple[Vector, Vector]:
+def locate_on_capsule(along_m: float, bearing_rad: float, length_m: float, radius_m: float) -> tuple[Vector, Vector]:
     """Outward normal and point of a link's capsule at a place along it and a bearing about it.
 
     Beyond its ends a capsule is a sphere, and its normal tilts forward or back.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from math import inf
 
-from snakesim_can_backend.bus.load import BIT_RATE, worst_bits
+from snakesim_can_backend.bus.load import BIT_RATE, worst_frame_bits
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 
 OPCODES = 32
@@ -39,7 +39,7 @@ class BusTime:
     """One bus. Times are microseconds, and must not go backward."""
 
     def __init__(self, bit_rate: int = BIT_RATE) -> None:
-        self.frame_us = [worst_bits(length) * 1e6 / bit_rate for length in range(9)]
+        self.frame_us = [worst_frame_bits(length) * 1e6 / bit_rate for length in range(9)]
         self._free_us = 0.0
         self._waiting: dict[int, dict[int, tuple[Frame, float]]] = {}  # sender -> slot -> frame, since when
         self._first: list[tuple[int, int, int]] = []  # heap: id, sender, slot of the first frame of every sender
@@ -50,14 +50,14 @@ class BusTime:
         self._frames, self._busy_us = [0] * OPCODES, [0.0] * OPCODES
         self._replaced, self._late_us = 0, 0.0
 
-    def heard(self, frame: Frame, now_us: float) -> None:
+    def record_host_frame(self, frame: Frame, now_us: float) -> None:
         """A frame of the host has arrived."""
         self._proceed(now_us)
         took = self.frame_us[len(frame.data)]
         self._free_us = min(max(self._free_us, now_us) + took, now_us + MAX_AHEAD_US)
-        self.count(frame)
+        self.count_frame(frame)
 
-    def offer(self, sender: int, frame: Frame, now_us: float) -> None:
+    def enqueue(self, sender: int, frame: Frame, now_us: float) -> None:
         """A module has a frame to send."""
         self._proceed(now_us)
         queue = self._waiting.setdefault(sender, {})
@@ -73,7 +73,7 @@ class BusTime:
         if len(queue) == 1:
             heappush(self._first, (frame.id, sender, slot))
 
-    def released(self, now_us: float) -> list[Frame]:
+    def take_sent_frames(self, now_us: float) -> list[Frame]:
         """Frames that are completely sent by now, in order, each once."""
         self._proceed(now_us)
         through, self._through = self._through, []
@@ -88,20 +88,20 @@ class BusTime:
         frame, since = self._waiting[self._first[0][1]][self._first[0][2]]
         return max(self._free_us, since) + self.frame_us[len(frame.data)]
 
-    def count(self, frame: Frame) -> None:
+    def count_frame(self, frame: Frame) -> None:
         """Add the bus time of a frame."""
         opcode = frame.id >> NODE_BITS
         self._frames[opcode] += 1
         self._busy_us[opcode] += self.frame_us[len(frame.data)]
 
-    def babble(self, sender: int, frame: Frame | None, now_us: float) -> None:
+    def set_babbling(self, sender: int, frame: Frame | None, now_us: float) -> None:
         """From now on a module repeats a frame, as often as the bus allows; None ends that."""
         self._proceed(now_us)
         if frame is None:
             self._endless.pop(sender, None)
         else:
             self._endless[sender] = frame
-            self.offer(sender, frame, now_us)
+            self.enqueue(sender, frame, now_us)
 
     def traffic(self, now_us: float) -> Traffic:
         """Traffic of the bus until now."""
@@ -138,10 +138,10 @@ class BusTime:
         self._free_us = start_us + took
         self._under_way = (frame, self._free_us)
         self._late_us = max(self._late_us, start_us - since_us)
-        self.count(frame)
+        self.count_frame(frame)
 
 
-def by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:
+def traffic_by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:
     """Traffic between two points in time: message, frames, share of time; only messages that occurred."""
     took_us = max(after.now_us - before.now_us, 1.0)
     return [

@@ -13,16 +13,24 @@ from zlib import crc32
 
 import msgspec
 
-from snakesim_can_backend.bus.load import shares
+from snakesim_can_backend.bus.load import joints_per_bus
 from snakesim_can_backend.emulator.bus_time import BusTime, Traffic
-from snakesim_can_backend.emulator.faults import parse
-from snakesim_can_backend.emulator.firmware import BOOT_US, Module
+from snakesim_can_backend.emulator.faults import parse_fault
+from snakesim_can_backend.emulator.firmware import BOOT_US, ModuleFirmware
 from snakesim_can_backend.emulator.frames import LENGTHS, read_sync
 from snakesim_can_backend.emulator.module_sensors import ModuleSensors
 from snakesim_can_backend.emulator.module_slot import ModuleSlot
 from snakesim_can_backend.emulator.node_ids import node_ids
-from snakesim_can_backend.emulator.parameters import Parameters, from_factory
-from snakesim_can_backend.protocol.definitions import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
+from snakesim_can_backend.emulator.parameters import ParameterStore, make_factory_defaults
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    FROM_HOST,
+    Frame,
+    ModuleParameter,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import as_built, built
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
@@ -57,26 +65,26 @@ class ModuleChain:
     ) -> None:
         """send_pose: gets a MocapSample as JSON after every Sync, before the joint states. Raises ConfigError."""
         robot, self.stepped, self.physics_model = config.robot, stepped, physics_model
-        self.count = robot.chain.modules
-        self.counts = shares(config, settings)  # modules on each bus
+        self.module_count = robot.chain.modules
+        self.modules_per_bus = joints_per_bus(config, settings)  # modules on each bus
         self.motors = Motors(as_built(config, settings.mounted).robot, physics_model.step_s)
         self._joints, self._told = built(robot, settings.mounted), robot.joint_table
         self._nodes = node_ids(robot, settings)
         loose = {name for name, truth in settings.mounted.items() if not truth.connected}
         self._loose = {i for i, joint in enumerate(self._joints) if joint.name in loose}
         self.thermal = Thermal(self._joints)
-        self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
+        self.buses = [BusTime(settings.bit_rate) for _ in self.modules_per_bus]
         self.now_us = 0.0  # module time: since the emulators were started
         self.skipped_us = 0.0  # time in which this process did not run
         self.refused = 0  # frames that no host sends
-        self.happened: list[str] = []  # injected faults, each begin and end
-        self._plan = Plan(parse(text, self.count) for text in settings.faults)
+        self.fault_log: list[str] = []  # injected faults, each begin and end
+        self._plan = Plan(parse_fault(text, self.module_count) for text in settings.faults)
         self._step_us, self._steps, self._due_us = physics_model.step_s * 1e6, 0, 0.0
         self._sync_time: int | None = None
         self._pose_time: int | None = None
-        starts = [0, *accumulate(self.counts)]
+        starts = [0, *accumulate(self.modules_per_bus)]
         self.slots: list[ModuleSlot] = []
-        for channel, count in enumerate(self.counts):
+        for channel, count in enumerate(self.modules_per_bus):
             for joint in range(starts[channel], starts[channel] + count):
                 serial = crc32(f"{config.seed}:{joint + 1}".encode())
                 self._seat(joint, channel, serial, -BOOT_US if stepped else 0.0)
@@ -84,16 +92,16 @@ class ModuleChain:
             ModuleSensors(
                 robot, physics_model, Mounting(self._joints[start : start + count]), start, (config.seed, channel)
             )
-            for channel, (start, count) in enumerate(zip(starts, self.counts, strict=False))
+            for channel, (start, count) in enumerate(zip(starts, self.modules_per_bus, strict=False))
         ]
         self._send_pose = send_pose
         self._camera: PoseCamera | None = None
         if send_pose is not None and robot.sensors.pose is not None:
             self._camera = PoseCamera(
-                robot.sensors.pose, physics_model, (config.seed, len(self.counts)), config.period_ns
+                robot.sensors.pose, physics_model, (config.seed, len(self.modules_per_bus)), config.period_ns
             )
         self._encode = msgspec.json.Encoder().encode
-        self._out: list[list[Frame]] = [[] for _ in self.counts]
+        self._out: list[list[Frame]] = [[] for _ in self.modules_per_bus]
         self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
         self._poll(0.0)
 
@@ -149,7 +157,7 @@ class ModuleChain:
         due_us = self._plan.next_s() * 1e6
         for slot in self.slots:
             j = slot.joint
-            slot.feel(speeds[j], watts[j], windings[j], boards[j])
+            slot.update_health(speeds[j], watts[j], windings[j], boards[j])
             due_us = min(due_us, slot.module.poll(now_us))
             self._follow_up(slot)
         for slot, since_us in self._babblers.items():
@@ -163,16 +171,16 @@ class ModuleChain:
 
     def receive(self, channel: int, frame: Frame) -> None:
         """A frame of the host has arrived."""
-        opcode, node = opcode_of(frame.id), node_of(frame.id)
+        opcode, node = parse_opcode(frame.id), parse_node(frame.id)
         # An Emergency is valid at any length.
         wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)
         if opcode not in FROM_HOST or wrong_length:
             self.refused += 1
             return
         if self.stepped:
-            self.buses[channel].count(frame)
+            self.buses[channel].count_frame(frame)
         else:
-            self.buses[channel].heard(frame, self.now_us)
+            self.buses[channel].record_host_frame(frame, self.now_us)
         if opcode == Opcode.SYNC:
             self._sync(channel, frame)
         elif opcode == Opcode.SET_POINT:
@@ -189,13 +197,13 @@ class ModuleChain:
             if opcode != Opcode.PARAMETER_REQUEST:
                 self._poll(self.now_us)
 
-    def take(self, channel: int) -> list[Frame]:
+    def take_frames(self, channel: int) -> list[Frame]:
         """Frames that are on the bus by now, in the order of arbitration, each once."""
         if not self.stepped:
-            return self.buses[channel].released(self.now_us)
+            return self.buses[channel].take_sent_frames(self.now_us)
         frames, self._out[channel] = self._out[channel], []
         for frame in frames:
-            self.buses[channel].count(frame)
+            self.buses[channel].count_frame(frame)
         return frames
 
     def traffic(self) -> list[Traffic]:
@@ -212,10 +220,10 @@ class ModuleChain:
             sample = self._camera.look(round(self.now_us * 1000))
             if sample is not None:
                 self._send_pose(self._encode(sample))
-        first = sum(self.counts[:channel])
+        first = sum(self.modules_per_bus[:channel])
         slots = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
-        imu_due = [slot.module.imu_is_due() for slot in slots[: self.counts[channel]]]
-        readings = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
+        imu_due = [slot.module.imu_is_due() for slot in slots[: self.modules_per_bus[channel]]]
+        readings = self._senses[channel].read(self.motors.torque_nm, self.motors.derated(), imu_due)
         for slot in slots:
             slot.module.sync(count, readings[slot.joint - first])
             self._follow_up(slot)
@@ -233,35 +241,35 @@ class ModuleChain:
         self._sync_time = sync_time
 
     def _at(self, channel: int, node: int) -> list[ModuleSlot]:
-        found = [self.slots[self._nodes.index(node)]] if 1 <= node <= self.count else []
-        if len(self.slots) > self.count:
-            found += [slot for slot in self.slots[self.count :] if slot.module.node == node]
+        found = [self.slots[self._nodes.index(node)]] if 1 <= node <= self.module_count else []
+        if len(self.slots) > self.module_count:
+            found += [slot for slot in self.slots[self.module_count :] if slot.module.node == node]
         return [slot for slot in found if slot.channel == channel]
 
     # --- what goes out -------------------------------------------------------------------------------------
 
     def _follow_up(self, slot: ModuleSlot) -> None:
         """Send a module's frames, and apply its demand to its motor."""
-        for frame in slot.outgoing():
+        for frame in slot.take_frames():
             if self.stepped:
                 self._out[slot.channel].append(frame)
             else:
-                self.buses[slot.channel].offer(slot.sender, frame, self.now_us)
+                self.buses[slot.channel].enqueue(slot.sender, frame, self.now_us)
         demand = slot.module.demand
         if demand is slot.driven or not slot.drives:
             return
         slot.driven = demand
         values = slot.module.parameters.values
-        damping = Parameter.DAMPING if demand.mode == Mode.POSITION else Parameter.VELOCITY_GAIN
-        mount = slot.built.drive
+        damping = ModuleParameter.DAMPING if demand.mode == Mode.POSITION else ModuleParameter.VELOCITY_GAIN
+        mount = slot.joint_model.drive
         self.motors.drive(
             slot.joint,
             demand.mode,
             joint_target(mount, demand.mode, demand.target),
-            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) * mount.gear if demand.mode else inf,
-            values[Parameter.STIFFNESS] * mount.gear**2,
+            min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * mount.gear if demand.mode else inf,
+            values[ModuleParameter.STIFFNESS] * mount.gear**2,
             values[damping] * mount.gear**2,
-            values[Parameter.SPEED_LIMIT] / mount.gear,
+            values[ModuleParameter.SPEED_LIMIT] / mount.gear,
         )
 
     # --- injected faults -----------------------------------------------------------------------------------
@@ -274,7 +282,7 @@ class ModuleChain:
     def _go_wrong(self, change: Change, now_us: float) -> None:
         fault, joint = change.injection, change.injection.number
         slot = self.slots[joint]
-        self.happened.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if change.begins else 'ends'}")
+        self.fault_log.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if change.begins else 'ends'}")
         match fault.kind:
             case "overheat":
                 self.thermal.inject(joint, heat=change.begins, hold=change.begins and fault.end_s != inf)
@@ -283,23 +291,23 @@ class ModuleChain:
                 if change.begins:
                     self._seat(joint, slot.channel, slot.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False)
                 else:
-                    self.slots[self.count :] = [s for s in self.slots[self.count :] if s.joint != joint]
+                    self.slots[self.module_count :] = [s for s in self.slots[self.module_count :] if s.joint != joint]
             case "babble" if self.stepped:
                 self._babblers.pop(slot, None)
                 if change.begins:
                     self._babblers[slot] = now_us
             case "babble":
                 frame = slot.module.heartbeat(now_us) if change.begins else None
-                self.buses[slot.channel].babble(slot.sender, frame, now_us)
+                self.buses[slot.channel].set_babbling(slot.sender, frame, now_us)
             case kind:
-                slot.go_wrong(kind, change.begins, now_us)
+                slot.set_fault(kind, change.begins, now_us)
 
     def _seat(self, number: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
         joint, gear = self._joints[number], self._told[number].drive.gear  # its maker does not know where it ends up
-        module = Module(
+        module = ModuleFirmware(
             self._nodes[number],
             serial,
-            Parameters(from_factory(joint.limits.torque_nm / gear, joint.limits.speed_rad_s * gear)),
+            ParameterStore(make_factory_defaults(joint.limits.torque_nm / gear, joint.limits.speed_rad_s * gear)),
             self.thermal.limits[number],
             min_voltage_v=joint.limits.min_voltage_v,
             stepped=self.stepped,

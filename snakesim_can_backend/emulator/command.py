@@ -11,10 +11,10 @@ import msgspec
 
 from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import Wire, wait
-from snakesim_can_backend.bus.load import mbit, shares
-from snakesim_can_backend.emulator.bus_time import Traffic, by_opcode
+from snakesim_can_backend.bus.load import format_bit_rate, joints_per_bus
+from snakesim_can_backend.emulator.bus_time import Traffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
-from snakesim_can_backend.emulator.faults import explain, parse, parse_typed
+from snakesim_can_backend.emulator.faults import describe_faults, parse_fault, parse_typed_fault
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import CanSettings
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="snakesim modules",
         description=__doc__,
-        epilog=f"faults:\n{explain()}",
+        epilog=f"faults:\n{describe_faults()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -79,9 +79,9 @@ def _serve(arguments: argparse.Namespace) -> int:
     loaded = _configuration(arguments)
     settings = _settings(arguments, loaded)
     _check_names(settings.channels, on_real_bus=arguments.on_real_bus)
-    shares(loaded.config, settings)
+    joints_per_bus(loaded.config, settings)
     for text in settings.faults:
-        parse(text, loaded.config.robot.chain.modules)
+        parse_fault(text, loaded.config.robot.chain.modules)
     with ExitStack() as opened:
         send_pose = None
         if arguments.pose != NO_POSE:
@@ -174,15 +174,18 @@ class Loop:
         for wire, before, after in zip(self._server.wires, self._start, self._chain.traffic(), strict=True):
             frames = sum(after.frames) - sum(before.frames)
             lines.append(
-                f"{wire.channel}: {frames} frames, {after.load_since(before):.1%} of {mbit(self._bit_rate)}; "
+                f"{wire.channel}: {frames} frames, {after.load_since(before):.1%} of {format_bit_rate(self._bit_rate)}; "
                 f"longest wait for the bus {after.late_us / 1e3:.1f} ms, {after.replaced} frames replaced by newer ones"
             )
-            lines += [f"  {op.name.lower():<18}{n:8d} frames {share:7.2%}" for op, n, share in by_opcode(before, after)]
+            lines += [
+                f"  {op.name.lower():<18}{n:8d} frames {share:7.2%}"
+                for op, n, share in traffic_by_opcode(before, after)
+            ]
         if self._server.unsent:
             lines.append(f"{self._server.unsent} frames were not accepted by their interface")
         if self._chain.skipped_us:
             lines.append(f"{self._chain.skipped_us / 1e3:.0f} ms skipped: this computer was too busy")
-        return lines + [f"fault: {text}" for text in self._chain.happened]
+        return lines + [f"fault: {text}" for text in self._chain.fault_log]
 
     def _show(self, before: list[Traffic], now_s: float) -> list[Traffic]:
         after = self._chain.traffic()
@@ -200,7 +203,7 @@ class Loop:
                 self._interactive = False
             elif line.strip():
                 try:
-                    fault, begins = parse_typed(line, self._chain.count, self._chain.now_us * 1e-6)
+                    fault, begins = parse_typed_fault(line, self._chain.module_count, self._chain.now_us * 1e-6)
                 except ConfigError as error:
                     say(str(error))
                 else:

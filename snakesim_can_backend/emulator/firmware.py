@@ -26,26 +26,26 @@ from snakesim_can_backend.emulator.frames import (
     write_shaft_load,
     write_tail_contact,
 )
-from snakesim_can_backend.emulator.parameters import Parameters
-from snakesim_can_backend.emulator.reports import ModuleHealth, Readings, health
+from snakesim_can_backend.emulator.parameters import ParameterStore
+from snakesim_can_backend.emulator.reports import ModuleHealth, ModuleReadings, encode_health
 from snakesim_can_backend.protocol.definitions import (
     COMMAND_KEY,
-    COUNTS,
+    COUNTER_MODULUS,
     HEALTH_PERIOD_S,
     HEARTBEAT_PERIOD_S,
-    MAX_LOST,
+    MAX_LOST_SETPOINTS,
     MAX_UPTIME_MS,
-    VERSION,
-    WRONG_COUNTS,
-    Action,
+    MAX_WRONG_COUNTS,
+    PROTOCOL_VERSION,
+    CommandAction,
     Frame,
     LastStop,
     ModuleFault,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Parameter,
     SafeMotion,
-    intact,
+    has_valid_checksum,
 )
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
@@ -70,14 +70,14 @@ class Demand(NamedTuple):
 PASSIVE = Demand(Mode.PASSIVE, 0.0, 0.0)
 
 
-class Module:
+class ModuleFirmware:
     """One module on the bus."""
 
     def __init__(
         self,
         node: int,
         serial: int,
-        parameters: Parameters,
+        parameters: ParameterStore,
         heat: HeatLimits,
         *,
         min_voltage_v: float = 18.0,
@@ -91,7 +91,7 @@ class Module:
         self._min_voltage_v = min_voltage_v
         self.node, self.serial, self.parameters, self.heat = node, serial, parameters, heat
         self.frames: list[Frame] = []
-        self.inside = ModuleHealth()
+        self.health = ModuleHealth()
         self.hangs = False  # its main loop hangs; only hardware still works
         self.refused = 0  # frames with a wrong checksum, count or length
         self._stepped = stepped
@@ -112,8 +112,8 @@ class Module:
             self.refused += self.state != ModuleState.BOOT
         elif opcode == Opcode.PARAMETER_REQUEST:
             driven = self.state in (ModuleState.ARMED, ModuleState.STOPPING)
-            self.frames.append(self.parameters.answer(self.node, frame.data, driven))
-        elif opcode == Opcode.COMMAND and intact(frame):
+            self.frames.append(self.parameters.answer_request(self.node, frame.data, driven))
+        elif opcode == Opcode.COMMAND and has_valid_checksum(frame):
             action, key = read_command(frame.data)
             if key == COMMAND_KEY:
                 self._carry_out(action, now_us)
@@ -123,17 +123,17 @@ class Module:
     def _carry_out(self, action: int, now_us: float) -> None:
         """Carry out the action of a Command; an unknown one has no effect."""
         match action:
-            case Action.ARM:
+            case CommandAction.ARM:
                 self._arm(now_us)
-            case Action.DISARM:
+            case CommandAction.DISARM:
                 self._disarm(now_us)
-            case Action.STOP:
+            case CommandAction.STOP:
                 self._stop(now_us)
-            case Action.CLEAR:
+            case CommandAction.CLEAR:
                 self._clear(now_us)
-            case Action.REBOOT:
+            case CommandAction.REBOOT:
                 self.reboot(now_us)
-            case Action.IDENTIFY:
+            case CommandAction.IDENTIFY:
                 self._identify(now_us)
             case _:
                 pass
@@ -142,15 +142,15 @@ class Module:
         """A SetPoint for this node. It waits for the next Sync."""
         if self.state != ModuleState.ARMED or self.hangs:
             return
-        if len(frame.data) != LENGTHS[Opcode.SET_POINT] or not intact(frame):
+        if len(frame.data) != LENGTHS[Opcode.SET_POINT] or not has_valid_checksum(frame):
             self.refused += 1
             return
         mode, count, number, limit = read_setpoint(frame.data)
-        expected, self._expected = self._expected, (count + 1) % COUNTS
-        if expected is not None and (count - expected) % COUNTS > MAX_LOST:
+        expected, self._expected = self._expected, (count + 1) % COUNTER_MODULUS
+        if expected is not None and (count - expected) % COUNTER_MODULUS > MAX_LOST_SETPOINTS:
             self.refused += 1
             self._wrong_counts += 1
-            if self._wrong_counts >= WRONG_COUNTS:
+            if self._wrong_counts >= MAX_WRONG_COUNTS:
                 self._fail(ModuleFault.STREAM, now_us)
             return
         self._wrong_counts = 0
@@ -164,7 +164,7 @@ class Module:
             target = self._within(target)
         self._pending = Demand(MODES[mode], target, limit * LIMIT_STEP)
 
-    def sync(self, count: int, reading: Readings) -> None:
+    def sync(self, count: int, reading: ModuleReadings) -> None:
         """Answer a Sync with the sensor readings of that instant, then enact the newest setpoint."""
         if self.state == ModuleState.BOOT:
             return
@@ -176,10 +176,10 @@ class Module:
         joint = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
         self._last_joint_state = write_joint_state(self.node, joint)
         self.frames.append(self._last_joint_state)
-        every = int(values[Parameter.CONTACT_EVERY])
+        every = int(values[ModuleParameter.CONTACT_EVERY])
         if every and count % every == 0:
             self.frames.append(write_contact(self.node, (*reading.contact, count)))
-            if values[Parameter.TAIL]:
+            if values[ModuleParameter.TAIL]:
                 self.frames.append(write_tail_contact(self.node, (*reading.tail_contact, count)))
         if self.imu_is_due():
             self._report_imu(count, reading)
@@ -190,7 +190,7 @@ class Module:
 
     def imu_is_due(self) -> bool:
         """Whether gyro, accelerometer and shaft load answer the next Sync; neighbors take turns."""
-        every = int(self.parameters.values[Parameter.IMU_EVERY])
+        every = int(self.parameters.values[ModuleParameter.IMU_EVERY])
         return every > 0 and (self._syncs + self.node) % every == 0
 
     # --- time ----------------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ class Module:
         if self.state == ModuleState.ARMED and now_us >= self._fed_us + self.watchdog_us:
             self._fail(ModuleFault.WATCHDOG, now_us)
         elif self.state == ModuleState.STOPPING and (
-            abs(self.inside.speed_rad_s) < AT_REST_RAD_S or now_us >= self._stopping_us + self.watchdog_us
+            abs(self.health.speed_rad_s) < AT_REST_RAD_S or now_us >= self._stopping_us + self.watchdog_us
         ):
             self._enter(ModuleState.DISARMED, now_us)
         if now_us >= self._heartbeat_us:
@@ -217,13 +217,13 @@ class Module:
             self.frames.append(self.heartbeat(now_us))
         if now_us >= self._health_us:
             self._health_us = max(self._health_us + HEALTH_US, now_us)
-            self.frames.append(write_health(self.node, health(self.inside)))
+            self.frames.append(write_health(self.node, encode_health(self.health)))
         return self._next_due(now_us)
 
     @property
     def watchdog_us(self) -> float:
         """How long a module acts on one setpoint."""
-        return self.parameters.values[Parameter.WATCHDOG] * 1e6
+        return self.parameters.values[ModuleParameter.WATCHDOG] * 1e6
 
     def reboot(self, now_us: float) -> None:
         """Reset everything that is not saved, and restart."""
@@ -267,8 +267,8 @@ class Module:
         if self.state == ModuleState.ARMED:
             self._stopping_us = now_us
             values = self.parameters.values
-            damped = Demand(Mode.VELOCITY, 0.0, values[Parameter.TORQUE_LIMIT])
-            safe = damped if values[Parameter.STOP_MODE] == SafeMotion.DAMP else PASSIVE
+            damped = Demand(Mode.VELOCITY, 0.0, values[ModuleParameter.TORQUE_LIMIT])
+            safe = damped if values[ModuleParameter.STOP_MODE] == SafeMotion.DAMP else PASSIVE
             self._enter(ModuleState.STOPPING, now_us, LastStop.STOP, safe)
 
     def _clear(self, now_us: float) -> None:
@@ -291,7 +291,7 @@ class Module:
 
     def _conditions(self) -> int:
         """Bits of the faults whose cause is present. A winding that overheated must cool well below that."""
-        inside = self.inside
+        inside = self.health
         hot = self.heat.derate_from_c if self.faults >> ModuleFault.OVERHEAT & 1 else self.heat.stop_at_c
         return (
             (inside.winding_c >= hot) << ModuleFault.OVERHEAT
@@ -306,7 +306,7 @@ class Module:
                 self._fail(fault, now_us)
 
     def _within(self, angle_rad: float) -> float:
-        most = self.parameters.values[Parameter.ANGLE_LIMIT]
+        most = self.parameters.values[ModuleParameter.ANGLE_LIMIT]
         return min(max(angle_rad, -most), most)
 
     def _next_due(self, now_us: float) -> float:
@@ -331,9 +331,9 @@ class Module:
         return write_heartbeat(self.node, state)
 
     def _identify(self, _now_us: float) -> None:
-        self.frames.append(write_identity(self.node, (self.serial, *FIRMWARE, VERSION, 1, self._stepped)))
+        self.frames.append(write_identity(self.node, (self.serial, *FIRMWARE, PROTOCOL_VERSION, 1, self._stepped)))
 
-    def _report_imu(self, count: int, reading: Readings) -> None:
+    def _report_imu(self, count: int, reading: ModuleReadings) -> None:
         if reading.gyro is not None and reading.acceleration is not None:
             self.frames.append(write_gyro(self.node, (*reading.gyro, count)))
             self.frames.append(write_acceleration(self.node, (*reading.acceleration, count)))

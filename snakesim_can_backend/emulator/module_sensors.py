@@ -17,8 +17,8 @@ from snakesim_can_backend.emulator.reports import (
     TORQUE,
     UNTOUCHED,
     VELOCITY,
-    Readings,
-    touch,
+    ModuleReadings,
+    encode_contact,
 )
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.arrays import Floats
@@ -43,7 +43,7 @@ class ModuleSensors:
         self._contacts, self._imu = robot.sensors.contacts, robot.sensors.imu
         self._torque_sigma = joints.torque_noise_nm
 
-    def look(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[Readings]:
+    def read(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[ModuleReadings]:
         """The readings of every module now; torque and derating are those of all motors of the chain."""
         here = slice(self._first, self._first + self._count)
         joints = np.stack(
@@ -54,9 +54,13 @@ class ModuleSensors:
         angles = self._mounting.drive_angle_rad(joints[0])
         velocities, torques = self._mounting.drive_velocity_rad_s(joints[1]), self._mounting.drive_torque_nm(joints[2])
         readings = [
-            Readings(angle, velocity, torque, bool(hot))
+            ModuleReadings(angle, velocity, torque, bool(hot))
             for angle, velocity, torque, hot in zip(
-                ANGLE.many(angles), VELOCITY.many(velocities), TORQUE.many(torques), derated[here], strict=True
+                ANGLE.to_raw_array(angles),
+                VELOCITY.to_raw_array(velocities),
+                TORQUE.to_raw_array(torques),
+                derated[here],
+                strict=True,
             )
         ]
         self._feel(readings)
@@ -64,12 +68,12 @@ class ModuleSensors:
             self._weigh(readings, imu_due)
         return readings
 
-    def _feel(self, readings: list[Readings]) -> None:
+    def _feel(self, readings: list[ModuleReadings]) -> None:
         sensor = self._contacts
         if sensor is None:
             return
         touches = {
-            load.link: touch(self._blurred(load))
+            load.link: encode_contact(self._blurred(load))
             for load in self._physics_model.loads()
             if math.hypot(*load.force_l) >= sensor.threshold_n
         }
@@ -86,10 +90,10 @@ class ModuleSensors:
         m, n = sensor.position_noise_m, sensor.force_noise_n
         return LinkLoad(load.link, (x + m * a, y + m * b, z + m * c), (fx + n * d, fy + n * e, fz + n * f))
 
-    def _weigh(self, readings: list[Readings], due: Sequence[bool]) -> None:
+    def _weigh(self, readings: list[ModuleReadings], due: Sequence[bool]) -> None:
         shaft = self._physics_model.shaft_torque_nm()[self._first : self._first + self._count]
         noise = self._torque_sigma * self._noise(self._count)
-        shafts = SHAFT_LOAD.many(self._mounting.drive_torque_nm(shaft + noise))
+        shafts = SHAFT_LOAD.to_raw_array(self._mounting.drive_torque_nm(shaft + noise))
         imu = self._physics_model.imu() if self._imu is not None else None
         for i, reading in enumerate(readings):
             if not due[i]:
@@ -99,5 +103,7 @@ class ModuleSensors:
                 at = imu.link.index(self._first + i + 1)
                 rate = np.array(imu.angular_velocity_rad_s[at])
                 force = np.array(imu.acceleration_m_s2[at])
-                reading.gyro = RATE.many(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
-                reading.acceleration = ACCELERATION.many(force + self._imu.acceleration_noise_m_s2 * self._noise(3))
+                reading.gyro = RATE.to_raw_array(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
+                reading.acceleration = ACCELERATION.to_raw_array(
+                    force + self._imu.acceleration_noise_m_s2 * self._noise(3)
+                )

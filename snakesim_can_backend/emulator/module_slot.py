@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from snakesim_can_backend.emulator.firmware import Demand, Module
-from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, opcode_of
+from snakesim_can_backend.emulator.firmware import Demand, ModuleFirmware
+from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, parse_opcode
 from snakesim_hal.model.joints import Joint
 
 SAGGED = 2 / 3  # of the least voltage
@@ -16,8 +16,8 @@ class ModuleSlot:
     sender: int  # its index in the bus's queue
     channel: int
     joint: int  # 0 at the tail
-    module: Module
-    built: Joint
+    module: ModuleFirmware
+    joint_model: Joint
     drives: bool = True  # False: it has no motor of its own; a duplicate
     driven: Demand | None = None  # the last demand applied to its motor
     mute: bool = False
@@ -26,9 +26,9 @@ class ModuleSlot:
 
     def __post_init__(self) -> None:
         """Under its supply."""
-        self.module.inside.voltage_v = self.built.supply.voltage_v
+        self.module.health.voltage_v = self.joint_model.supply.voltage_v
 
-    def go_wrong(self, kind: str, wrong: bool, now_us: float) -> None:
+    def set_fault(self, kind: str, wrong: bool, now_us: float) -> None:
         """Begin or end a fault of this module."""
         match kind:
             case "mute":
@@ -40,23 +40,23 @@ class ModuleSlot:
             case "checksum":
                 self.wrong_checksum = wrong
             case "leak":
-                self.module.inside.leak = wrong
+                self.module.health.leak = wrong
             case "undervoltage":
-                sagged_v = SAGGED * self.built.limits.min_voltage_v
-                self.module.inside.voltage_v = sagged_v if wrong else self.built.supply.voltage_v
+                sagged_v = SAGGED * self.joint_model.limits.min_voltage_v
+                self.module.health.voltage_v = sagged_v if wrong else self.joint_model.supply.voltage_v
             case "reboot" if wrong:
                 self.module.reboot(now_us)
             case _:
                 pass
 
-    def feel(self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float) -> None:
+    def update_health(self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float) -> None:
         """Update its internal measurements."""
-        inside = self.module.inside
+        inside = self.module.health
         inside.speed_rad_s, inside.winding_c = speed_rad_s, winding_c
         inside.board_c = board_c
-        inside.current_a = self.built.supply.idle_a + power_w / inside.voltage_v
+        inside.current_a = self.joint_model.supply.idle_a + power_w / inside.voltage_v
 
-    def outgoing(self) -> list[Frame]:
+    def take_frames(self) -> list[Frame]:
         """The module's frames to send, with faults applied; each frame once."""
         frames = self.module.frames
         if not frames:
@@ -69,7 +69,7 @@ class ModuleSlot:
         return frames
 
     def _corrupted(self, frame: Frame) -> Frame:
-        if opcode_of(frame.id) != Opcode.JOINT_STATE:
+        if parse_opcode(frame.id) != Opcode.JOINT_STATE:
             return frame
         data = bytearray(frame.data)
         if self.wrong_count:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_can_backend.protocol.codec import Signal, codec
+from snakesim_can_backend.protocol.codec import Signal, load_layouts
 from snakesim_can_backend.protocol.definitions import Opcode
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.physics.physics_model import LinkLoad
@@ -21,7 +21,7 @@ class Rounder:
         self._offset, self._per_unit = signal.offset, 1.0 / signal.scale
         self._low, self._high = (round((end - signal.offset) / signal.scale) for end in (signal.low, signal.high))
 
-    def one(self, value: float) -> int:
+    def to_raw(self, value: float) -> int:
         """The nearest step; NaN becomes 0."""
         if math.isnan(value):
             return 0
@@ -29,14 +29,14 @@ class Rounder:
             min(max(round(min(max((value - self._offset) * self._per_unit, -1e12), 1e12)), self._low), self._high)
         )
 
-    def many(self, values: Floats) -> list[int]:
+    def to_raw_array(self, values: Floats) -> list[int]:
         """The same for an array."""
         raw = np.nan_to_num((values - self._offset) * self._per_unit, posinf=1e12, neginf=-1e12)
         return np.clip(np.rint(raw), self._low, self._high).astype(np.int64).tolist()
 
 
 @dataclass(slots=True)
-class Readings:
+class ModuleReadings:
     """One module's sensor readings at a Sync, in raw numbers."""
 
     angle: int
@@ -62,28 +62,35 @@ class ModuleHealth:
     leak: bool = False
 
 
-def touch(load: LinkLoad) -> tuple[int, int, int, int, int, int]:
+def encode_contact(load: LinkLoad) -> tuple[int, int, int, int, int, int]:
     """The raw numbers of a Contact. A bearing wraps around: half a turn to either side is the same."""
     x, y, z = load.position_l
     fx, fy, fz = load.force_l
-    return FORCE.one(fx), FORCE.one(fy), FORCE.one(fz), ALONG.one(x), round(math.atan2(z, y) / BEARING_STEP), 1
+    return (
+        FORCE.to_raw(fx),
+        FORCE.to_raw(fy),
+        FORCE.to_raw(fz),
+        ALONG.to_raw(x),
+        round(math.atan2(z, y) / BEARING_STEP),
+        1,
+    )
 
 
-def health(inside: ModuleHealth) -> tuple[int, int, int, int, int, int]:
+def encode_health(inside: ModuleHealth) -> tuple[int, int, int, int, int, int]:
     """The raw numbers of a Health."""
     leak = inside.leak
     return (
-        VOLTAGE.one(inside.voltage_v),
-        CURRENT.one(inside.current_a),
-        MOTOR_C.one(inside.winding_c),
-        BOARD_C.one(inside.board_c),
+        VOLTAGE.to_raw(inside.voltage_v),
+        CURRENT.to_raw(inside.current_a),
+        MOTOR_C.to_raw(inside.winding_c),
+        BOARD_C.to_raw(inside.board_c),
         int(leak),
-        WATER.one(100.0 if leak else 0.0),
+        WATER.to_raw(100.0 if leak else 0.0),
     )
 
 
 def _rounder(opcode: Opcode, signal: str) -> Rounder:
-    return Rounder(codec()[opcode].signals[signal])
+    return Rounder(load_layouts()[opcode].signals[signal])
 
 
 ANGLE = _rounder(Opcode.JOINT_STATE, "angle")
@@ -91,7 +98,7 @@ VELOCITY = _rounder(Opcode.JOINT_STATE, "velocity")
 TORQUE = _rounder(Opcode.JOINT_STATE, "torque")
 FORCE = _rounder(Opcode.CONTACT, "force_x")
 ALONG = _rounder(Opcode.CONTACT, "along")
-BEARING_STEP = codec()[Opcode.CONTACT].signals["bearing"].scale
+BEARING_STEP = load_layouts()[Opcode.CONTACT].signals["bearing"].scale
 RATE = _rounder(Opcode.GYRO, "rate_x")
 ACCELERATION = _rounder(Opcode.ACCELEROMETER, "acceleration_x")
 SHAFT_LOAD = _rounder(Opcode.SHAFT_LOAD, "torque")

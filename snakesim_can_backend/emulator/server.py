@@ -27,8 +27,8 @@ class EmulatorServer:
     """The far end of one or more buses, tail to head."""
 
     def __init__(self, wires: Sequence[Wire], chain: ModuleChain) -> None:
-        if len(wires) != len(chain.counts):
-            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.counts)} buses")
+        if len(wires) != len(chain.modules_per_bus):
+            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses")
         self.wires, self.chain = wires, chain
         self.unsent = 0  # frames that an interface did not accept
         self._start_ns: int | None = None
@@ -74,7 +74,7 @@ class EmulatorServer:
 
     def _send(self) -> None:
         for channel, wire in enumerate(self.wires):
-            for frame in self.chain.take(channel):
+            for frame in self.chain.take_frames(channel):
                 self.unsent += not wire.send(frame)
 
 
@@ -101,7 +101,7 @@ class InProcessEmulators:
             self._send_pose.close()
 
 
-def here(
+def make_local_emulators(
     config: RunConfig,
     settings: CanSettings,
     channel: str,

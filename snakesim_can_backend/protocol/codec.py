@@ -55,7 +55,7 @@ class Signal:
         """As bitstruct writes it; of a float only the bits are taken."""
         return f"{'s' if self.signed and not self.is_float else 'u'}{self.bits}"
 
-    def raw(self, value: float) -> int:
+    def encode(self, value: float) -> int:
         """The nearest step. Raises CodecError for what is out of range."""
         if not self.low <= value <= self.high:  # which NaN fails too
             raise CodecError(f"{self.name} = {value} {self.unit} does not fit; it goes from {self.low} to {self.high}")
@@ -63,14 +63,14 @@ class Signal:
             return int.from_bytes(_single.pack(value), "little")
         return round((value - self.offset) / self.scale)
 
-    def value(self, raw: int) -> float:
+    def decode(self, raw: int) -> float:
         """What a raw number means."""
         if self.is_float:
             return _single.unpack(raw.to_bytes(4, "little"))[0]
         return raw * self.scale + self.offset
 
 
-class Layout:
+class MessageLayout:
     """One message of the protocol."""
 
     def __init__(self, message: Any) -> None:
@@ -79,9 +79,9 @@ class Layout:
         self.length: int = message.length
         self.signals: dict[str, Signal] = {s.name: _signal(s) for s in message.signals}
         self._checked = self.opcode in WITH_CHECKSUM
-        self._readers = {name: self.reader(name) for name in self.signals}
+        self._readers = {name: self.make_reader(name) for name in self.signals}
 
-    def reader(self, *names: str) -> Reader:
+    def make_reader(self, *names: str) -> Reader:
         """A function that takes these signals' raw numbers out of a frame of this length; they must not overlap."""
         places, parts, at = dict[str, int](), list[str](), 8 * self.length
         for signal in sorted((self.signals[name] for name in names), key=lambda s: -s.shift):  # from the last bit on
@@ -94,7 +94,7 @@ class Layout:
         in_order = itemgetter(*(places[name] for name in names))
         return lambda data: in_order(unpack(data[::-1]))
 
-    def writer(self, *names: str) -> Writer:
+    def make_writer(self, *names: str) -> Writer:
         """A function that makes the frame of a node from these signals' raw numbers; the checksum comes by itself."""
         parts = [(s.shift, s.mask) for s in (self.signals[name] for name in names)]
         opcode, length, checked = self.opcode, self.length, self._checked
@@ -110,22 +110,22 @@ class Layout:
 
         return write
 
-    def frame(self, node: int, **values: float) -> Frame:
+    def encode(self, node: int, **values: float) -> Frame:
         """The frame of a node from values in SI units; what is not named is 0. Raises CodecError."""
-        raw = [self.signals[name].raw(value) for name, value in values.items()]
-        return self.writer(*values)(node, raw)
+        raw = [self.signals[name].encode(value) for name, value in values.items()]
+        return self.make_writer(*values)(node, raw)
 
-    def values(self, data: bytes) -> Mapping[str, float]:
+    def decode(self, data: bytes) -> Mapping[str, float]:
         """All signals in SI units. Of a multiplexed group only one means anything: look at `mode`."""
         if len(data) != self.length:
             raise CodecError(f"{self.name} has {self.length} bytes, this one {len(data)}")
-        return {name: self.signals[name].value(read(data)[0]) for name, read in self._readers.items()}
+        return {name: self.signals[name].decode(read(data)[0]) for name, read in self._readers.items()}
 
 
 @cache
-def codec() -> dict[Opcode, Layout]:
+def load_layouts() -> dict[Opcode, MessageLayout]:
     """The layout of every message of the DBC file, read once a process."""
-    layouts = map(Layout, load_database().messages)
+    layouts = map(MessageLayout, load_database().messages)
     return {layout.opcode: layout for layout in layouts}
 
 

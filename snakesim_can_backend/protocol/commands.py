@@ -10,18 +10,18 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.protocol.codec import Writer, codec
+from snakesim_can_backend.protocol.codec import Writer, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     COMMAND_KEY,
-    COUNTS,
-    Action,
+    COUNTER_MODULUS,
+    CommandAction,
     EmergencyReason,
     Frame,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Operation,
-    Parameter,
+    ParameterOperation,
 )
 from snakesim_hal.backend import Setpoints
 from snakesim_hal.wire.messages import LifecycleState
@@ -35,14 +35,14 @@ class SetpointWriter:
     """Makes the setpoint frames of all joints; tracks the next count that each module expects."""
 
     def __init__(self, joints: int) -> None:
-        layout = codec()[Opcode.SET_POINT]
-        self._write = layout.writer("mode", "count", "position", "torque_limit")  # the targets share their bits
+        layout = load_layouts()[Opcode.SET_POINT]
+        self._write = layout.make_writer("mode", "count", "position", "torque_limit")  # the targets share their bits
         self._count = [0] * joints
         scales = [layout.signals[name].scale for name in ("position", "velocity", "torque")]
         self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; the bits of a passive one are 0
         self._limit_steps = 1.0 / layout.signals["torque_limit"].scale
 
-    def frames(self, setpoints: Setpoints) -> list[Frame]:
+    def encode(self, setpoints: Setpoints) -> list[Frame]:
         """One frame a joint, tail to head."""
         modes = np.array(setpoints.mode, dtype=np.intp)
         target = _steps(np.array(setpoints.target) * self._steps_per_unit[modes], -MAX_RAW, MAX_RAW)
@@ -50,9 +50,9 @@ class SetpointWriter:
         rows = zip(setpoints.mode, self._count, target.tolist(), limit.tolist(), strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 
-    def sent(self, joint: int) -> None:
+    def confirm_sent(self, joint: int) -> None:
         """The bus accepted the setpoint of a joint; only then does its module expect the next count."""
-        self._count[joint] = (self._count[joint] + 1) % COUNTS
+        self._count[joint] = (self._count[joint] + 1) % COUNTER_MODULUS
 
 
 def _steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
@@ -60,55 +60,57 @@ def _steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64
     return np.clip(np.rint(values), low, high).astype(np.int64)
 
 
-def on_change(before: LifecycleState, now: LifecycleState) -> list[Frame]:
+def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[Frame]:
     """Frames to all modules when the robot's lifecycle changes; it may have passed through states in between."""
     if now == before:
         return []
     if now == "estop":
-        return [emergency()]
+        return [make_emergency()]
     if before == "armed":
-        return [command(Action.STOP if now == "fault" else Action.DISARM)]
-    first = [command(Action.CLEAR)] if before in LATCHED and now not in LATCHED else []
-    return [*first, command(Action.ARM)] if now == "armed" else first
+        return [make_command(CommandAction.STOP if now == "fault" else CommandAction.DISARM)]
+    first = [make_command(CommandAction.CLEAR)] if before in LATCHED and now not in LATCHED else []
+    return [*first, make_command(CommandAction.ARM)] if now == "armed" else first
 
 
-def reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
+def make_reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
     """The frame to repeat to a module in an unexpected state, because one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
-            return command(Action.ARM, node)
+            return make_command(CommandAction.ARM, node)
         case "estop", ModuleState.DISARMED | ModuleState.ARMED | ModuleState.STOPPING | ModuleState.FAULT:
-            return emergency()
+            return make_emergency()
         case (("disarmed" | "fault"), ModuleState.ARMED):
-            return command(Action.STOP, node)
+            return make_command(CommandAction.STOP, node)
     return None
 
 
-def is_arming(frame: Frame) -> bool:
+def is_arm_command(frame: Frame) -> bool:
     """Whether a frame would switch motors on."""
-    return frame == command(Action.ARM)
+    return frame == make_command(CommandAction.ARM)
 
 
-def command(action: Action, node: int = BROADCAST) -> Frame:
+def make_command(action: CommandAction, node: int = BROADCAST) -> Frame:
     """A Command to one module, or to all."""
-    return codec()[Opcode.COMMAND].frame(node, action=action, key=COMMAND_KEY)
+    return load_layouts()[Opcode.COMMAND].encode(node, action=action, key=COMMAND_KEY)
 
 
-def question(node: int) -> Frame:
+def make_query(node: int) -> Frame:
     """A request for a constant value: its answer comes after all earlier frames of the module."""
-    return codec()[Opcode.PARAMETER_REQUEST].frame(node, index=Parameter.TAIL, operation=Operation.READ, value=0.0)
+    return load_layouts()[Opcode.PARAMETER_REQUEST].encode(
+        node, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0
+    )
 
 
-def emergency() -> Frame:
+def make_emergency() -> Frame:
     """Motors off at once, on all modules."""
-    return codec()[Opcode.EMERGENCY].frame(BROADCAST, reason=EmergencyReason.HOST)
+    return load_layouts()[Opcode.EMERGENCY].encode(BROADCAST, reason=EmergencyReason.HOST)
 
 
-def sync(count: int, time_us: int) -> Frame:
+def make_sync(count: int, time_us: int) -> Frame:
     """All modules sample and enact now."""
     return _sync_writer()(BROADCAST, (count & 0xFF, time_us & 0xFFFFFFFF))
 
 
 @cache
 def _sync_writer() -> Writer:
-    return codec()[Opcode.SYNC].writer("count", "time")
+    return load_layouts()[Opcode.SYNC].make_writer("count", "time")

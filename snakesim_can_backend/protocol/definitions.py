@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-VERSION = 1
+PROTOCOL_VERSION = 1
 BROADCAST = 0
 FIRST_NODE, LAST_NODE = 1, 62
 NODE_BITS = 6
 NODE_MASK = (1 << NODE_BITS) - 1
 COMMAND_KEY = 0x5AAE
-COUNTS = 16  # setpoint and state counters have four bits
-MAX_LOST = 2  # setpoints that may be missing before one; a count further ahead, or an earlier one, is wrong
-WRONG_COUNTS = 5  # in a row, after which a module stops
+COUNTER_MODULUS = 16  # setpoint and state counters have four bits
+MAX_LOST_SETPOINTS = 2  # setpoints that may be missing before one; a count further ahead, or an earlier one, is wrong
+MAX_WRONG_COUNTS = 5  # in a row, after which a module stops
 HEARTBEAT_PERIOD_S = 0.1
 UPTIME_RANGE_MS = 1 << 32  # of a heartbeat: 49.7 days
 MAX_UPTIME_MS = UPTIME_RANGE_MS - 1  # where an uptime stays from then on
@@ -59,7 +59,7 @@ class ModuleState(IntEnum):
     EMERGENCY = 5  # passive; latched until cleared or rebooted
 
 
-class Action(IntEnum):
+class CommandAction(IntEnum):
     """Action of a Command."""
 
     ARM = 1
@@ -105,7 +105,7 @@ class EmergencyReason(IntEnum):
     HOST = 2
 
 
-class Operation(IntEnum):
+class ParameterOperation(IntEnum):
     """Operation of a ParameterRequest."""
 
     READ = 0
@@ -113,7 +113,7 @@ class Operation(IntEnum):
     SAVE = 2
 
 
-class Result(IntEnum):
+class ParameterResult(IntEnum):
     """Result of a ParameterRequest."""
 
     DONE = 0
@@ -131,7 +131,7 @@ class SafeMotion(IntEnum):
     DAMP = 1
 
 
-class Parameter(IntEnum):
+class ModuleParameter(IntEnum):
     """Index of every parameter."""
 
     STIFFNESS = 1
@@ -159,20 +159,20 @@ class ParameterRange:
     writable: bool = True
 
 
-PARAMETERS: dict[Parameter, ParameterRange] = {
-    Parameter.STIFFNESS: ParameterRange(0.0, 1e5, "N·m/rad"),
-    Parameter.DAMPING: ParameterRange(0.0, 1e4, "N·m·s/rad"),
-    Parameter.VELOCITY_GAIN: ParameterRange(0.0, 1e4, "N·m·s/rad"),
-    Parameter.TORQUE_LIMIT: ParameterRange(0.0, 32.767, "N·m"),
-    Parameter.SPEED_LIMIT: ParameterRange(0.0, 32.767, "rad/s"),
-    Parameter.ANGLE_LIMIT: ParameterRange(0.0, 3.2767, "rad"),
-    Parameter.WATCHDOG: ParameterRange(0.02, 0.1, "s"),
-    Parameter.STOP_MODE: ParameterRange(0, 1, "0 passive, 1 damp"),
-    Parameter.CONTACT_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
-    Parameter.IMU_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
-    Parameter.TAIL: ParameterRange(0, 1, "1: sends TailContact too"),
-    Parameter.RATED_TORQUE: ParameterRange(0.0, 32.767, "N·m", writable=False),
-    Parameter.RATED_SPEED: ParameterRange(0.0, 32.767, "rad/s", writable=False),
+PARAMETERS: dict[ModuleParameter, ParameterRange] = {
+    ModuleParameter.STIFFNESS: ParameterRange(0.0, 1e5, "N·m/rad"),
+    ModuleParameter.DAMPING: ParameterRange(0.0, 1e4, "N·m·s/rad"),
+    ModuleParameter.VELOCITY_GAIN: ParameterRange(0.0, 1e4, "N·m·s/rad"),
+    ModuleParameter.TORQUE_LIMIT: ParameterRange(0.0, 32.767, "N·m"),
+    ModuleParameter.SPEED_LIMIT: ParameterRange(0.0, 32.767, "rad/s"),
+    ModuleParameter.ANGLE_LIMIT: ParameterRange(0.0, 3.2767, "rad"),
+    ModuleParameter.WATCHDOG: ParameterRange(0.02, 0.1, "s"),
+    ModuleParameter.STOP_MODE: ParameterRange(0, 1, "0 passive, 1 damp"),
+    ModuleParameter.CONTACT_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
+    ModuleParameter.IMU_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
+    ModuleParameter.TAIL: ParameterRange(0, 1, "1: sends TailContact too"),
+    ModuleParameter.RATED_TORQUE: ParameterRange(0.0, 32.767, "N·m", writable=False),
+    ModuleParameter.RATED_SPEED: ParameterRange(0.0, 32.767, "rad/s", writable=False),
 }
 
 
@@ -188,12 +188,12 @@ def frame_id(opcode: Opcode, node: int) -> int:
     return opcode << NODE_BITS | node
 
 
-def opcode_of(identifier: int) -> int:
+def parse_opcode(identifier: int) -> int:
     """The opcode of an id."""
     return identifier >> NODE_BITS
 
 
-def node_of(identifier: int) -> int:
+def parse_node(identifier: int) -> int:
     """The node of an id: sender or receiver."""
     return identifier & NODE_MASK
 
@@ -203,6 +203,6 @@ def checksum(identifier: int, data: bytes) -> int:
     return crc_hqx(data, identifier) & 0xFF
 
 
-def intact(frame: Frame) -> bool:
+def has_valid_checksum(frame: Frame) -> bool:
     """Whether the last byte of a frame is the checksum of the others."""
     return crc_hqx(frame.data[:-1], frame.id) & 0xFF == frame.data[-1]
