@@ -24,7 +24,7 @@ from snakesim_can_backend.bus.load import (
     suggest_alternatives,
 )
 from snakesim_can_backend.bus.read_log import BusLog
-from snakesim_can_backend.bus.strangers import UnknownFrames, listen_for_unknown_frames
+from snakesim_can_backend.bus.unknown_frames import UnknownFrames, listen_for_unknown_frames
 from snakesim_can_backend.driver.bring_up import ModuleBus, ModuleIdentity, find_modules
 from snakesim_can_backend.driver.modules import answer_limit_s
 from snakesim_can_backend.driver.offline import LogReplay, compare_with_run_log

@@ -274,7 +274,7 @@ class JointModules:
         try:
             check_ratings(self._config.robot, configure_modules(self._buses, due, limit_s, self.reading.process_frame))
         finally:
-            self.reading.forget_frames()  # they arrived over more than one period
+            self.reading.reset_frame_counts()  # they arrived over more than one period
         self._unconfigured.clear()
 
     def _await_first_states(self) -> None:

@@ -13,7 +13,7 @@ import can
 import numpy as np
 
 from snakesim_can_backend.bus.load import ReportSchedule
-from snakesim_can_backend.bus.strangers import guess_origin, matches_protocol
+from snakesim_can_backend.bus.unknown_frames import guess_origin, matches_protocol
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.driver.sensors import contacts_due, joint_values
 from snakesim_can_backend.protocol.codec import load_layouts

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.emulator.reports import (
+from snakesim_can_backend.emulator.frames import (
     ACCELERATION,
     ANGLE,
+    NO_CONTACT,
     RATE,
     SHAFT_LOAD,
     TORQUE,
-    UNTOUCHED,
     VELOCITY,
     ModuleReadings,
     encode_contact,
@@ -78,8 +78,8 @@ class ModuleSensors:
             if math.hypot(*load.force_l) >= sensor.threshold_n
         }
         for i, reading in enumerate(readings if touches else ()):
-            reading.tail_contact = touches.get(self._first + i, UNTOUCHED)
-            reading.contact = touches.get(self._first + i + 1, UNTOUCHED)
+            reading.tail_contact = touches.get(self._first + i, NO_CONTACT)
+            reading.contact = touches.get(self._first + i + 1, NO_CONTACT)
 
     def _blurred(self, load: LinkLoad) -> LinkLoad:
         sensor = self._contacts

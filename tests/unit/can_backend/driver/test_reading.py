@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_can_backend.driver.reports import LATE_SYNCS, ModuleReports
+from snakesim_can_backend.driver.reports import MAX_LATE_SYNCS, ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode
 from tests.unit.can_backend.frames import answer, begin, contact, joint_state, syncs
@@ -40,7 +40,7 @@ def test_an_older_state_never_replaces_a_newer_one() -> None:
     made.process_frame(joint_state(2, made.sync, 0.5))
     made.process_frame(joint_state(2, made.sync - 1, -0.5))
     assert angles(made)[1] == pytest.approx(0.5) and made.modules[1].sync == made.sync
-    assert made.modules[1].twice == 0, "late is not twice"
+    assert made.modules[1].double_answers == 0, "late is not twice"
 
 
 def test_two_answers_to_one_sync_are_counted_once_a_sync_and_in_a_row() -> None:
@@ -105,7 +105,7 @@ def test_forces_are_waited_for_at_the_syncs_that_ask_for_them() -> None:
 
 def test_who_has_not_answered_for_long_is_not_waited_for() -> None:
     made = reading()
-    syncs(made, LATE_SYNCS, [1, 3])
+    syncs(made, MAX_LATE_SYNCS, [1, 3])
     begin(made, contacts=True, tail=True)
     answer(made, [1, 3])
     assert not made.complete and made.states_missing == 1, "three Syncs are not long"
@@ -119,7 +119,7 @@ def test_who_has_not_answered_for_long_is_not_waited_for() -> None:
 
 def test_without_the_tail_nobody_waits_for_its_second_link() -> None:
     made = reading()
-    syncs(made, LATE_SYNCS + 1, [2, 3])
+    syncs(made, MAX_LATE_SYNCS + 1, [2, 3])
     begin(made, contacts=True, tail=True)
     assert (made.states_missing, made.contacts_missing) == (2, 2)
 

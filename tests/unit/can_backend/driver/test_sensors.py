@@ -17,8 +17,7 @@ from snakesim_can_backend.driver.sensors import (
     describe_sensors,
     locate_on_capsule,
 )
-from snakesim_can_backend.emulator.frames import write_contact, write_tail_contact
-from snakesim_can_backend.emulator.reports import encode_contact
+from snakesim_can_backend.emulator.frames import encode_contact, write_contact, write_tail_contact
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import Opcode
 from snakesim_can_backend.settings import CanSettings

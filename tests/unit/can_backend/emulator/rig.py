@@ -6,8 +6,8 @@ from typing import Any
 from snakesim_can_backend.emulator.bus_time import Traffic
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.emulator.frames import ModuleReadings
 from snakesim_can_backend.emulator.parameters import ParameterStore, make_factory_defaults
-from snakesim_can_backend.emulator.reports import ModuleReadings
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command, make_sync
 from snakesim_can_backend.protocol.definitions import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.emulator.chain import MAX_AT_ONCE_US
-from snakesim_can_backend.emulator.reports import ALONG, ANGLE, FORCE
+from snakesim_can_backend.emulator.frames import ALONG, ANGLE, FORCE
 from snakesim_can_backend.protocol.commands import make_command, make_sync
 from snakesim_can_backend.protocol.definitions import CommandAction, ModuleParameter, ModuleState, Opcode
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
