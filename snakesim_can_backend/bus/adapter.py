@@ -125,9 +125,7 @@ def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
         check_channel(channel, fd=fd)
         bus = split_channel(channel)
         if bus in channel_of_bus:
-            raise ConfigError(
-                f"channels: {channel_of_bus[bus]!r} and {channel!r} are the same bus; name each bus once"
-            )
+            raise ConfigError(f"channels: {channel_of_bus[bus]!r} and {channel!r} are the same bus; name each bus once")
         channel_of_bus[bus] = channel
     groups = [channel for channel in channels if _is_multicast(channel)]
     if len(groups) > 1 and not GROUPS_ARE_SEPARATE:
