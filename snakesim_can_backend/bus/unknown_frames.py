@@ -1,6 +1,7 @@
-"""Listen to a bus without sending anything: which frames on it are none of the joint modules' protocol, and whose.
+"""Listens to a bus without sending anything, and lists the frames that are none of the joint modules' protocol.
 
-Only what a frame itself shows is told: where several devices use a format, it is "as of" the one named.
+The origin of such a frame is guessed from its id, length and data only. Where several devices use a format, the guess
+is "as" the one that is named.
 """
 
 import time
@@ -21,20 +22,30 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_hal.base.errors import BackendError
 
-CANOPEN_HEARTBEAT, CANOPEN_STATES = 0x700, {0: "boot", 4: "stopped", 5: "operational", 127: "pre-operational"}
-ODRIVE_HEARTBEAT, ODRIVE_LENGTH, ODRIVE_STATES, ODRIVE_NODE_BITS = 0x01, 8, 14, 5
-MAX_FRAMES = 100_000
+MAX_FRAMES = 100_000  # then listening ends early
+
+# CANopen: a heartbeat has the id 0x700 + node, and one byte with the node's state.
+CANOPEN_HEARTBEAT = 0x700
+CANOPEN_MAX_NODE = 0x7F
+CANOPEN_STATES = {0: "boot", 4: "stopped", 5: "operational", 127: "pre-operational"}
+
+# ODrive: a heartbeat has the command 0x01 in the lower five bits of its id, and the axis state in its fifth byte.
+ODRIVE_HEARTBEAT = 0x01
+ODRIVE_HEARTBEAT_BYTES = 8
+ODRIVE_STATE_BYTE = 4
+ODRIVE_MAX_STATE = 14
+ODRIVE_COMMAND_BITS = 5
 
 
 @dataclass(frozen=True)
 class UnknownFrames:
-    """Frames of one id that are not of our protocol."""
+    """Frames of one id that are not of the joint modules' protocol."""
 
     id: int
     extended: bool
     length: int  # bytes, of the newest
     frames: int
-    origin: str  # whose it may be; empty: unknown
+    origin: str  # device that may have sent them; empty: unknown
 
     def __str__(self) -> str:
         digits = f"0x{self.id:08X}" if self.extended else f"0x{self.id:03X}"
@@ -42,48 +53,57 @@ class UnknownFrames:
 
 
 def listen_for_unknown_frames(bus: can.BusABC, seconds: float) -> list[UnknownFrames]:
-    """Those heard on a bus within a time, by id. Raises BackendError."""
-    heard: Counter[tuple[int, bool]] = Counter()
+    """Return the unknown frames that arrive on a bus within a time, sorted by id. Raises BackendError."""
+    counts: Counter[tuple[int, bool]] = Counter()  # by id, and whether it is extended
     newest: dict[tuple[int, bool], can.Message] = {}
-    end = time.monotonic() + seconds
+    end_s = time.monotonic() + seconds
     try:
-        while (left_s := end - time.monotonic()) > 0 and heard.total() < MAX_FRAMES:
+        while counts.total() < MAX_FRAMES:
+            left_s = end_s - time.monotonic()
+            if left_s <= 0:
+                break
             message = bus.recv(left_s)
             if message is None or message.is_error_frame or matches_protocol(message):
                 continue
             key = message.arbitration_id, message.is_extended_id
-            heard[key] += 1
+            counts[key] += 1
             newest[key] = message
     except (OSError, ValueError, can.CanError) as error:
         raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}") from error
-    return [
-        UnknownFrames(*key, len(newest[key].data), count, guess_origin(newest[key]))
-        for key, count in sorted(heard.items())
-    ]
+    unknown: list[UnknownFrames] = []
+    for (identifier, extended), count in sorted(counts.items()):
+        message = newest[identifier, extended]
+        unknown.append(UnknownFrames(identifier, extended, len(message.data), count, guess_origin(message)))
+    return unknown
 
 
 def matches_protocol(message: can.Message) -> bool:
-    """Whether a frame has an id, a length and, where there is one, a checksum of the joint modules' protocol."""
+    """Return whether id, length and, where there is one, checksum are those of the joint modules' protocol."""
     if message.is_extended_id or message.is_remote_frame or message.is_fd:
         return False
     frame = Frame(message.arbitration_id, bytes(message.data))
-    opcode, layouts = parse_opcode(frame.id), load_layouts()
-    if opcode not in layouts or parse_node(frame.id) > LAST_NODE or len(frame.data) != layouts[Opcode(opcode)].length:
+    opcode = parse_opcode(frame.id)
+    layouts = load_layouts()
+    if opcode not in layouts or parse_node(frame.id) > LAST_NODE:
+        return False
+    if len(frame.data) != layouts[Opcode(opcode)].length:
         return False
     return opcode not in WITH_CHECKSUM or has_valid_checksum(frame)
 
 
 def guess_origin(message: can.Message) -> str:
-    """What a foreign frame looks like; empty: unknown."""
-    identifier, data = message.arbitration_id, bytes(message.data)
+    """Return what an unknown frame looks like; empty: unknown."""
+    identifier = message.arbitration_id
+    data = bytes(message.data)
     if message.is_fd:
         return "CAN FD"
     if message.is_extended_id:
         return "29-bit id"
     node = identifier - CANOPEN_HEARTBEAT
-    if 0 < node <= 0x7F and len(data) == 1 and data[0] in CANOPEN_STATES:
+    if 0 < node <= CANOPEN_MAX_NODE and len(data) == 1 and data[0] in CANOPEN_STATES:
         return f"as CANopen's heartbeat of node {node}, {CANOPEN_STATES[data[0]]}"
-    is_heartbeat = identifier & ((1 << ODRIVE_NODE_BITS) - 1) == ODRIVE_HEARTBEAT and len(data) == ODRIVE_LENGTH
-    if is_heartbeat and data[4] <= ODRIVE_STATES:
-        return f"as ODrive's heartbeat of node {identifier >> ODRIVE_NODE_BITS}"
+    command = identifier & ((1 << ODRIVE_COMMAND_BITS) - 1)
+    is_heartbeat = command == ODRIVE_HEARTBEAT and len(data) == ODRIVE_HEARTBEAT_BYTES
+    if is_heartbeat and data[ODRIVE_STATE_BYTE] <= ODRIVE_MAX_STATE:
+        return f"as ODrive's heartbeat of node {identifier >> ODRIVE_COMMAND_BITS}"
     return ""

@@ -1,4 +1,4 @@
-"""The backend `can`: joint modules as a driver type of the driver kit, with sensors of their own."""
+"""The backend `can`: joint modules as a driver type of the driver kit, with contact sensors and IMUs."""
 
 from snakesim_can_backend.bus.adapter import check_channels
 from snakesim_can_backend.bus.load import check_load, plan_reports
@@ -24,51 +24,61 @@ class CanBackend(DriveBackend):
     """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
 
     Settings = CanSettings
-    clear_grace = 0  # the monitor has its own, for what takes a while to be over
+    clear_grace = 0  # the monitor itself gives modules time to follow a clear
     modules: JointModules
-    _sensors: SampleBuilder
+    _sample_builder: SampleBuilder
 
     @staticmethod
     def check(config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
-        """Real modules support real time only; emulators that it starts support lockstep. Raises ConfigError."""
+        """Check that a run is possible with these settings.
+
+        Returns:
+            The supported clock modes: real time only on real modules, and lockstep too on emulators of this driver.
+
+        Raises:
+            ConfigError: it is not possible; the message says why, and what to change.
+        """
+        has_emulators = settings.emulators_run != "none"
         check_load(config, settings)
         check_gains(config.robot)
         check_drives(config.robot, settings)
-        check_mounted(
-            config.robot, config.backend_section, settings.mounted, emulators=settings.emulators_run != "none"
-        )
+        check_mounted(config.robot, config.backend_section, settings.mounted, emulators=has_emulators)
         check_ratings(config.robot)
         check_watchdog(config, settings)
         check_pose(config, settings.pose_listen)
         check_emulators(config, settings)
         check_faults(config, settings)
         check_channels(settings.channels)
-        return ("realtime",) if settings.emulators_run == "none" else ("lockstep", "realtime")
+        if has_emulators:
+            return ("lockstep", "realtime")
+        return ("realtime",)
 
     def __init__(self, config: RunConfig, settings: CanSettings) -> None:
         """Open the buses and find every module; nothing is enabled. Raises ConfigError and BackendError."""
         self.check(config, settings)
-        clock, emulators = Clock(config), settings.emulators_run != "none"
-        mocap = receiver(config, settings.pose_listen, emulators=emulators, clock=lambda _timestamp_ns: clock.ns())
+        clock = Clock(config)
+        has_emulators = settings.emulators_run != "none"
+        mocap = receiver(config, settings.pose_listen, emulators=has_emulators, clock=lambda _timestamp_ns: clock.ns())
         self._reports = plan_reports(config, settings)
 
         def make_modules(readings: Readings) -> JointModules:
             pose = mocap.address if mocap is not None else None
             self.modules = JointModules(config, settings, clock, pose, readings)
-            self._sensors = SampleBuilder(config, self._reports, self.modules.reading, mocap)
+            self._sample_builder = SampleBuilder(config, self._reports, self.modules.reading, mocap)
             return self.modules
 
+        hardware = "+".join(settings.channels)
         watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
-        super().__init__(config, NAME, "+".join(settings.channels), clock, mocap, make_modules, watchdogs_s)
+        super().__init__(config, NAME, hardware, clock, mocap, make_modules, watchdogs_s)
 
     def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)
 
     def _samples(self, tick: int, timestamp_ns: int) -> Samples:
-        return self._sensors.make_samples(tick, timestamp_ns)
+        return self._sample_builder.make_samples(tick, timestamp_ns)
 
     def _silent(self) -> list[Finding]:
-        return []  # the monitor finds it, by the answers to Syncs
+        return []  # the monitor finds silent modules, by their answers to Syncs
 
     def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
         return describe_sensors(config, self._reports, pose_delay_s=pose_delay_s)

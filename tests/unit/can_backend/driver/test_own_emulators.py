@@ -140,7 +140,7 @@ def test_a_child_that_ends_by_itself_is_noticed_even_when_its_log_is_gone(child:
     child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     assert emulators.describe_exit() is None
-    emulators._said.unlink()
+    emulators._output.unlink()
     wait_until(emulators.describe_exit, "the end of the child")
     assert emulators.describe_exit() == "the emulated joint modules have ended, with exit code 3"
     emulators.stop()

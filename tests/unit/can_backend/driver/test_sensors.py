@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from snakesim_can_backend.bus.load import ReportSchedule, plan_reports
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.driver.sensors import (
-    LONG_AGO_NS,
+    NO_STATE_AGE_NS,
     SampleBuilder,
     contacts_due,
     describe_sensors,
@@ -74,7 +74,7 @@ def test_what_was_never_heard_is_not_valid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
-    assert joints.valid == [True, True, False, True] and joints.age_ns[2] == LONG_AGO_NS
+    assert joints.valid == [True, True, False, True] and joints.age_ns[2] == NO_STATE_AGE_NS
     assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), "a zero that nobody may believe"
 
 
