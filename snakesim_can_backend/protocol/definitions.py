@@ -10,22 +10,30 @@ from enum import IntEnum
 from typing import NamedTuple
 
 PROTOCOL_VERSION = 1
-BROADCAST = 0
-FIRST_NODE, LAST_NODE = 1, 62
+
+# Ids: the upper five bits are the opcode, the lower six the node.
 NODE_BITS = 6
 NODE_MASK = (1 << NODE_BITS) - 1
-COMMAND_KEY = 0x5AAE
-COUNTER_MODULUS = 16  # setpoint and state counters have four bits
-MAX_LOST_SETPOINTS = 2  # setpoints that may be missing before one; a count further ahead, or an earlier one, is wrong
+BROADCAST = 0  # node of frames to all modules
+FIRST_NODE = 1
+LAST_NODE = 62
+
+COMMAND_KEY = 0x5AAE  # in every Command, so that no other frame can be taken for one
+
+# Counters of setpoints and states.
+COUNTER_MODULUS = 16  # they have four bits
+MAX_LOST_SETPOINTS = 2  # that may be missing before one; a count further ahead, or an earlier one, is wrong
 MAX_WRONG_COUNTS = 5  # in a row, after which a module stops
+
+# Reports that modules send by themselves.
 HEARTBEAT_PERIOD_S = 0.1
+HEALTH_PERIOD_S = 0.5
 UPTIME_RANGE_MS = 1 << 32  # of a heartbeat: 49.7 days
 MAX_UPTIME_MS = UPTIME_RANGE_MS - 1  # where an uptime stays from then on
-HEALTH_PERIOD_S = 0.5
 
 
 class Opcode(IntEnum):
-    """Upper five bits of an id; the lowest wins arbitration."""
+    """The kind of a message: the upper five bits of an id. The lowest wins arbitration."""
 
     EMERGENCY = 0
     COMMAND = 1
@@ -98,7 +106,7 @@ class ModuleFault(IntEnum):
 
 
 class EmergencyReason(IntEnum):
-    """Who sent an Emergency."""
+    """What sent an Emergency."""
 
     UNSPECIFIED = 0
     PERSON = 1
@@ -184,25 +192,28 @@ class Frame(NamedTuple):
 
 
 def frame_id(opcode: Opcode, node: int) -> int:
-    """The id of a message to or from a node; node 0 is broadcast."""
+    """Return the id of a message to or from a node; node 0 is broadcast."""
     return opcode << NODE_BITS | node
 
 
 def parse_opcode(identifier: int) -> int:
-    """The opcode of an id."""
+    """Return the opcode in an id. It need not be one of `Opcode`."""
     return identifier >> NODE_BITS
 
 
 def parse_node(identifier: int) -> int:
-    """The node of an id: sender or receiver."""
+    """Return the node in an id: the sender or the receiver."""
     return identifier & NODE_MASK
 
 
 def checksum(identifier: int, data: bytes) -> int:
-    """Low byte of CRC-16/XMODEM over `data`, with the id as initial value, so that frames cannot be confused."""
+    """Return the checksum of a frame: the low byte of CRC-16/XMODEM over the data before it.
+
+    The id is the initial value, so that a frame cannot be confused with one of another id.
+    """
     return crc_hqx(data, identifier) & 0xFF
 
 
 def has_valid_checksum(frame: Frame) -> bool:
-    """Whether the last byte of a frame is the checksum of the others."""
+    """Return whether the last byte of a frame is the checksum of the others."""
     return crc_hqx(frame.data[:-1], frame.id) & 0xFF == frame.data[-1]

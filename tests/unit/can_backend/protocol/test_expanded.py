@@ -24,7 +24,7 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
 )
-from snakesim_can_backend.protocol.expanded import nodes_of
+from snakesim_can_backend.protocol.expanded import list_nodes
 from snakesim_hal.wire.messages import Mode
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
@@ -49,7 +49,7 @@ def test_every_message_of_every_node_is_there_and_no_other(database: Database) -
     expected = {
         opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
         for opcode, layout in load_layouts().items()
-        for node in nodes_of(opcode)
+        for node in list_nodes(opcode)
     }
     assert {message.frame_id: message.name for message in database.messages} == expected
 
