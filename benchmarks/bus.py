@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterator
 import can
 
 from benchmarks.table import HEADER, row
-from snakesim_can_backend.bus.bus import drain, is_up
+from snakesim_can_backend.bus.bus import drain_socket, is_up
 from snakesim_can_backend.bus.load import BIT_RATE, FRAME_BITS
-from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.codec import codec, load_database
-from snakesim_can_backend.protocol.definitions import COUNTS, Opcode
+from snakesim_can_backend.driver.reports import ModuleReports
+from snakesim_can_backend.protocol.codec import load_database, load_layouts
+from snakesim_can_backend.protocol.definitions import COUNTER_MODULUS, Opcode
 
 JOINTS = 13
 SYNCS = 400
@@ -30,12 +30,12 @@ WANTED = struct.Struct("<hhhBB")
 
 def answers(sync: int) -> list[bytes]:
     """What all modules say to one Sync, as the kernel hands it over."""
-    state, contact = codec()[Opcode.JOINT_STATE], codec()[Opcode.CONTACT]
-    count = sync % COUNTS
+    state, contact = load_layouts()[Opcode.JOINT_STATE], load_layouts()[Opcode.CONTACT]
+    count = sync % COUNTER_MODULUS
     frames = []
     for node in range(1, JOINTS + 1):
-        frames.append(state.frame(node, angle=0.1 * node, velocity=-0.2, torque=1.5, count=count, state=2))
-        frames.append(contact.frame(node, force_x=1.0, force_y=-20.0, along=0.05, bearing=1.0, touched=1, count=count))
+        frames.append(state.encode(node, angle=0.1 * node, velocity=-0.2, torque=1.5, count=count, state=2))
+        frames.append(contact.encode(node, force_x=1.0, force_y=-20.0, along=0.05, bearing=1.0, touched=1, count=count))
     return [RAW.pack(frame.id, len(frame.data), frame.data) for frame in frames]
 
 
@@ -87,16 +87,16 @@ def _cost(receiver: Callable[[socket.socket], Callable[[int], int]]) -> float:
 
 
 def _driver(source: socket.socket) -> Callable[[int], int]:
-    reading, buffer = Reading(JOINTS), bytearray(RAW.size)
+    reading, buffer = ModuleReports(JOINTS), bytearray(RAW.size)
 
     def receive(sync: int) -> int:
-        reading.begin(sync, contacts=True, tail=False)
+        reading.begin_sync(sync, contacts=True, tail=False)
         frames = []
-        drain(source, buffer, frames, lambda _identifier, _data: None)
+        drain_socket(source, buffer, frames, lambda _identifier, _data: None)
         for frame in frames:
-            reading.take(frame)
+            reading.process_frame(frame)
         assert reading.complete
-        reading.joints()
+        reading.shaft_values()
         return len(frames)
 
     return receive

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.whole import run
-from snakesim_can_backend.bus.load import MAX_LOAD, Reports, load
-from snakesim_can_backend.protocol.definitions import Opcode, opcode_of
+from snakesim_can_backend.bus.load import MAX_LOAD, ReportSchedule, bus_load
+from snakesim_can_backend.protocol.definitions import Opcode, parse_opcode
 from tests.unit.can_backend.emulator.rig import run_at
 
 WARM_UP = 100  # cycles
@@ -54,7 +54,7 @@ def _frames(log: Path) -> tuple[np.ndarray, list[tuple[float, float]]]:
     first = last = 0.0
     for line in log.read_text(encoding="ascii").splitlines():
         stamp, _channel, frame, *_ = line.split()
-        opcode, at = opcode_of(int(frame[:3], 16)), float(stamp[1:-1])
+        opcode, at = parse_opcode(int(frame[:3], 16)), float(stamp[1:-1])
         if opcode == Opcode.SYNC:
             syncs.append(at)
             if first:
@@ -74,7 +74,7 @@ def load_table() -> list[str]:
     for joints in JOINTS:
         for rate_hz in RATES_HZ:
             _, before, after, _ = run_at(joints, rate_hz)
-            computed, measured = load(joints, Reports(rate_hz)), after.load_since(before)
+            computed, measured = bus_load(joints, ReportSchedule(rate_hz)), after.load_since(before)
             apart = f"{100 * (measured / computed - 1):+.1f} %" if computed < 1 else "bus is full"
             says = "takes it" if computed <= MAX_LOAD else "refuses it"
             rows.append(f"| {joints} | {rate_hz} Hz | {computed:.1%} | {measured:.1%} | {apart} | {says} |")

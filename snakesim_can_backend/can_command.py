@@ -12,24 +12,24 @@ from snakesim_can_backend.bus.load import (
     BIT_RATE,
     MAX_LOAD,
     MIN_RATE_HZ,
-    Reports,
-    arithmetic,
-    busiest_s,
-    each_bus,
-    fits,
-    load,
-    mbit,
-    reports_at,
-    reports_of,
-    what_fits,
+    ReportSchedule,
+    bus_load,
+    busiest_period_s,
+    explain_load,
+    format_bit_rate,
+    is_feasible,
+    plan_buses,
+    plan_reports,
+    plan_reports_at,
+    suggest_alternatives,
 )
 from snakesim_can_backend.bus.read_log import BusLog
-from snakesim_can_backend.bus.strangers import Stranger, strangers
-from snakesim_can_backend.driver.bring_up import Bus, Identity, find
+from snakesim_can_backend.bus.unknown_frames import UnknownFrames, listen_for_unknown_frames
+from snakesim_can_backend.driver.bring_up import ModuleBus, ModuleIdentity, find_modules
 from snakesim_can_backend.driver.modules import answer_limit_s
-from snakesim_can_backend.driver.offline import Replay, against_record
-from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.driver.offline import LogReplay, compare_with_run_log
+from snakesim_can_backend.driver.reports import ModuleReports
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import CanSettings
@@ -126,14 +126,14 @@ def settings_of(loaded: Loaded) -> CanSettings:
 
 def one(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
     """The sum for every bus as lines, and whether all fit."""
-    buses, period_ms, lines = each_bus(config, settings), 1e3 / config.rate_hz, list[str]()
+    buses, period_ms, lines = plan_buses(config, settings), 1e3 / config.rate_hz, list[str]()
     for name, bus in zip(settings.channels or ["one bus"], buses, strict=True):
-        lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *arithmetic(*bus)]
-        busiest_ms = 1e3 * busiest_s(*bus)
+        lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *explain_load(*bus)]
+        busiest_ms = 1e3 * busiest_period_s(*bus)
         lines.append(f"  Sync, answers, forces and setpoints of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
-    if all(fits(*bus) for bus in buses):
+    if all(is_feasible(*bus) for bus in buses):
         return lines, True
-    return [*lines, f"Refused. {what_fits([joints for joints, _ in buses], config, settings)}"], False
+    return [*lines, f"Refused. {suggest_alternatives([joints for joints, _ in buses], config, settings)}"], False
 
 
 def table(
@@ -144,15 +144,15 @@ def table(
     rates = rates_hz or [config.rate_hz]
     yield "joints" + "".join(f"{f'{rate:g} Hz':>16}" for rate in rates)
     for count in joints:
-        cells = [_cell(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
+        cells = [_cell(ceil(count / buses), plan_reports_at(rate, config, settings)) for rate in rates]
         yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
-    of = mbit(settings.bit_rate)
+    of = format_bit_rate(settings.bit_rate)
     yield f"Worst-case load of {on}, {of}; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
 
 
-def _cell(joints: int, reports: Reports) -> str:
-    return f"{100 * load(joints, reports):.1f} %" + ("" if fits(joints, reports) else " refused")
+def _cell(joints: int, reports: ReportSchedule) -> str:
+    return f"{100 * bus_load(joints, reports):.1f} %" + ("" if is_feasible(joints, reports) else " refused")
 
 
 # --- scan --------------------------------------------------------------------------------------------------
@@ -177,24 +177,24 @@ def _scan(arguments: argparse.Namespace) -> int:
     return OK if found else FAILED
 
 
-def overheard(channel: str, bit_rate: int) -> list[Stranger]:
+def overheard(channel: str, bit_rate: int) -> list[UnknownFrames]:
     """Who else is on a bus. Sends nothing."""
     check_channel(channel)
     bus = open_bus(channel, bit_rate)
     try:
-        return strangers(bus, LISTEN_S)
+        return listen_for_unknown_frames(bus, LISTEN_S)
     finally:
         bus.shutdown()
 
 
 def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
     """Discover the modules on a bus; one row a module, as text by `COLUMNS`. Sends only identify."""
-    reading = Reading(LAST_NODE)
-    everybody = Bus(wire, range(FIRST_NODE, LAST_NODE + 1))
-    return [_row(identity, reading) for identity in find([everybody], seconds, reading.take)]
+    reading = ModuleReports(LAST_NODE)
+    everybody = ModuleBus(wire, range(FIRST_NODE, LAST_NODE + 1))
+    return [_row(identity, reading) for identity in find_modules([everybody], seconds, reading.process_frame)]
 
 
-def _row(identity: Identity, reading: Reading) -> dict[str, str]:
+def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
     row = dict.fromkeys(COLUMNS, UNKNOWN) | {
         "channel": identity.channel,
         "node": str(identity.node),
@@ -212,12 +212,12 @@ def _row(identity: Identity, reading: Reading) -> dict[str, str]:
         row["faults"] = "+".join(module.fault_names()) or "none"
         row["uptime"] = f"{module.uptime_ms / 1000:.1f} s"
     if health is not None:
-        signals = codec()[Opcode.HEALTH].signals
-        row["voltage"] = f"{signals['voltage'].value(health[0]):.1f} V"
-        row["motor"] = f"{signals['motor_temperature'].value(health[2]):.0f} °C"
-        row["board"] = f"{signals['board_temperature'].value(health[3]):.0f} °C"
+        signals = load_layouts()[Opcode.HEALTH].signals
+        row["voltage"] = f"{signals['voltage'].decode(health[0]):.1f} V"
+        row["motor"] = f"{signals['motor_temperature'].decode(health[2]):.0f} °C"
+        row["board"] = f"{signals['board_temperature'].decode(health[3]):.0f} °C"
     if shaft is not None:  # only while a host sends Syncs, and modules report their IMUs
-        row["shaft"] = f"{codec()[Opcode.SHAFT_LOAD].signals['torque'].value(shaft):.3f} N·m"
+        row["shaft"] = f"{load_layouts()[Opcode.SHAFT_LOAD].signals['torque'].decode(shaft):.3f} N·m"
     return row
 
 
@@ -234,9 +234,9 @@ def _replay(arguments: argparse.Namespace) -> int:
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)
     mounting, limit_s = Mounting(loaded.config.robot.joint_table), answer_limit_s(loaded.config, settings)
-    done = Replay(mounting, reports_of(loaded.config, settings), limit_s)
+    done = LogReplay(mounting, plan_reports(loaded.config, settings), limit_s)
     log = BusLog(arguments.log)
-    done.take(log)
+    done.read(log)
     if not done.joints:
         found = f"{done.frames} frames, and no Sync among them: the log of another bus"
         say(f"{arguments.log}: {found}{looks(done.foreign)}")
@@ -247,9 +247,9 @@ def _replay(arguments: argparse.Namespace) -> int:
     for name, silent in zip(layout.joints, done.silent, strict=True):
         if silent:
             say(f"  {name} did not answer {silent} Syncs in time")
-    for node, count in sorted(done.reading.strangers.items()):
+    for node, count in sorted(done.reading.unknown_nodes.items()):
         say(f"  {count} frames of node {node}, which is not of this robot")
-    verdict = against_record(done, layout, rows)
+    verdict = compare_with_run_log(done, layout, rows)
     if verdict.first_wrong:
         say(f"joint states differ from {arguments.run}: {verdict.first_wrong}")
         return FAILED

@@ -1,4 +1,4 @@
-"""A bus through any adapter that python-can opens, and which of the wires a channel is.
+"""Opens a bus through any adapter that python-can supports, and parses the name of a channel.
 
 A channel is a SocketCAN interface (`can0`), or `INTERFACE:CHANNEL` of python-can: `slcan:/dev/ttyACM0`,
 `pcan:PCAN_USBBUS1`, `kvaser:0`, `gs_usb:0`, `udp_multicast:239.74.163.2`. Its adapter is configured to the bit rate; a
@@ -17,34 +17,37 @@ from typing import Any
 
 import can
 
-from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface, message_of
-from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
+from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface, to_python_can
+from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, did_you_mean
 
 LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
-FD = ("socketcan", "kvaser", *LOCAL)
-GROUPS_ARE_SEPARATE = sys.platform == "linux"
-IP_MULTICAST_ALL, IPV6_MULTICAST_ALL = 49, 29  # linux/in.h, linux/in6.h
+FD = ("socketcan", "kvaser", *LOCAL)  # interfaces through which this driver supports CAN FD
+GROUPS_ARE_SEPARATE = sys.platform == "linux"  # only Linux keeps multicast groups on one UDP port apart
+IP_MULTICAST_ALL = 49  # linux/in.h
+IPV6_MULTICAST_ALL = 29  # linux/in6.h
+ERROR_FRAME_BYTES = 8  # of a whole error frame of the kernel
 # A library that is missing or too old makes python-can's interfaces raise any of these.
 LIBRARY_ERRORS = (ImportError, TypeError, NameError, AttributeError, NotImplementedError)
 SERIAL_PORT = "a serial port, such as /dev/ttyACM0: see `snakesim doctor`"
-OF_KERNEL = "with the kernel's own driver the adapter is an interface such as can0"
+KERNEL_DRIVER = "with the kernel's own driver the adapter is an interface such as can0"
 WINDOWS = "Windows, and its vendor's driver"
+# What a person must install or name to use an interface of python-can; shown when it cannot be opened.
 NEEDS = {
     "canalystii": "the Python package canalystii",
     "cantact": "the Python package cantact",
     "etas": WINDOWS,
-    "gs_usb": f"the Python packages gs_usb and pyusb; {OF_KERNEL}",
+    "gs_usb": f"the Python packages gs_usb and pyusb; {KERNEL_DRIVER}",
     "iscan": WINDOWS,
     "ixxat": WINDOWS,
-    "kvaser": f"Kvaser's library canlib; {OF_KERNEL}",
+    "kvaser": f"Kvaser's library canlib; {KERNEL_DRIVER}",
     "neousys": "the library of Neousys, libwdt_dio",
     "neovi": "the Python packages python-ics and filelock",
     "nican": WINDOWS,
     "nixnet": WINDOWS,
-    "pcan": f"PEAK's library PCANBasic; {OF_KERNEL}",
+    "pcan": f"PEAK's library PCANBasic; {KERNEL_DRIVER}",
     "robotell": SERIAL_PORT,
     "seeedstudio": SERIAL_PORT,
     "serial": SERIAL_PORT,
@@ -55,58 +58,32 @@ NEEDS = {
     "usb2can": WINDOWS,
     "vector": WINDOWS,
 }
-POLL_S = 0.0005  # of an adapter that cannot be waited for
+POLL_S = 0.0005  # pause between two looks at an adapter that has no file descriptor
 
 
 def open_wire(
     channel: str, only: Iterable[Opcode] | None = None, bit_rate: int = BIT_RATE, data_bit_rate: int | None = None
 ) -> Wire:
-    """The end of a bus. only: messages to receive; None: all. Raises ConfigError and BackendError.
+    """Open one end of a bus.
 
-    data_bit_rate: of CAN FD; None: classic CAN.
+    Args:
+        channel: a SocketCAN interface, or INTERFACE:CHANNEL of python-can.
+        only: messages to receive; None: all.
+        bit_rate: in bit/s; not used by an interface of the kernel.
+        data_bit_rate: second bit rate, for the data of CAN FD; None: classic CAN.
+
+    Raises:
+        ConfigError: there is no such channel.
+        BackendError: the channel cannot be opened.
     """
-    interface, name = _parted(channel)
+    interface, name = split_channel(channel)
     if interface == "socketcan" and data_bit_rate is None:
         return SocketCanWire(name, only)
     return AdapterWire(channel, only, bit_rate, data_bit_rate)
 
 
-def check_channel(channel: str, *, fd: bool = False) -> None:
-    """Raise ConfigError unless python-can knows the interface, and the kernel the one that it is to have."""
-    interface, name = _parted(channel)
-    if fd and interface not in FD:
-        raise ConfigError(
-            f"channel {channel!r}: CAN FD is driven through {', '.join(FD)}; on Linux most adapters are interfaces of "
-            f"the kernel, such as can0"
-        )
-    if interface == "socketcan":
-        check_interface(name)
-
-
-def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
-    """Check every channel of a robot, and that each is another bus. Raises ConfigError."""
-    first: dict[tuple[str, str], str] = {}
-    for channel in channels:
-        check_channel(channel, fd=fd)
-        bus = _parted(channel)
-        if bus in first:
-            raise ConfigError(f"channels: {first[bus]!r} and {channel!r} are the same bus; name each bus once")
-        first[bus] = channel
-    groups = [channel for channel in channels if _parted(channel)[0] == "udp_multicast"]
-    if len(groups) > 1 and not GROUPS_ARE_SEPARATE:
-        raise ConfigError(
-            f"channels: {', '.join(groups)} share one UDP port, and only Linux keeps their groups apart: name one of "
-            f"them"
-        )
-
-
-def is_emulated(channel: str) -> bool:
-    """Whether no real module can be on a bus of this name."""
-    interface, name = _parted(channel)
-    return interface in LOCAL or (interface == "socketcan" and name.startswith("vcan"))
-
-
-def _parted(channel: str) -> tuple[str, str]:
+def split_channel(channel: str) -> tuple[str, str]:
+    """Return python-can's interface and the name of a channel on it. Raises ConfigError."""
     interface, colon, name = channel.partition(":")
     if not colon:
         return "socketcan", channel
@@ -121,64 +98,126 @@ def _parted(channel: str) -> tuple[str, str]:
     return interface, name
 
 
+def check_channel(channel: str, *, fd: bool = False) -> None:
+    """Check that python-can has the interface of a channel, and that an interface of the kernel is up.
+
+    Args:
+        channel: a SocketCAN interface, or INTERFACE:CHANNEL of python-can.
+        fd: whether it must support CAN FD.
+
+    Raises:
+        ConfigError: it does not exist, is down, or does not support CAN FD.
+    """
+    interface, name = split_channel(channel)
+    if fd and interface not in FD:
+        raise ConfigError(
+            f"channel {channel!r}: CAN FD is driven through {', '.join(FD)}; on Linux most adapters are interfaces of "
+            f"the kernel, such as can0"
+        )
+    if interface == "socketcan":
+        check_interface(name)
+
+
+def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
+    """Check every channel of a robot, and that each is another bus. Raises ConfigError."""
+    channel_of_bus: dict[tuple[str, str], str] = {}
+    for channel in channels:
+        check_channel(channel, fd=fd)
+        bus = split_channel(channel)
+        if bus in channel_of_bus:
+            raise ConfigError(f"channels: {channel_of_bus[bus]!r} and {channel!r} are the same bus; name each bus once")
+        channel_of_bus[bus] = channel
+    groups = [channel for channel in channels if _is_multicast(channel)]
+    if len(groups) > 1 and not GROUPS_ARE_SEPARATE:
+        raise ConfigError(
+            f"channels: {', '.join(groups)} share one UDP port, and only Linux keeps their groups apart: name one of "
+            f"them"
+        )
+
+
+def is_emulated(channel: str) -> bool:
+    """Return whether no real module can be on a bus of this name."""
+    interface, name = split_channel(channel)
+    is_virtual_interface = interface == "socketcan" and name.startswith("vcan")
+    return interface in LOCAL or is_virtual_interface
+
+
+def _is_multicast(channel: str) -> bool:
+    interface, _ = split_channel(channel)
+    return interface == "udp_multicast"
+
+
 def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> can.BusABC:
-    """python-can's bus of a channel. Raises BackendError when it cannot be opened."""
-    interface, name = _parted(channel)
-    fd = data_bit_rate is not None
-    settings: dict[str, Any] = {} if interface in (*LOCAL, "socketcan") else {"bitrate": bit_rate}
-    if interface == "virtual":
-        settings["protocol"] = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
-    elif fd or interface == "udp_multicast":
-        settings["fd"] = fd
-    if fd and "bitrate" in settings:
-        settings["data_bitrate"] = data_bit_rate
+    """Open a channel as a bus of python-can. Raises ConfigError and BackendError."""
+    interface, name = split_channel(channel)
+    settings = _bus_settings(interface, bit_rate, data_bit_rate)
     try:
         bus = can.Bus(interface=interface, channel=name, **settings)
     except (*IO_ERRORS, *LIBRARY_ERRORS) as error:
         needs = f"; {interface} needs {NEEDS[interface]}" if interface in NEEDS else ""
-        why = "its library is missing" if isinstance(error, NameError | AttributeError) else str(error)
-        raise BackendError(f"{channel}: cannot be opened: {why}{needs}") from error
+        library_is_missing = isinstance(error, NameError | AttributeError)
+        reason = "its library is missing" if library_is_missing else str(error)
+        raise BackendError(f"{channel}: cannot be opened: {reason}{needs}") from error
     if interface == "udp_multicast":
-        hear_own_group(bus)
+        receive_own_group_only(bus)
     return bus
 
 
-def hear_own_group(bus: can.BusABC) -> None:
-    """Receive what is sent to the group of this bus, and to no other one.
+def _bus_settings(interface: str, bit_rate: int, data_bit_rate: int | None) -> dict[str, Any]:
+    """Return the arguments with which python-can opens an interface; they differ between interfaces."""
+    fd = data_bit_rate is not None
+    if interface == "virtual":
+        return {"protocol": can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20}
+    if interface == "udp_multicast":
+        return {"fd": fd}
+    if interface == "socketcan":  # its bit rates are set with `ip link`
+        return {"fd": True} if fd else {}
+    settings: dict[str, Any] = {"bitrate": bit_rate}
+    if fd:
+        settings["fd"] = True
+        settings["data_bitrate"] = data_bit_rate
+    return settings
+
+
+def receive_own_group_only(bus: can.BusABC) -> None:
+    """Receive the datagrams of this bus's multicast group only.
 
     All such buses share one port. By default the kernel gives a socket the datagrams of every group that any socket of
     the computer has joined.
     """
-    with socket.socket(fileno=os.dup(bus.fileno())) as own:
-        if own.family == socket.AF_INET:
-            level, option = socket.IPPROTO_IP, IP_MULTICAST_ALL
+    with socket.socket(fileno=os.dup(bus.fileno())) as own_socket:
+        if own_socket.family == socket.AF_INET:
+            level = socket.IPPROTO_IP
+            option = IP_MULTICAST_ALL
         else:
-            level, option = socket.IPPROTO_IPV6, IPV6_MULTICAST_ALL
+            level = socket.IPPROTO_IPV6
+            option = IPV6_MULTICAST_ALL
         with contextlib.suppress(OSError):  # not on Linux: `check_channels` refuses a second bus
-            own.setsockopt(level, option, 0)
+            own_socket.setsockopt(level, option, 0)
 
 
 class AdapterWire:
-    """One end of a bus, through python-can. On classic CAN frames that are no data frames of 11 bits are dropped."""
+    """One end of a bus, through python-can. On classic CAN it drops all frames but data frames with 11-bit ids."""
 
     def __init__(
         self, channel: str, only: Iterable[Opcode] | None, bit_rate: int, data_bit_rate: int | None = None
     ) -> None:
-        """Raises BackendError when it cannot be opened."""
-        self.channel, self._fd = channel, data_bit_rate is not None
+        """Open the adapter. `open_wire` explains the arguments. Raises ConfigError and BackendError."""
+        self.channel = channel
+        self._fd = data_bit_rate is not None
         self._only = None if only is None else frozenset(int(opcode) for opcode in only)
         self._bus = open_bus(channel, bit_rate, data_bit_rate)
-        self._file = self._descriptor()
-        echoed = _parted(channel)[0] == "udp_multicast"
-        self._echoes: Counter[Frame] | None = Counter() if echoed else None  # of own frames
-        self._found: list[BusError] = []
+        self._file = self._file_descriptor()
+        # UDP multicast returns the frames that this end sends: how many of each are still to come back.
+        self._echoes: Counter[Frame] | None = Counter() if _is_multicast(channel) else None
+        self._errors: list[BusError] = []
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame; False when the adapter did not take it."""
+        """Send a frame; return False if the adapter did not accept it."""
         try:
-            self._bus.send(message_of(frame, fd=self._fd), timeout=0)
+            self._bus.send(to_python_can(frame, fd=self._fd), timeout=0)
         except can.CanError as error:
-            self._found.append(BusError("not_sent", self.channel, str(error)))
+            self._errors.append(BusError("not_sent", self.channel, str(error)))
             return False
         except (OSError, ValueError) as error:
             raise BackendError(f"{self.channel}: cannot send: {error}") from error
@@ -187,35 +226,39 @@ class AdapterWire:
         return True
 
     def receive(self) -> list[Frame]:
-        """All received frames."""
+        """Return all received frames, in order."""
         frames: list[Frame] = []
         try:
             for _ in range(MAX_AT_ONCE):
-                if (message := self._bus.recv(0)) is None:
+                message = self._bus.recv(0)
+                if message is None:
                     break
                 if message.is_error_frame:
-                    self._found += self._errors_in(message)
-                elif self._is_wanted(message, frame := Frame(message.arbitration_id, bytes(message.data))):
+                    self._errors += self._decode_errors(message)
+                    continue
+                frame = Frame(message.arbitration_id, bytes(message.data))
+                if self._is_wanted(message, frame):
                     frames.append(frame)
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot receive: {error}") from error
         return frames
 
     def errors(self) -> list[BusError]:
-        """Error frames, and frames that were not sent, since the last call."""
-        found, self._found = self._found, []
-        return found
+        """Return the error frames, and the frames that were not sent, since the last call."""
+        errors = self._errors
+        self._errors = []
+        return errors
 
     def fileno(self) -> int | None:
-        """Its file, where it has one."""
+        """Return the adapter's file descriptor, or None if it has none."""
         return self._file
 
     def idle(self) -> float | None:
-        """The other end runs by itself."""
+        """Return how long to wait for the file descriptor, or until the next look at an adapter without one."""
         return math.inf if self._file is not None else POLL_S
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Nothing can be injected from this end."""
+        """Raise ConfigError, because no fault can be injected from this end."""
         raise ConfigError(f"{self.channel}: the fault {kind} can be injected on a virtual bus or on vcan, not here")
 
     def close(self) -> None:
@@ -225,20 +268,25 @@ class AdapterWire:
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
-    def _errors_in(self, message: can.Message) -> list[BusError]:
-        if _parted(self.channel)[0] == "socketcan":
-            return bus_errors_of(message.arbitration_id, bytes(message.data).ljust(8, b"\0"), self.channel)
+    def _decode_errors(self, message: can.Message) -> list[BusError]:
+        interface, _ = split_channel(self.channel)
+        if interface == "socketcan":
+            data = bytes(message.data).ljust(ERROR_FRAME_BYTES, b"\0")
+            return decode_error_frame(message.arbitration_id, data, self.channel)
         return [BusError("error_frames", self.channel, "an error frame")]
 
     def _is_wanted(self, message: can.Message, frame: Frame) -> bool:
-        if message.is_remote_frame or (not self._fd and (message.is_extended_id or message.is_fd)):
+        """Return whether to receive a frame; an echo of a frame that this end sent is removed once."""
+        if message.is_remote_frame:
             return False
-        if self._echoes and self._echoes[frame] > 0:  # UDP returns what one sends, and does not say whose it was
+        if not self._fd and (message.is_extended_id or message.is_fd):
+            return False
+        if self._echoes and self._echoes[frame] > 0:  # UDP does not say which end sent a datagram
             self._echoes[frame] -= 1
             return False
         return self._only is None or message.arbitration_id >> NODE_BITS in self._only
 
-    def _descriptor(self) -> int | None:
+    def _file_descriptor(self) -> int | None:
         try:
             number = self._bus.fileno()
         except NotImplementedError:

@@ -1,9 +1,9 @@
-"""One end of a CAN bus: frames in, frames out, and bus errors.
+"""One end of a CAN bus: it sends and receives frames, and reports bus errors.
 
-`SocketCanWire` is a kernel interface (can0, vcan0). python-can opens and filters it; frames go through its socket
-directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends in one
-process, for machines whose kernel has no CAN. It does *not* simulate arbitration and bit rate; errors, a full queue and
-an interface that goes down only as injected faults: see `bus_faults`.
+`SocketCanWire` is an interface of the kernel (can0, vcan0). python-can opens and filters it; frames go through its
+socket directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends
+in one process, for machines whose kernel has no CAN. It does *not* simulate arbitration and bit rate. It has errors, a
+full queue and an interface that goes down only as injected faults: see `bus_faults`.
 """
 
 import contextlib
@@ -22,47 +22,64 @@ import can
 from can.interfaces.socketcan.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
-from snakesim_can_backend.bus.bus_faults import VirtualFaults, inject_into_interface
-from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
+from snakesim_can_backend.bus.bus_faults import SendOutcome, VirtualFaults, inject_into_interface
+from snakesim_can_backend.protocol.definitions import NODE_BITS, NODE_MASK, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import Injection
 
-EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
-RECEIVE_BUFFER_BYTES = 1 << 20
-LAST_STANDARD_ID = 0x7FF
-MAX_AT_ONCE = 4096  # a babbling bus must not block its reader for ever
-MOMENT_S, PAUSE_S = 0.01, 0.001
-SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
+# Flags in the id of a frame on a raw socket: linux/can.h.
+EXTENDED = 0x80000000
+REMOTE = 0x40000000
+ERROR = 0x20000000
+LAST_STANDARD_ID = 0x7FF  # of 11 bits
+# The drop counter of a socket: linux/sock_diag.h.
+SO_MEMINFO = 55
+MEMINFO_FORMAT = struct.Struct("=9I")
+MEMINFO_DROPS = 8  # index of the counter
+INTERFACE_UP = 1  # flag of an interface: linux/if.h
+
+RECEIVE_BUFFER_BYTES = 1 << 20  # enough for seconds in which this process does not run
+MAX_AT_ONCE = 4096  # frames; a babbling bus must not block its reader for ever
+MAX_WAIT_S = 0.01  # for frames, before control cycles begin
+PAUSE_S = 0.001  # while nothing can arrive
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
-_wire_format = struct.Struct("<IB3x8s")
+_wire_format = struct.Struct("<IB3x8s")  # id, length, data
 
 
 class Wire(Protocol):
-    """One end of a bus. Errors are reported by `errors` or a BackendError, never another exception."""
+    """One end of a bus.
+
+    Errors of the bus are reported by `errors`. A method may also raise a BackendError, but never another exception.
+    """
 
     channel: str
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame. False when it was not accepted; `errors` says why, and nothing is queued for later."""
+        """Send a frame.
+
+        Returns:
+            False if the bus did not accept the frame. `errors` says why, and nothing is queued for later.
+        """
         ...
 
     def receive(self) -> list[Frame]:
-        """All received frames, in order; never waits."""
+        """Return all received frames, in order. Never waits."""
         ...
 
     def errors(self) -> list[BusError]:
-        """Bus errors since the last call."""
+        """Return the bus errors since the last call."""
         ...
 
     def fileno(self) -> int | None:
-        """File descriptor to wait on; None for a bus inside this process."""
+        """Return a file descriptor to wait on; None for a bus inside this process."""
         ...
 
     def idle(self) -> float | None:
         """Let the other end run, if it is in this process.
 
-        Seconds until a frame may arrive, 0 if there is one; None: not before this end sends something.
+        Returns:
+            Seconds until a frame may arrive, and 0 if there is one. None: no frame before this end sends something.
         """
         ...
 
@@ -76,12 +93,18 @@ class Wire(Protocol):
 
 
 class SocketCanWire:
-    """A SocketCAN interface."""
+    """One end of a bus, as an interface of the kernel."""
 
     def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
-        """only: messages to receive, filtered in the kernel; None: all with 11-bit ids.
+        """Open an interface.
 
-        Raises ConfigError for a missing interface, BackendError for one that cannot be opened.
+        Args:
+            channel: name of the interface.
+            only: messages to receive, filtered in the kernel; None: all with 11-bit ids.
+
+        Raises:
+            ConfigError: there is no such interface, or it is down.
+            BackendError: it cannot be opened.
         """
         check_interface(channel)
         self.channel = channel
@@ -96,12 +119,13 @@ class SocketCanWire:
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(_wire_format.size)
-        self._found: list[BusError] = []
-        self._down = self._gone = False
-        self._dropped = 0
+        self._errors: list[BusError] = []
+        self._down = False  # the interface
+        self._gone = False  # the adapter was unplugged
+        self._dropped = 0  # received frames that the kernel has dropped so far
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame; False when the queue is full or the interface is down."""
+        """Send a frame; return False if the queue is full or the interface is down."""
         try:
             self._socket.send(_wire_format.pack(frame.id, len(frame.data), frame.data))
         except OSError as error:
@@ -112,32 +136,33 @@ class SocketCanWire:
         return True
 
     def receive(self) -> list[Frame]:
-        """All received frames."""
+        """Return all received frames, in order."""
         frames: list[Frame] = []
         try:
-            drain(self._socket, self._buffer, frames, self._note_error)
+            drain_socket(self._socket, self._buffer, frames, self._note_error_frame)
         except OSError as error:
             self._note_failure(error)
         return frames
 
     def errors(self) -> list[BusError]:
-        """Bus errors since the last call."""
+        """Return the bus errors since the last call, with frames that the kernel dropped."""
         dropped = self._count_drops()
         if dropped > self._dropped:
             detail = f"the kernel dropped {dropped - self._dropped} frames: this process reads too slowly"
-            self._found.append(BusError("receive_overflow", self.channel, detail))
+            self._errors.append(BusError("receive_overflow", self.channel, detail))
             self._dropped = dropped
         if self._down and is_up(self.channel):
             self._note_up()
-        found, self._found = self._found, []
-        return found
+        errors = self._errors
+        self._errors = []
+        return errors
 
     def fileno(self) -> int | None:
-        """The socket."""
+        """Return the socket's file descriptor."""
         return self._socket.fileno()
 
     def idle(self) -> float | None:
-        """The other end runs by itself."""
+        """Return infinity, because a frame may arrive at any time and the socket can be waited for."""
         return math.inf
 
     def inject(self, kind: str, *, begins: bool) -> None:
@@ -152,25 +177,35 @@ class SocketCanWire:
             raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
     def _set_filters(self) -> None:
-        all_nodes = 0x7FF & ~((1 << NODE_BITS) - 1)
-        wanted = [(0, 0)] if self._only is None else [(opcode << NODE_BITS, all_nodes) for opcode in self._only]
-        data = b"".join(struct.pack("=II", id_, mask | EXTENDED | REMOTE) for id_, mask in wanted)
+        """Let the kernel drop all messages that this end does not need."""
+        filters = [(0, 0)]  # (id, mask): every frame with an 11-bit id
+        if self._only is not None:
+            opcode_mask = LAST_STANDARD_ID & ~NODE_MASK
+            filters = [(opcode << NODE_BITS, opcode_mask) for opcode in self._only]
+        data = b"".join(struct.pack("=II", identifier, mask | EXTENDED | REMOTE) for identifier, mask in filters)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
 
-    def _note_error(self, identifier: int, data: bytes) -> None:
-        self._found.extend(bus_errors_of(identifier, data, self.channel))
+    def _note_error_frame(self, identifier: int, data: bytes) -> None:
+        self._errors.extend(decode_error_frame(identifier, data, self.channel))
 
     def _note_failure(self, error: OSError) -> None:
-        if error.errno in (errno.ENOBUFS, errno.EAGAIN):  # the interface's queue, or this socket's share of it
-            self._found.append(BusError("queue_full", self.channel, "the transmit queue is full"))
-        elif error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
-            self._gone |= error.errno != errno.ENETDOWN
-            if not self._down:
-                what = "gone" if self._gone else "down"
-                self._found.append(BusError("interface_down", self.channel, f"the interface is {what}"))
-            self._down = True
-        else:
-            raise BackendError(f"{self.channel}: {error.strerror}") from error
+        """Report a full queue or an interface that went down. Raises BackendError for any other error."""
+        match error.errno:
+            case errno.ENOBUFS | errno.EAGAIN:  # the interface's queue, or this socket's share of it
+                self._errors.append(BusError("queue_full", self.channel, "the transmit queue is full"))
+            case errno.ENETDOWN:
+                self._note_down()
+            case errno.ENODEV | errno.ENXIO:
+                self._gone = True
+                self._note_down()
+            case _:
+                raise BackendError(f"{self.channel}: {error.strerror}") from error
+
+    def _note_down(self) -> None:
+        if not self._down:
+            state = "gone" if self._gone else "down"
+            self._errors.append(BusError("interface_down", self.channel, f"the interface is {state}"))
+        self._down = True
 
     def _note_up(self) -> None:
         if self._gone:  # an adapter that was plugged in again is another interface of the same name
@@ -179,28 +214,41 @@ class SocketCanWire:
                 self._set_filters()  # the kernel dropped them with the interface
             except OSError:
                 return
-        self._down = self._gone = False
-        self._found.append(BusError("interface_up", self.channel, "the interface is up again"))
+        self._down = False
+        self._gone = False
+        self._errors.append(BusError("interface_up", self.channel, "the interface is up again"))
 
     def _count_drops(self) -> int:
+        """Return how many received frames the kernel has dropped since the socket was opened; 0 if it is unknown."""
         try:
-            raw = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_BYTES)
+            raw = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_FORMAT.size)
         except OSError:
             return 0
-        return struct.unpack("=9I", raw)[MEMINFO_DROPS] if len(raw) == MEMINFO_BYTES else 0
+        if len(raw) != MEMINFO_FORMAT.size:
+            return 0
+        return MEMINFO_FORMAT.unpack(raw)[MEMINFO_DROPS]
 
 
-def message_of(frame: Frame, *, fd: bool = False) -> can.Message:
-    """As python-can has it. An id that does not fit 11 bits has 29."""
-    extended = frame.id > LAST_STANDARD_ID
-    return can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=extended, is_fd=fd, bitrate_switch=fd)
+def to_python_can(frame: Frame, *, fd: bool = False) -> can.Message:
+    """Return a frame as a message of python-can. An id that does not fit 11 bits has 29."""
+    return can.Message(
+        arbitration_id=frame.id,
+        data=frame.data,
+        is_extended_id=frame.id > LAST_STANDARD_ID,
+        is_fd=fd,
+        bitrate_switch=fd,
+    )
 
 
 class VirtualPeer(Protocol):
     """The other end of a virtual bus, in the same process."""
 
     def __call__(self) -> float | None:
-        """Run briefly; seconds until the next run is due, None: not before it receives something."""
+        """Run briefly.
+
+        Returns:
+            Seconds until the next run is due. None: not before this end receives something.
+        """
         ...
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
@@ -212,8 +260,11 @@ class VirtualPeer(Protocol):
         ...
 
 
-def virtual_channel() -> str:
-    """A name that no other virtual bus has. Its last digits are a channel: log files take them for one, as of can0."""
+def make_virtual_channel() -> str:
+    """Return a name that no other virtual bus has.
+
+    It ends in a number, because tools that read log files take the last digits for the channel, as in can0.
+    """
     return f"virtual-{uuid.uuid4().hex[:8]}-0"
 
 
@@ -221,48 +272,63 @@ class VirtualWire:
     """One end of python-can's virtual bus."""
 
     def __init__(self, channel: str, peer: VirtualPeer | None = None, *, fd: bool = False) -> None:
-        """peer: runs the other end whenever this one is idle; returns when its next run is due."""
+        """Open one end.
+
+        Args:
+            channel: name of the bus; both ends open the same one.
+            peer: runs the other end whenever this one is idle; None: the other end runs by itself.
+            fd: whether the bus is CAN FD.
+        """
         self.channel = channel
         self.peer = peer
         self._fd = fd
-        self._bus = VirtualBus(channel=channel, protocol=can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20)
+        protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        self._bus = VirtualBus(channel=channel, protocol=protocol)
         self._faults = VirtualFaults(channel)
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame; a virtual bus accepts everything, unless a fault is active."""
-        if self._faults.on and (taken := self._faults.stops_sending()) is not None:
-            return taken
+        """Send a frame. A virtual bus accepts everything, unless a fault is active."""
+        if self._faults.active:
+            match self._faults.judge_send():
+                case SendOutcome.REJECTED:
+                    return False
+                case SendOutcome.LOST:
+                    return True
+                case SendOutcome.SENT:
+                    pass
         try:
-            self._bus.send(message_of(frame, fd=self._fd))
+            self._bus.send(to_python_can(frame, fd=self._fd))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot send: {error}") from error
         return True
 
     def receive(self) -> list[Frame]:
-        """All received frames."""
+        """Return all received frames, in order."""
         frames: list[Frame] = []
         try:
             while (message := self._bus.recv(0)) is not None:
                 frames.append(Frame(message.arbitration_id, bytes(message.data)))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot receive: {error}") from error
-        return self._faults.leaves(frames) if self._faults.on else frames
+        if self._faults.active:
+            return self._faults.filter_received(frames)
+        return frames
 
     def errors(self) -> list[BusError]:
-        """A virtual bus has only injected errors."""
+        """Return the injected errors since the last call; a virtual bus has no others."""
         return self._faults.take_errors()
 
     def fileno(self) -> int | None:
-        """None: there is nothing to wait on."""
+        """Return None, because there is no file descriptor to wait on."""
         return None
 
     def idle(self) -> float | None:
-        """Let the other end run."""
+        """Let the other end run, and return when it must run again."""
         pause_s = math.inf if self.peer is None else self.peer()
         return pause_s if self._bus.queue.empty() else 0.0
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault, as this end would see it on a kernel interface; the other end is not affected."""
+        """Begin or end a fault, as an interface of the kernel would have it; the other end is not affected."""
         self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
@@ -275,12 +341,22 @@ class VirtualWire:
             raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
 
-def drain(
+def drain_socket(
     source: socket.socket, buffer: bytearray, frames: list[Frame], on_error: Callable[[int, bytes], None]
 ) -> None:
-    """Append all frames of a non-blocking raw CAN socket; error frames of the kernel go to `on_error`."""
-    receive_into, unpack, append = source.recv_into, _wire_format.unpack, frames.append
-    new = tuple.__new__  # as Frame(...), without its argument handling
+    """Read frames from a non-blocking raw CAN socket until it is empty, at most MAX_AT_ONCE.
+
+    Args:
+        source: the socket.
+        buffer: memory for one frame of the kernel.
+        frames: gets the data frames.
+        on_error: gets id and data of the kernel's error frames.
+    """
+    # This loop runs for every frame: local names, and a Frame that is made without its argument handling.
+    receive_into = source.recv_into
+    unpack = _wire_format.unpack
+    append = frames.append
+    new_tuple = tuple.__new__
     with contextlib.suppress(BlockingIOError):
         for _ in range(MAX_AT_ONCE):
             receive_into(buffer)
@@ -288,33 +364,45 @@ def drain(
             if identifier & ERROR:
                 on_error(identifier, data)
             else:
-                append(new(Frame, (identifier, data[:length])))
+                append(new_tuple(Frame, (identifier, data[:length])))
 
 
 def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
-    """Wait until a frame may have arrived on any of them, or the timeout. Other ends in this process run meanwhile.
+    """Wait until a frame may have arrived on any bus, or the timeout. Other ends in this process run meanwhile.
 
-    False when nothing can arrive before this end sends something. Raises BackendError.
+    Args:
+        wires: ends of the buses.
+        timeout_s: how long to wait at most.
+
+    Returns:
+        False if nothing can arrive before this end sends something.
+
+    Raises:
+        BackendError: a bus cannot be waited for.
     """
-    pauses = [pause for wire in wires if (pause := wire.idle()) is not None]
-    if not pauses:
+    pauses_s: list[float] = []
+    for wire in wires:
+        pause_s = wire.idle()
+        if pause_s is not None:
+            pauses_s.append(pause_s)
+    if not pauses_s:
         return False
-    files = [number for wire in wires if (number := wire.fileno()) is not None]
-    timeout_s = max(min([timeout_s, *pauses]), 0.0)
-    if files:
+    wait_s = max(min([timeout_s, *pauses_s]), 0.0)
+    descriptors = [number for wire in wires if (number := wire.fileno()) is not None]
+    if descriptors:
         try:
-            select.select(files, [], [], timeout_s)
+            select.select(descriptors, [], [], wait_s)
         except IO_ERRORS as error:
             channels = ", ".join(wire.channel for wire in wires)
             raise BackendError(f"{channels}: cannot be waited for: {error}") from error
-    elif timeout_s > 0:
-        time.sleep(timeout_s)
+    elif wait_s > 0:
+        time.sleep(wait_s)
     return True
 
 
-def arrivals(wires: Sequence[Wire], limit_s: float = MOMENT_S) -> Iterator[tuple[Wire, Frame]]:
-    """What has come after a moment at most; for the time before ticks begin."""
-    if not wait(wires, min(limit_s, MOMENT_S)):
+def receive_frames(wires: Sequence[Wire], limit_s: float = MAX_WAIT_S) -> Iterator[tuple[Wire, Frame]]:
+    """Wait for at most MAX_WAIT_S and yield what has arrived. For the time before control cycles begin."""
+    if not wait(wires, min(limit_s, MAX_WAIT_S)):
         time.sleep(PAUSE_S)
     for wire in wires:
         for frame in wire.receive():
@@ -322,7 +410,14 @@ def arrivals(wires: Sequence[Wire], limit_s: float = MOMENT_S) -> Iterator[tuple
 
 
 def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) -> bool:
-    """Begin or end a fault of a bus; False for a fault of something else. Raises ConfigError."""
+    """Begin or end a fault of a bus.
+
+    Returns:
+        False for a fault of something else.
+
+    Raises:
+        ConfigError: there is no such bus, or the fault cannot be injected there.
+    """
     if injection.target_type != "bus":
         return False
     if injection.number >= len(wires):
@@ -346,11 +441,12 @@ def check_interface(channel: str) -> None:
 
 
 def is_up(channel: str) -> bool:
-    """Whether an interface exists and is administratively up."""
+    """Return whether an interface exists and is administratively up."""
     try:
-        return bool(int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16) & 1)
+        flags = int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16)
     except (OSError, ValueError):  # the latter: the file of an interface that is going away is empty
         return False
+    return bool(flags & INTERFACE_UP)
 
 
 def _kernel_has_can() -> bool:

@@ -1,30 +1,44 @@
-"""Injected faults of a bus: imitated at one end of a virtual bus, and made on a kernel interface.
+"""Injected faults of a bus: imitated at one end of a virtual bus, or made on an interface of the kernel.
 
-A virtual bus behaves like a kernel interface with the same fault: its errors, accepted frames and received frames.
+A virtual bus behaves like an interface of the kernel with the same fault: in the errors that it reports, and in the
+frames that it accepts and receives.
 """
 
 import contextlib
 import socket
 import struct
 import subprocess
+from enum import Enum, auto
 
 from snakesim_can_backend.bus.bus_errors import BusError, Kind
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import ConfigError
 
 VIRTUAL = "vcan"
-ERROR_FRAME, CONTROLLER, BUS_OFF, RESTARTED = 0x20000000, 0x04, 0x40, 0x100  # linux/can.h, linux/can/error.h
-RECEIVE_OVERFLOW, TRANSMIT_PASSIVE = 0x01, 0x20  # in data[1] of the class `CONTROLLER`
-PASSIVE_ERRORS, MAX_ERRORS = 128, 255
-ERROR_FRAMES = {  # fault, begins -> class, state of the controller, transmit errors
+IP_TIMEOUT_S = 5.0
+
+# Bits of an error frame's id: linux/can.h and linux/can/error.h.
+ERROR_FRAME = 0x20000000
+CONTROLLER = 0x04
+BUS_OFF = 0x40
+RESTARTED = 0x100
+# Its second byte, if its class is CONTROLLER.
+RECEIVE_OVERFLOW = 0x01
+TRANSMIT_PASSIVE = 0x20
+# Transmit errors that its seventh byte counts.
+PASSIVE_ERRORS = 128
+MAX_ERRORS = 255
+
+# (fault, begins): class, state of the controller, transmit errors
+ERROR_FRAMES = {
     ("bus_off", True): (BUS_OFF, 0, MAX_ERRORS),
     ("bus_off", False): (RESTARTED, 0, 0),
     ("error_passive", True): (CONTROLLER, TRANSMIT_PASSIVE, PASSIVE_ERRORS),
     ("overflow", True): (CONTROLLER, RECEIVE_OVERFLOW, 0),
 }
 
-
-SEEN: dict[tuple[str, bool], tuple[Kind, str]] = {  # fault, begins -> the error that a kernel interface would tell
+# (fault, begins): kind and detail of the error that an interface of the kernel would report
+REPORTED_ERRORS: dict[tuple[str, bool], tuple[Kind, str]] = {
     ("cut", True): ("interface_down", "the interface is down"),
     ("cut", False): ("interface_up", "the interface is up again"),
     ("bus_off", True): ("bus_off", f"transmit errors {MAX_ERRORS}, receive errors 0"),
@@ -33,57 +47,71 @@ SEEN: dict[tuple[str, bool], tuple[Kind, str]] = {  # fault, begins -> the error
 }
 
 
+class SendOutcome(Enum):
+    """What becomes of a frame that is sent on a bus with injected faults."""
+
+    SENT = auto()
+    REJECTED = auto()
+    LOST = auto()  # accepted, but never on the bus
+
+
 class VirtualFaults:
-    """Injected faults of one end of a virtual bus."""
+    """The injected faults of one end of a virtual bus."""
 
     def __init__(self, channel: str) -> None:
         self._channel = channel
-        self._found: list[BusError] = []
-        self.on: set[str] = set()
+        self._errors: list[BusError] = []
+        self.active: set[str] = set()
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end one."""
-        if kind != "error_passive":  # which has no end
-            if begins == (kind in self.on):
+        """Begin or end a fault; a fault that already has, is left as it is."""
+        if kind != "error_passive":  # which is reported once, and has no end
+            is_active = kind in self.active
+            if begins == is_active:
                 return
-            self.on.symmetric_difference_update([kind])
-        if seen := SEEN.get((kind, begins)):
-            self._found.append(BusError(seen[0], self._channel, seen[1]))
+            if begins:
+                self.active.add(kind)
+            else:
+                self.active.discard(kind)
+        if (kind, begins) in REPORTED_ERRORS:
+            error_kind, detail = REPORTED_ERRORS[kind, begins]
+            self._errors.append(BusError(error_kind, self._channel, detail))
 
-    def stops_sending(self) -> bool | None:
-        """What happens to a frame: False, rejected; True, accepted and lost; None, sent."""
-        if "cut" in self.on:
-            return False
-        if "bus_off" in self.on:  # its queue is gone with the carrier: the kernel accepts frames and drops them
-            return True
-        if "full" in self.on:
-            self._found.append(BusError("queue_full", self._channel, "the transmit queue is full"))
-            return False
-        return None
+    def judge_send(self) -> SendOutcome:
+        """Return what becomes of a frame that is sent now."""
+        if "cut" in self.active:
+            return SendOutcome.REJECTED
+        if "bus_off" in self.active:  # its queue is gone with the carrier: the kernel accepts frames and drops them
+            return SendOutcome.LOST
+        if "full" in self.active:
+            self._errors.append(BusError("queue_full", self._channel, "the transmit queue is full"))
+            return SendOutcome.REJECTED
+        return SendOutcome.SENT
 
-    def leaves(self, frames: list[Frame]) -> list[Frame]:
-        """The sent frames that arrive."""
-        if self.on & {"cut", "bus_off"}:
+    def filter_received(self, frames: list[Frame]) -> list[Frame]:
+        """Return those of the frames on the bus that this end receives."""
+        if "cut" in self.active or "bus_off" in self.active:
             return []
-        if frames and "overflow" in self.on:
-            self.on.discard("overflow")
+        if frames and "overflow" in self.active:
+            self.active.discard("overflow")
             detail = f"the kernel dropped {len(frames)} frames: this process reads too slowly"
-            self._found.append(BusError("receive_overflow", self._channel, detail))
+            self._errors.append(BusError("receive_overflow", self._channel, detail))
             return []
         return frames
 
     def take_errors(self) -> list[BusError]:
-        """Bus errors since the last call."""
-        found, self._found = self._found, []
-        return found
+        """Return the bus errors since the last call."""
+        errors = self._errors
+        self._errors = []
+        return errors
 
 
 def inject_into_interface(channel: str, kind: str, *, begins: bool) -> None:
-    """Begin or end a fault of a kernel interface. Raises ConfigError if that is not possible."""
+    """Begin or end a fault of an interface of the kernel. Raises ConfigError if that is not possible."""
     if kind == "cut":
         _set_link(channel, "down" if begins else "up")
     elif (kind, begins) in ERROR_FRAMES:
-        _send_error(channel, *ERROR_FRAMES[kind, begins])
+        _send_error_frame(channel, *ERROR_FRAMES[kind, begins])
     elif kind == "full":
         raise ConfigError(
             f"{channel}: a program cannot fill an interface's queue and release it again; a traffic limit does: "
@@ -92,24 +120,28 @@ def inject_into_interface(channel: str, kind: str, *, begins: bool) -> None:
 
 
 def _set_link(channel: str, state: str) -> None:
+    """Bring an interface up or down. Raises ConfigError."""
     command = ["ip", "link", "set", channel, state]
+    problem = ""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=False)
-        said = done.stderr.strip() if done.returncode else ""
+        result = subprocess.run(command, capture_output=True, text=True, timeout=IP_TIMEOUT_S, check=False)
+        if result.returncode:
+            problem = result.stderr.strip()
     except (OSError, subprocess.TimeoutExpired) as error:
-        said = str(error)
-    if said:
-        raise ConfigError(f"`{' '.join(command)}`: {said}; it needs CAP_NET_ADMIN, and iproute2 installed")
+        problem = str(error)
+    if problem:
+        raise ConfigError(f"`{' '.join(command)}`: {problem}; it needs CAP_NET_ADMIN, and iproute2 installed")
 
 
-def _send_error(channel: str, kind: int, controller: int, transmit_errors: int) -> None:
-    """As the driver of a controller would: only virtual interfaces carry error frames sent by a program."""
+def _send_error_frame(channel: str, error_class: int, controller_state: int, transmit_errors: int) -> None:
+    """Send an error frame as the driver of a controller does. Only virtual interfaces carry one from a program."""
     if not channel.startswith(VIRTUAL):
         raise ConfigError(f"{channel}: error frames can only be sent on virtual interfaces, called {VIRTUAL}...")
-    data = bytes([0, controller, 0, 0, 0, 0, transmit_errors, 0])
-    with contextlib.closing(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)) as other:
+    data = bytes([0, controller_state, 0, 0, 0, 0, transmit_errors, 0])
+    frame = struct.pack("=IB3x8s", ERROR_FRAME | error_class, len(data), data)
+    with contextlib.closing(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)) as sender:
         try:
-            other.bind((channel,))
-            other.send(struct.pack("=IB3x8s", ERROR_FRAME | kind, len(data), data))
+            sender.bind((channel,))
+            sender.send(frame)
         except OSError as error:
             raise ConfigError(f"{channel}: cannot send an error frame: {error.strerror}") from error

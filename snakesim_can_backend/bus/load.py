@@ -1,4 +1,4 @@
-"""Bus load of a configuration, in bits; refuses one that does not fit.
+"""The bus load of a configuration, in bits; refuses one that does not fit.
 
 A classic frame with an 11-bit id and n bytes takes 47 + 8 n bits: start, id, control, data, CRC, acknowledge, end and
 the gap to the next. After five equal bits the sender stuffs one in between; at worst that adds one for every four of
@@ -9,53 +9,64 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
 
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, HEARTBEAT_PERIOD_S, LAST_NODE, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 
 BIT_RATE = 1_000_000
-MAX_LOAD = 0.8
-MAX_EVERY = 255  # Syncs; limit of the parameters
-MIN_RATE_HZ = 20
-FRAME_BITS = 47
-STUFFED_FROM = 34
-FD_START, FD_END = 36, 13  # bits of CAN FD with an id of 29: up to the switch of rates, and after the CRC
+MAX_LOAD = 0.8  # of a bus's time; the rest is for commands, parameters and repeated frames
+MAX_EVERY = 255  # Syncs between reports; limit of the modules' parameters
+MIN_RATE_HZ = 20  # a slower control rate is not proposed
+MAX_PROPOSED_BUSES = 8
+FRAME_BITS = 47  # of a classic frame, without its data
+STUFFED_FROM = 34  # of these bits, those that can be stuffed
+FD_START_BITS = 36  # of a frame of CAN FD with an id of 29 bits, up to the switch of bit rates
+FD_END_BITS = 13  # after the CRC
+FD_LENGTH_BITS = 5
+FD_STUFF_COUNT_BITS = 4
 
 
-def mbit(bit_rate: int) -> str:
-    """In words."""
+def format_bit_rate(bit_rate: int) -> str:
+    """Return a bit rate as text for a person, in Mbit/s."""
     return f"{bit_rate / 1e6:g} Mbit/s"
 
 
-def worst_bits(length: int) -> int:
-    """Bits of a frame with `length` bytes, with the maximum of stuff bits."""
+def worst_frame_bits(length: int) -> int:
+    """Return the bits of a classic frame with `length` bytes, with the maximum of stuff bits."""
     return FRAME_BITS + 8 * length + (STUFFED_FROM + 8 * length - 1) // 4
 
 
-def worst_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
-    """Time of a frame, at worst-case stuffing; with a second bit rate, of CAN FD with an id of 29 bits.
+def worst_frame_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
+    """Return the time that a frame takes at worst-case stuffing.
 
-    There identifier and end go at the first rate; length, data and CRC at the second. Its CRC has 17 bits, or 21 above
-    16 bytes, with the count of stuff bits before it and a fixed stuff bit for every four.
+    On CAN FD, identifier and end are sent at the first bit rate; length, data and CRC at the second. The CRC has 17
+    bits, or 21 above 16 bytes of data. Before it comes the count of stuff bits, and it has a fixed stuff bit for every
+    four bits.
+
+    Args:
+        length: bytes of data.
+        bit_rate: in bit/s.
+        data_bit_rate: in bit/s, of CAN FD with an id of 29 bits; None: classic CAN with an id of 11 bits.
     """
     if data_bit_rate is None:
-        return worst_bits(length) / bit_rate
-    crc = 4 + (17 if length <= 16 else 21)
-    data = 5 + 8 * length
-    slow, fast = FD_START + (FD_START - 1) // 4 + FD_END, data + data // 4 + crc + ceil(crc / 4)
-    return slow / bit_rate + fast / data_bit_rate
+        return worst_frame_bits(length) / bit_rate
+    crc_bits = FD_STUFF_COUNT_BITS + (17 if length <= 16 else 21)
+    data_bits = FD_LENGTH_BITS + 8 * length
+    slow_bits = FD_START_BITS + (FD_START_BITS - 1) // 4 + FD_END_BITS
+    fast_bits = data_bits + data_bits // 4 + crc_bits + ceil(crc_bits / 4)
+    return slow_bits / bit_rate + fast_bits / data_bit_rate
 
 
 @dataclass(frozen=True)
-class Reports:
-    """Which reports are sent, and how often."""
+class ReportSchedule:
+    """Which reports the modules on a bus send, and how often."""
 
-    rate_hz: float
+    rate_hz: float  # of Syncs
     contact_every: int = 1  # Syncs; 0: never
-    imu_every: int = 20
-    tail: bool = True  # a module on the bus sends TailContact
+    imu_every: int = 20  # Syncs; 0: never
+    tail: bool = True  # whether a module on the bus sends TailContact
     bit_rate: int = BIT_RATE
 
 
@@ -68,69 +79,87 @@ class Stream:
 
     @property
     def bits_per_s(self) -> float:
-        """Worst case."""
-        return self.frames_per_s * worst_bits(codec()[self.opcode].length)
+        """Return the bits per second at worst-case stuffing."""
+        return self.frames_per_s * worst_frame_bits(load_layouts()[self.opcode].length)
 
 
-def streams(joints: int, reports: Reports) -> list[Stream]:
-    """All frames on a bus with this many joints while the robot runs."""
-    rate = reports.rate_hz
-    contacts = rate / reports.contact_every if reports.contact_every else 0.0
-    imus = rate / reports.imu_every if reports.imu_every else 0.0
+def list_streams(joints: int, reports: ReportSchedule) -> list[Stream]:
+    """Return all kinds of frames on a bus with this many joints while the robot runs."""
+    rate_hz = reports.rate_hz
+    contact_hz = rate_hz / reports.contact_every if reports.contact_every else 0.0
+    imu_hz = rate_hz / reports.imu_every if reports.imu_every else 0.0
+    tail_contact_hz = contact_hz if reports.tail else 0.0
     return [
-        Stream(Opcode.SYNC, rate),
-        Stream(Opcode.SET_POINT, joints * rate),
-        Stream(Opcode.JOINT_STATE, joints * rate),
-        Stream(Opcode.CONTACT, joints * contacts),
-        Stream(Opcode.TAIL_CONTACT, contacts if reports.tail else 0.0),
-        Stream(Opcode.GYRO, joints * imus),
-        Stream(Opcode.ACCELEROMETER, joints * imus),
-        Stream(Opcode.SHAFT_LOAD, joints * imus),
+        Stream(Opcode.SYNC, rate_hz),
+        Stream(Opcode.SET_POINT, joints * rate_hz),
+        Stream(Opcode.JOINT_STATE, joints * rate_hz),
+        Stream(Opcode.CONTACT, joints * contact_hz),
+        Stream(Opcode.TAIL_CONTACT, tail_contact_hz),
+        Stream(Opcode.GYRO, joints * imu_hz),
+        Stream(Opcode.ACCELEROMETER, joints * imu_hz),
+        Stream(Opcode.SHAFT_LOAD, joints * imu_hz),
         Stream(Opcode.HEARTBEAT, joints / HEARTBEAT_PERIOD_S),
         Stream(Opcode.HEALTH, joints / HEALTH_PERIOD_S),
     ]
 
 
-def load(joints: int, reports: Reports) -> float:
-    """Worst-case load of a bus, as a share of its time."""
-    return sum(stream.bits_per_s for stream in streams(joints, reports)) / reports.bit_rate
+def bus_load(joints: int, reports: ReportSchedule) -> float:
+    """Return the worst-case load of a bus, as a fraction of its time."""
+    return sum(stream.bits_per_s for stream in list_streams(joints, reports)) / reports.bit_rate
 
 
-def busiest_s(joints: int, reports: Reports) -> float:
-    """Bus time of one period in which forces are reported: Sync, all answers, all setpoints, at worst."""
-    once = streams(joints, Reports(1.0, min(reports.contact_every, 1), 0, reports.tail))
-    each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
-    return sum(stream.bits_per_s for stream in once if stream.opcode in each_period) / reports.bit_rate
+def busiest_period_s(joints: int, reports: ReportSchedule) -> float:
+    """Return the bus time of a period with force reports: Sync, all answers and all setpoints, at worst."""
+    one_period = ReportSchedule(1.0, min(reports.contact_every, 1), 0, reports.tail)
+    in_each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
+    streams = [stream for stream in list_streams(joints, one_period) if stream.opcode in in_each_period]
+    return sum(stream.bits_per_s for stream in streams) / reports.bit_rate
 
 
-def fits(joints: int, reports: Reports) -> bool:
-    """Whether a bus can carry this many joints, on average and in the longest period."""
-    return load(joints, reports) <= MAX_LOAD and busiest_s(joints, reports) * reports.rate_hz <= 1
+def is_feasible(joints: int, reports: ReportSchedule) -> bool:
+    """Return whether a bus can carry this many joints, on average and in the longest period."""
+    fits_on_average = bus_load(joints, reports) <= MAX_LOAD
+    return fits_on_average and busiest_period_s(joints, reports) * reports.rate_hz <= 1
 
 
-def every(rate_hz: float, wanted_hz: float) -> int:
-    """Number of Syncs between reports at about `wanted_hz`; 0 for never."""
-    return 0 if wanted_hz <= 0 else round(min(max(rate_hz / wanted_hz, 1.0), MAX_EVERY))
+# --- the reports of a run -----------------------------------------------------------------------------------------
 
 
-def reports_of(config: RunConfig, settings: CanSettings) -> Reports:
-    """The reports of a run's modules, and how often."""
-    return reports_at(config.rate_hz, config, settings)
+def syncs_per_report(rate_hz: float, report_hz: float) -> int:
+    """Return the number of Syncs between reports at about `report_hz`; 0 for never."""
+    if report_hz <= 0:
+        return 0
+    return round(min(max(rate_hz / report_hz, 1.0), MAX_EVERY))
 
 
-def reports_at(rate_hz: float, config: RunConfig, settings: CanSettings) -> Reports:
-    """The same for another control rate: rates in Hz are converted to Syncs."""
+def plan_reports(config: RunConfig, settings: CanSettings) -> ReportSchedule:
+    """Return which reports the modules of a run send, and how often."""
+    return plan_reports_at(config.rate_hz, config, settings)
+
+
+def plan_reports_at(rate_hz: float, config: RunConfig, settings: CanSettings) -> ReportSchedule:
+    """Return the reports at another control rate than the run's: rates in Hz are converted to Syncs."""
     sensors = config.robot.sensors
     contact_hz = 0.0
     if sensors.contacts is not None:
-        contact_hz = sensors.contacts.rate_hz if settings.contact_rate_hz is None else settings.contact_rate_hz
-    imu_hz = min(settings.imu_rate_hz, sensors.imu.rate_hz) if sensors.imu is not None else 0.0
-    return Reports(rate_hz, every(rate_hz, contact_hz), every(rate_hz, imu_hz), bit_rate=settings.bit_rate)
+        contact_hz = sensors.contacts.rate_hz
+        if settings.contact_rate_hz is not None:
+            contact_hz = settings.contact_rate_hz
+    imu_hz = 0.0
+    if sensors.imu is not None:
+        imu_hz = min(settings.imu_rate_hz, sensors.imu.rate_hz)
+    return ReportSchedule(
+        rate_hz,
+        contact_every=syncs_per_report(rate_hz, contact_hz),
+        imu_every=syncs_per_report(rate_hz, imu_hz),
+        bit_rate=settings.bit_rate,
+    )
 
 
-def shares(config: RunConfig, settings: CanSettings) -> list[int]:
-    """Number of joints of each bus, tail to head. Raises ConfigError."""
-    joints, buses = config.robot.chain.modules, max(len(settings.channels), 1)
+def joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
+    """Return the number of joints on each bus, tail to head. Raises ConfigError for impossible settings."""
+    joints = config.robot.chain.modules
+    buses = max(len(settings.channels), 1)
     if len(set(settings.channels)) < len(settings.channels):
         raise ConfigError(f"`backends.can.channels` = {settings.channels} names a channel twice")
     if joints > LAST_NODE:
@@ -145,88 +174,122 @@ def shares(config: RunConfig, settings: CanSettings) -> list[int]:
         )
     if buses > joints:
         raise ConfigError(f"`backends.can.channels` names {buses} channels for {joints} joints")
-    return list(given) or [joints // buses + (i < joints % buses) for i in range(buses)]
+    if given:
+        return list(given)
+    each, left_over = divmod(joints, buses)
+    return [each + (bus < left_over) for bus in range(buses)]
+
+
+def plan_buses(config: RunConfig, settings: CanSettings) -> list[tuple[int, ReportSchedule]]:
+    """Return joints and reports of every bus, tail to head. Only the first carries TailContact. Raises ConfigError."""
+    reports = plan_reports(config, settings)
+    buses: list[tuple[int, ReportSchedule]] = []
+    for bus, joints in enumerate(joints_per_bus(config, settings)):
+        has_tail = reports.tail and bus == 0
+        buses.append((joints, replace(reports, tail=has_tail)))
+    return buses
+
+
+# --- the check ----------------------------------------------------------------------------------------------------
 
 
 def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
-    """The load of every bus. Raises ConfigError, with the sum and alternatives that fit, when one is too high.
+    """Check that every bus can carry its joints.
 
-    Too high is more than `MAX_LOAD` of the time, or a single period that is too long.
+    Returns:
+        The load of every bus, as a fraction of its time.
+
+    Raises:
+        ConfigError: a load is above `MAX_LOAD`, or a single period is too long. The error has the sum, and
+            alternatives that fit.
     """
-    buses = each_bus(config, settings)
-    joints, loads = [count for count, _ in buses], [load(*bus) for bus in buses]
-    worst = max(range(len(loads)), key=lambda i: loads[i])
-    if loads[worst] > MAX_LOAD:
+    buses = plan_buses(config, settings)
+    joints = [count for count, _ in buses]
+    loads = [bus_load(*bus) for bus in buses]
+    fullest = max(range(len(loads)), key=lambda i: loads[i])
+    if loads[fullest] > MAX_LOAD:
         raise ConfigError(
-            f"{joints[worst]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, worst)}:",
-            *arithmetic(*buses[worst]),
-            what_fits(joints, config, settings),
+            f"{joints[fullest]} joints at {config.rate_hz:g} Hz do not fit on {_bus_name(settings, fullest)}:",
+            *explain_load(*buses[fullest]),
+            suggest_alternatives(joints, config, settings),
         )
-    longest = max(range(len(buses)), key=lambda i: busiest_s(*buses[i]))
-    needed_s = busiest_s(*buses[longest])
-    if needed_s * config.rate_hz > 1:
+    periods_s = [busiest_period_s(*bus) for bus in buses]
+    longest = max(range(len(buses)), key=lambda i: periods_s[i])
+    if periods_s[longest] * config.rate_hz > 1:
         raise ConfigError(
-            f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, longest)}: a period "
-            f"with force reports takes {needed_s * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.",
-            what_fits(joints, config, settings),
+            f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_bus_name(settings, longest)}: a period "
+            f"with force reports takes {periods_s[longest] * 1000:.2f} ms of bus time and lasts "
+            f"{1000 / config.rate_hz:.2f} ms.",
+            suggest_alternatives(joints, config, settings),
         )
     return loads
 
 
-def _name(settings: CanSettings, bus: int) -> str:
+def _bus_name(settings: CanSettings, bus: int) -> str:
     return settings.channels[bus] if settings.channels else "the virtual bus"
 
 
-def arithmetic(joints: int, reports: Reports) -> list[str]:
-    """The sum, line by line."""
+def explain_load(joints: int, reports: ReportSchedule) -> list[str]:
+    """Return the sum of a bus's load, one line for each kind of frame."""
     lines: list[str] = []
-    for stream in streams(joints, reports):
-        if stream.frames_per_s:
-            layout = codec()[stream.opcode]
-            bits = worst_bits(layout.length)
-            lines.append(
-                f"  {layout.name:<14}{stream.frames_per_s:7.0f} frames/s x {bits:3d} bits ({layout.length} bytes)"
-                f" = {100 * stream.bits_per_s / reports.bit_rate:5.1f} %"
-            )
-    total = 100 * load(joints, reports)
-    return [
-        *lines,
-        f"  together {total:.1f} % of {mbit(reports.bit_rate)} at worst-case stuffing; at most {MAX_LOAD:.0%}",
-    ]
+    for stream in list_streams(joints, reports):
+        if not stream.frames_per_s:
+            continue
+        layout = load_layouts()[stream.opcode]
+        bits = worst_frame_bits(layout.length)
+        percent = 100 * stream.bits_per_s / reports.bit_rate
+        lines.append(
+            f"  {layout.name:<14}{stream.frames_per_s:7.0f} frames/s x {bits:3d} bits ({layout.length} bytes)"
+            f" = {percent:5.1f} %"
+        )
+    total_percent = 100 * bus_load(joints, reports)
+    bit_rate = format_bit_rate(reports.bit_rate)
+    lines.append(f"  together {total_percent:.1f} % of {bit_rate} at worst-case stuffing; at most {MAX_LOAD:.0%}")
+    return lines
 
 
-def what_fits(joints: Sequence[int], config: RunConfig, settings: CanSettings) -> str:
-    """Alternatives that fit: a lower rate, more buses, fewer reports."""
-    fullest, total = max(joints), sum(joints)
-    reports = reports_of(config, settings)
-    ways = []
-    rate = max_rate_hz(fullest, config, settings)
-    if rate is not None:
-        ways.append(f"rate_hz = {rate} on {len(joints)} bus{'es' if len(joints) > 1 else ''}")
-    for buses in range(len(joints) + 1, min(total, 8) + 1):
-        if fits(ceil(total / buses), reports):
-            ways.append(f"{buses} channels with up to {ceil(total / buses)} joints each")
+def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: CanSettings) -> str:
+    """Return a sentence with alternatives that fit: a lower rate, more buses, fewer reports.
+
+    Args:
+        joints: number of joints on each bus.
+        config: the run.
+        settings: settings of the backend.
+    """
+    fullest = max(joints)
+    total = sum(joints)
+    reports = plan_reports(config, settings)
+    alternatives: list[str] = []
+
+    rate_hz = max_rate_hz(fullest, config, settings)
+    if rate_hz is not None:
+        buses = f"{len(joints)} bus" if len(joints) == 1 else f"{len(joints)} buses"
+        alternatives.append(f"rate_hz = {rate_hz} on {buses}")
+
+    for channels in range(len(joints) + 1, min(total, MAX_PROPOSED_BUSES) + 1):
+        joints_each = ceil(total / channels)
+        if is_feasible(joints_each, reports):
+            alternatives.append(f"{channels} channels with up to {joints_each} joints each")
             break
-    for times in (2, 4):
-        contact_every = times * reports.contact_every
-        if 0 < contact_every <= MAX_EVERY and fits(fullest, replace(reports, contact_every=contact_every)):
-            ways.append(f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}")
+
+    for factor in (2, 4):
+        contact_every = factor * reports.contact_every
+        if not 0 < contact_every <= MAX_EVERY:
+            continue
+        if is_feasible(fullest, replace(reports, contact_every=contact_every)):
+            alternatives.append(f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}")
             break
-    return "What would fit: " + ("; or ".join(ways) or "nothing on classic CAN") + "."
+
+    text = "; or ".join(alternatives) or "nothing on classic CAN"
+    return f"What would fit: {text}."
 
 
 def max_rate_hz(joints: int, config: RunConfig, settings: CanSettings) -> int | None:
-    """The highest integer rate below the run's at which this many joints fit on a bus; None when none does.
+    """Return the highest integer rate below the run's at which this many joints fit on a bus; None if there is none.
 
     Bisection does not work: at some lower rate reports may come at every Sync instead of every second one.
     """
     for rate_hz in range(ceil(config.rate_hz) - 1, MIN_RATE_HZ - 1, -1):
-        if fits(joints, reports_at(rate_hz, config, settings)):
+        if is_feasible(joints, plan_reports_at(rate_hz, config, settings)):
             return rate_hz
     return None
-
-
-def each_bus(config: RunConfig, settings: CanSettings) -> list[tuple[int, Reports]]:
-    """Joints and reports of every bus, tail to head: only the first carries TailContact. Raises ConfigError."""
-    reports = reports_of(config, settings)
-    return [(count, replace(reports, tail=reports.tail and i == 0)) for i, count in enumerate(shares(config, settings))]

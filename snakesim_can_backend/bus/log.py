@@ -1,6 +1,7 @@
-"""A log of all frames on the wires, in candump's format: `(1700000000.000000) can0 105#00112233 R`.
+"""Writes a log of all frames on the wires, in candump's format: `(1700000000.000000) can0 105#00112233 R`.
 
-R was received, T transmitted; of CAN FD `can0 00008001##1...`. Frames that were read together have one time.
+R marks received frames, T transmitted ones. CAN FD is written as `can0 00008001##1...`. Frames that were read together
+have the same time.
 """
 
 import contextlib
@@ -14,13 +15,22 @@ from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import ConfigError
 
 FLUSH_BYTES = 1 << 16
-FD_MARK = "##1"  # a second bit rate
+CLASSIC_MARK = "#"
+FD_MARK = "##1"  # the digit is the flags; 1: the data had a second bit rate
 
 _log = logging.getLogger("snakesim.can")
 
 
 def open_log(path: Path, backend: str = "can") -> TextIO:
-    """Begin a log. backend: whose setting it is. Raises ConfigError."""
+    """Open a new log file.
+
+    Args:
+        path: the file.
+        backend: section of the settings that names the file, for the error message.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
     try:
         return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)
     except OSError as error:
@@ -28,43 +38,48 @@ def open_log(path: Path, backend: str = "can") -> TextIO:
 
 
 class LoggedWire:
-    """A wire that keeps a log. Several may share one file."""
+    """A wire that logs its frames. Several may share one file."""
 
     def __init__(self, wire: Wire, log: TextIO, *, fd: bool = False) -> None:
-        self._wire, self._log, self._mark = wire, log, FD_MARK if fd else "#"
+        self._wire = wire
+        self._log = log
+        self._mark = FD_MARK if fd else CLASSIC_MARK
+        self._is_full = False  # the disk
         self.channel = wire.channel
-        # As the wire does. Injected faults: frames that do not reach it are not logged.
-        self.errors, self.fileno, self.idle, self.inject = wire.errors, wire.fileno, wire.idle, wire.inject
-        self._full = False
+        # Everything else is done by the wire itself. Frames that an injected fault stops are not logged.
+        self.errors = wire.errors
+        self.fileno = wire.fileno
+        self.idle = wire.idle
+        self.inject = wire.inject
 
     def send(self, frame: Frame) -> bool:
-        """Send, and log accepted frames."""
-        taken = self._wire.send(frame)
-        if taken:
+        """Send a frame, and log it if the bus accepted it."""
+        accepted = self._wire.send(frame)
+        if accepted:
             self._write([frame], "T")
-        return taken
+        return accepted
 
     def receive(self) -> list[Frame]:
-        """Receive, and log all frames."""
+        """Return all received frames, and log them."""
         frames = self._wire.receive()
         if frames:
             self._write(frames, "R")
         return frames
 
     def close(self) -> None:
-        """Close the wire; the log is complete."""
+        """Complete the log, and close the wire."""
         with contextlib.suppress(OSError):
             self._log.flush()
         self._wire.close()
 
     def _write(self, frames: list[Frame], direction: str) -> None:
-        if self._full:
+        if self._is_full:
             return
-        place = f"({time.time():.6f}) {self.channel}"
+        prefix = f"({time.time():.6f}) {self.channel}"
         try:
             for frame in frames:
-                name = f"{frame.id:03X}" if frame.id <= LAST_STANDARD_ID else f"{frame.id:08X}"
-                self._log.write(f"{place} {name}{self._mark}{frame.data.hex().upper()} {direction}\n")
+                identifier = f"{frame.id:03X}" if frame.id <= LAST_STANDARD_ID else f"{frame.id:08X}"
+                self._log.write(f"{prefix} {identifier}{self._mark}{frame.data.hex().upper()} {direction}\n")
         except OSError as error:  # a full disk ends the log, and nothing else
-            self._full = True
+            self._is_full = True
             _log.warning("the bus log ends here: %s", error.strerror)

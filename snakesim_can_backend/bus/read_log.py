@@ -1,4 +1,4 @@
-"""Read a log of a CAN bus: every frame that is whole, and which lines are not.
+"""Reads a log of a CAN bus: every whole frame, and which lines are no whole frames.
 
 `.log` is what candump writes: `candump -L`, as the driver's own log is, or what it prints on a terminal, with any of
 its times or none. `.asc` and `.blf` are read by python-can. A log that ends in the middle of a line, as after a power
@@ -21,13 +21,15 @@ import can
 from snakesim_hal.base.errors import ConfigError
 
 KINDS = ".log, .asc, .blf"
-NAMED = 3  # dropped lines that are named; the others are counted
-SHOWN = 60  # characters of a dropped line
-LOOKED_AT = 500  # lines, to know whether their times are differences
+MAX_NAMED_LINES = 3  # dropped lines that are shown; the others are counted
+MAX_SHOWN_CHARACTERS = 60  # of a dropped line
+MAX_ERROR_CHARACTERS = 200  # of an error of python-can
+PROBED_LINES = 500  # to know whether their times are differences
 STEP_S = 1e-6  # between frames of a log without times
-ERROR_FLAG, EXTENDED_FLAG_DIGITS = 0x20000000, 8
-ID_BITS = 0x1FFFFFFF
-FAST_DATA = 1  # of the flags of CAN FD: the data had a second bit rate
+ERROR_FLAG = 0x20000000  # in the id of an error frame
+ID_MASK = 0x1FFFFFFF  # id without flags
+EXTENDED_ID_DIGITS = 8  # a shorter id has 11 bits
+FAST_DATA = 1  # flag of CAN FD: the data had a second bit rate
 
 COMPACT = re.compile(  # (1700000000.000000) can0 105#00112233 R
     r"\((?P<time>\d+\.\d+)\)\s+(?P<channel>\S+)\s+(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
@@ -62,10 +64,10 @@ class BusLog:
         self.has_times = True
 
     def __iter__(self) -> Iterator[can.Message]:
-        """Every whole frame. Raises ConfigError for a file without any, if it is not empty."""
+        """Yield every whole frame. Raises ConfigError for a file without any, if it is not empty."""
+        messages = self._read_candump() if self._is_candump() else self._read_by_python_can()
         frames = 0
-        read = self._read_candump if self._is_candump() else self._read_by_python_can
-        for message in read():
+        for message in messages:
             frames += 1
             yield message
         if frames == 0 and self.dropped:
@@ -74,13 +76,13 @@ class BusLog:
     def report(self) -> Iterator[str]:
         """Yield lines for a person: what was left out, and what is not known of the rest."""
         if self.dropped_count:
-            named = "; ".join(map(str, self.dropped))
-            unnamed = self.dropped_count - len(self.dropped)
-            more = f"; and {unnamed} more" if unnamed else ""
-            lines = "1 line is no whole frame and was"
+            subject = "1 line is no whole frame and was"
             if self.dropped_count > 1:
-                lines = f"{self.dropped_count} lines are no whole frames and were"
-            yield f"{lines} left out: {named}{more}"
+                subject = f"{self.dropped_count} lines are no whole frames and were"
+            named = "; ".join(str(line) for line in self.dropped)
+            unnamed_count = self.dropped_count - len(self.dropped)
+            more = f"; and {unnamed_count} more" if unnamed_count else ""
+            yield f"{subject} left out: {named}{more}"
         if not self.has_times:
             yield "the frames have no times (candump -t a has): an answer counts as in time until the next Sync"
 
@@ -96,7 +98,7 @@ class BusLog:
         for number, line in self._lines():
             if not line.strip():
                 continue
-            message = read_line(line)
+            message = parse_line(line)
             if message is None:
                 self._drop(f"line {number}", line)
                 continue
@@ -108,11 +110,17 @@ class BusLog:
             yield message
 
     def _times_are_steps(self) -> bool:
-        """Whether times are since the frame before, as `candump -t d` prints them: they go back now and then."""
-        read = (read_line(line) for _, line in islice(self._lines(), LOOKED_AT))
-        times = [message.timestamp for message in read if message is not None]
-        self.has_times = not times or any(times)
-        return any(after < before for before, after in pairwise(times))
+        """Return whether each time is the one since the frame before; also set `has_times`.
+
+        `candump -t d` prints such times. They are differences, so that some of them are smaller than the one before.
+        """
+        times_s: list[float] = []
+        for _, line in islice(self._lines(), PROBED_LINES):
+            message = parse_line(line)
+            if message is not None:
+                times_s.append(message.timestamp)
+        self.has_times = not times_s or any(times_s)
+        return any(after_s < before_s for before_s, after_s in pairwise(times_s))
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         number = 0
@@ -141,57 +149,72 @@ class BusLog:
                     yield message
         except Exception as error:  # noqa: BLE001 - a damaged file makes python-can's readers raise almost anything
             if frames == 0:
-                raise self._refusal(str(error)[:200]) from None
+                raise self._refusal(str(error)[:MAX_ERROR_CHARACTERS]) from None
             self._drop(f"after frame {frames}", str(error) or type(error).__name__)
 
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _drop(self, where: str, text: str) -> None:
         self.dropped_count += 1
-        if len(self.dropped) < NAMED:
-            shown = repr(text.rstrip("\r\n"))
-            self.dropped.append(DroppedLine(where, shown if len(shown) <= SHOWN else f"{shown[:SHOWN]}..."))
+        if len(self.dropped) >= MAX_NAMED_LINES:
+            return
+        shown = repr(text.rstrip("\r\n"))
+        if len(shown) > MAX_SHOWN_CHARACTERS:
+            shown = f"{shown[:MAX_SHOWN_CHARACTERS]}..."
+        self.dropped.append(DroppedLine(where, shown))
 
-    def _refusal(self, why: str) -> ConfigError:
-        return ConfigError(f"{self.path} cannot be read as a log of a CAN bus ({KINDS}): {why}")
+    def _refusal(self, reason: str) -> ConfigError:
+        return ConfigError(f"{self.path} cannot be read as a log of a CAN bus ({KINDS}): {reason}")
 
 
-def read_line(line: str) -> can.Message | None:
-    """Return the frame of a line of candump; None if it is not whole. A time of 0: the line has none."""
-    whole = line.endswith("\n")
-    if found := COMPACT.fullmatch(line):
-        # A line without its end may have lost bytes; the direction comes after them.
-        return _compact(found) if whole or found["direction"] else None
-    if found := PRINTED.fullmatch(line.rstrip("\r\n")):
-        return _printed(found)
+def parse_line(line: str) -> can.Message | None:
+    """Return the frame of a line of candump; None if it is not whole. A time of 0 means that the line has none."""
+    compact = COMPACT.fullmatch(line)
+    if compact is not None:
+        # A line without its end may have lost bytes, but not if the direction is there, which comes after them.
+        is_whole = line.endswith("\n") or compact["direction"] is not None
+        return _parse_compact(compact) if is_whole else None
+    printed = PRINTED.fullmatch(line.rstrip("\r\n"))
+    if printed is not None:
+        return _parse_printed(printed)
     return None
 
 
-def _compact(found: re.Match[str]) -> can.Message:
-    data = bytes.fromhex(found["data"] or "")
-    return _message(
-        found,
-        float(found["time"]),
+def _parse_compact(match: re.Match[str]) -> can.Message:
+    """Return the frame of a line of `candump -L`."""
+    data = bytes.fromhex(match["data"] or "")
+    flags = match["flags"]  # such as "#1"; None: classic CAN
+    has_fast_data = flags is not None and bool(int(flags[1:], 16) & FAST_DATA)
+    remote = match["remote"]  # such as "R8", with the length; None: a data frame
+    length = len(data)
+    if remote:
+        length = int(remote[1:] or 0)
+    return _make_message(
+        match,
+        float(match["time"]),
         data,
-        is_fd=found["flags"] is not None,
-        has_fast_data=found["flags"] is not None and bool(int(found["flags"][1:], 16) & FAST_DATA),
-        is_remote=found["remote"] is not None,
-        length=int(found["remote"][1:] or 0) if found["remote"] else len(data),
+        is_fd=flags is not None,
+        has_fast_data=has_fast_data,
+        is_remote=remote is not None,
+        length=length,
     )
 
 
-def _printed(found: re.Match[str]) -> can.Message | None:
-    length, rest = int(found["length"]), found["rest"]
-    is_remote = rest.strip().startswith("remote request")
-    data = bytes.fromhex("".join(BYTE.findall(rest)[:length]))
-    time_s = _time_s(found["time"])
+def _parse_printed(match: re.Match[str]) -> can.Message | None:
+    """Return the frame of a line that candump prints on a terminal; None if bytes are missing."""
+    length = int(match["length"])
+    is_fd = len(match["length"]) > 1
+    is_remote = match["rest"].strip().startswith("remote request")
+    hex_bytes = BYTE.findall(match["rest"])[:length]
+    data = bytes.fromhex("".join(hex_bytes))
+    time_s = _parse_time(match["time"])
     if time_s is None or (len(data) < length and not is_remote):
         return None
-    return _message(found, time_s, data, is_fd=len(found["length"]) > 1, is_remote=is_remote, length=length)
+    return _make_message(match, time_s, data, is_fd=is_fd, is_remote=is_remote, length=length)
 
 
-def _time_s(text: str | None) -> float | None:
-    """Return a time as candump prints it: seconds, or a date; 0: there is none. None: it is none of these."""
+def _parse_time(text: str | None) -> float | None:
+    """Return a time that candump prints, seconds or a date, in seconds; 0 if there is none, None for anything else."""
     if text is None:
         return 0.0
     try:
@@ -206,8 +229,8 @@ def _time_s(text: str | None) -> float | None:
         return None
 
 
-def _message(
-    found: re.Match[str],
+def _make_message(
+    match: re.Match[str],
     time_s: float,
     data: bytes,
     *,
@@ -216,19 +239,20 @@ def _message(
     length: int,
     has_fast_data: bool = False,
 ) -> can.Message:
-    number = int(found["id"], 16)
-    is_extended = len(found["id"]) == EXTENDED_FLAG_DIGITS
-    if is_extended and number & ERROR_FLAG:
-        return can.Message(timestamp=time_s, channel=found["channel"], is_error_frame=True)
+    """Return the frame with the id, channel and direction of a line."""
+    identifier = int(match["id"], 16)
+    is_extended = len(match["id"]) == EXTENDED_ID_DIGITS
+    if is_extended and identifier & ERROR_FLAG:
+        return can.Message(timestamp=time_s, channel=match["channel"], is_error_frame=True)
     return can.Message(
         timestamp=time_s,
-        arbitration_id=number & ID_BITS,
+        arbitration_id=identifier & ID_MASK,
         is_extended_id=is_extended,
         is_remote_frame=is_remote,
         is_fd=is_fd,
         bitrate_switch=has_fast_data,
-        is_rx=found["direction"] != "T",
+        is_rx=match["direction"] != "T",
         dlc=length,
         data=None if is_remote else data,
-        channel=found["channel"],
+        channel=match["channel"],
     )

@@ -7,8 +7,8 @@ from typing import Annotated, Any, ClassVar
 from msgspec import Meta
 
 from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
-from snakesim_can_backend.bus.bus import VirtualWire, Wire, virtual_channel
-from snakesim_can_backend.bus.load import mbit, worst_s
+from snakesim_can_backend.bus.bus import VirtualWire, Wire, make_virtual_channel
+from snakesim_can_backend.bus.load import format_bit_rate, worst_frame_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
 from snakesim_can_backend.can_drives.emulator import CanEmulator
@@ -104,16 +104,16 @@ class CanDriveBackend(DriverTypeBackend):
         """Return the load of the fullest bus."""
 
         def frame_s(length: int) -> float:
-            return worst_s(length, settings.bit_rate, settings.fd_rate)
+            return worst_frame_s(length, settings.bit_rate, settings.fd_rate)
 
         return compute_load(cls.traffic, assign_ports(joints, settings.channels), rate_hz, frame_s)
 
     @staticmethod
     def describe_rates(settings: Any) -> str:
         """Return the bit rates in words."""
-        rates = mbit(settings.bit_rate)
+        rates = format_bit_rate(settings.bit_rate)
         if settings.fd_rate:
-            rates += f" with data at {mbit(settings.fd_rate)}"
+            rates += f" with data at {format_bit_rate(settings.fd_rate)}"
         return rates
 
     @classmethod
@@ -177,5 +177,5 @@ class CanDriveBackend(DriverTypeBackend):
             )
             return cls.drives_class(context)
 
-        channels = settings.channels if body is None else [virtual_channel()]
+        channels = settings.channels if body is None else [make_virtual_channel()]
         return group_by_port(joints, settings, channels, open_drives)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from snakesim_can_backend.bus.bus import VirtualPeer, Wire, arrivals, inject_into, wait
+from snakesim_can_backend.bus.bus import VirtualPeer, Wire, inject_into, receive_frames, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import FAULTS
@@ -372,5 +372,5 @@ class CanDrives(ABC):
                 for i in drives:
                     request(i)
                 next_request_s = now_s + REQUEST_PERIOD_S
-            for _, frame in arrivals([self.wire]):
+            for _, frame in receive_frames([self.wire]):
                 self.handle_frame(frame)

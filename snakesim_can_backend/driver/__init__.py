@@ -1,8 +1,12 @@
-"""The backend `can`.
+"""The backend `can`: the driver of joint modules on CAN buses.
 
-`backend`     CanBackend, on the kit of `snakesim_drivers.kit`      `modules`  what a tick says to modules
-`bring_up`    finds and checks every module, enabling none; `parameters` checks their parameters
-`reports`     the modules' reports as arrays; `module_monitor` detects module and bus faults
-`sensors`     IMU, contacts, power
+`backend`         `CanBackend`, on the kit of `snakesim_drivers.kit`
+`modules`         sends Syncs, setpoints and commands, and collects the answers
+`bring_up`        finds and checks every module, and writes its parameters; enables none
+`parameters`      plans the parameters, and checks the robot file against protocol and modules
+`reports`         the newest reports of all modules, in raw numbers
+`module_monitor`  detects faults of modules and buses
+`sensors`         makes the sensor messages: joint state, contacts, IMU, power
 `own_emulators`   emulated joint modules, if the scenario asks for them
+`offline`         replays a log of the bus
 """

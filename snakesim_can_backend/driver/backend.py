@@ -1,11 +1,11 @@
-"""The backend `can`: joint modules as a driver type of the driver kit, with sensors of their own."""
+"""The backend `can`: joint modules as a driver type of the driver kit, with contact sensors and IMUs."""
 
 from snakesim_can_backend.bus.adapter import check_channels
-from snakesim_can_backend.bus.load import check_load, reports_of
-from snakesim_can_backend.driver.modules import Modules
+from snakesim_can_backend.bus.load import check_load, plan_reports
+from snakesim_can_backend.driver.modules import JointModules
 from snakesim_can_backend.driver.own_emulators import check_emulators, check_faults
 from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog
-from snakesim_can_backend.driver.sensors import Sensors, described
+from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import check_mounted
 from snakesim_drivers.kit.drive_backend import DriveBackend, DriverClock
@@ -24,53 +24,63 @@ class CanBackend(DriveBackend):
     """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
 
     Settings = CanSettings
-    reset_grace_cycles = 0  # the monitor has its own grace for each kind of fault
-    modules: Modules
-    _sensors: Sensors
+    clear_grace = 0  # the monitor itself gives modules time to follow a clear
+    modules: JointModules
+    _sample_builder: SampleBuilder
 
     @staticmethod
     def check(config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
-        """Real modules support real time only; emulators that it starts support lockstep. Raises ConfigError."""
+        """Check that a run is possible with these settings.
+
+        Returns:
+            The supported clock modes: real time only on real modules, and lockstep too on emulators of this driver.
+
+        Raises:
+            ConfigError: it is not possible; the message says why, and what to change.
+        """
+        has_emulators = settings.emulators_run != "none"
         check_load(config, settings)
         check_gains(config.robot)
         check_drives(config.robot, settings)
-        check_mounted(
-            config.robot, config.backend_section, settings.mounted, emulators=settings.emulators_run != "none"
-        )
+        check_mounted(config.robot, config.backend_section, settings.mounted, emulators=has_emulators)
         check_ratings(config.robot)
         check_watchdog(config, settings)
         check_pose(config, settings.pose_listen)
         check_emulators(config, settings)
         check_faults(config, settings)
         check_channels(settings.channels)
-        return ("realtime",) if settings.emulators_run == "none" else ("lockstep", "realtime")
+        if has_emulators:
+            return ("lockstep", "realtime")
+        return ("realtime",)
 
     def __init__(self, config: RunConfig, settings: CanSettings) -> None:
         """Open the buses and find every module; nothing is enabled. Raises ConfigError and BackendError."""
         self.check(config, settings)
-        clock, emulators = DriverClock(config), settings.emulators_run != "none"
+        clock = DriverClock(config)
+        has_emulators = settings.emulators_run != "none"
         mocap = make_receiver(
-            config, settings.pose_listen, emulators=emulators, clock=lambda _timestamp_ns: clock.now_ns()
+            config, settings.pose_listen, emulators=has_emulators, clock=lambda _timestamp_ns: clock.now_ns()
         )
-        self._reports = reports_of(config, settings)
+        self._reports = plan_reports(config, settings)
 
-        def make_modules(readings: DriveReadings) -> Modules:
+        def make_modules(readings: DriveReadings) -> JointModules:
             pose = mocap.address if mocap is not None else None
-            self.modules = Modules(config, settings, clock, pose, readings)
-            self._sensors = Sensors(config, self._reports, self.modules.reading, mocap)
+            self.modules = JointModules(config, settings, clock, pose, readings)
+            self._sample_builder = SampleBuilder(config, self._reports, self.modules.reading, mocap)
             return self.modules
 
+        hardware = "+".join(settings.channels)
         watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
-        super().__init__(config, NAME, "+".join(settings.channels), clock, mocap, make_modules, watchdogs_s)
+        super().__init__(config, NAME, hardware, clock, mocap, make_modules, watchdogs_s)
 
-    def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+    def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)
 
-    def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
-        return self._sensors.sample(tick, timestamp_ns)
+    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
+        return self._sample_builder.make_samples(tick, timestamp_ns)
 
-    def _find_silent_drives(self) -> list[Finding]:
-        return []  # the monitor finds it, by the answers to Syncs
+    def _silent(self) -> list[Finding]:
+        return []  # the monitor finds silent modules, by their answers to Syncs
 
-    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
-        return described(config, self._reports, pose_delay_s=pose_delay_s)
+    def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+        return describe_sensors(config, self._reports, pose_delay_s=pose_delay_s)

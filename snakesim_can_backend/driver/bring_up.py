@@ -1,6 +1,6 @@
-"""Find every module, check it, and write its parameters. Enables nothing: when it is done all motors are off.
+"""Finds every module, checks it, and writes its parameters. It enables nothing: afterwards all motors are off.
 
-All errors are reported at once, so that a person can fix them in one go.
+All errors of the robot are reported together, so that a person can fix them in one go.
 """
 
 import time
@@ -8,29 +8,29 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from snakesim_can_backend.bus.bus import Wire, arrivals
+from snakesim_can_backend.bus.bus import Wire, receive_frames
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
-    VERSION,
-    Action,
+    PROTOCOL_VERSION,
+    CommandAction,
     Frame,
+    ModuleParameter,
     Opcode,
-    Operation,
-    Parameter,
-    Result,
-    node_of,
-    opcode_of,
+    ParameterOperation,
+    ParameterResult,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.base.errors import BackendError
 
-ASK_EVERY_S = 0.1
+ASK_EVERY_S = 0.1  # until a request is repeated
 LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id may answer later
 
 
 @dataclass(frozen=True)
-class Identity:
+class ModuleIdentity:
     """A module's answer to `identify`."""
 
     node: int
@@ -43,132 +43,57 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Bus:
+class ModuleBus:
     """One wire, and the nodes that belong on it."""
 
     wire: Wire
     nodes: range
 
 
-def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None] | None = None) -> list[Identity]:
-    """Send `identify` until all expected nodes have answered, or the timeout. Two modules may share an id."""
-    read = codec()[Opcode.IDENTITY].values
-    found: dict[tuple[str, int, int], Identity] = {}
-    wanted = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
+# --- finding modules ----------------------------------------------------------------------------------------------
+
+
+def find_modules(
+    buses: Sequence[ModuleBus], limit_s: float, on_frame: Callable[[Frame], None] | None = None
+) -> list[ModuleIdentity]:
+    """Send `identify` until all expected nodes have answered, or the time is over.
+
+    Args:
+        buses: the buses, with the nodes that are expected there.
+        limit_s: how long to wait at most.
+        on_frame: gets all frames that are no answers.
+
+    Returns:
+        Everything that answered, sorted by node. Two modules may have the same id.
+    """
+    layout = load_layouts()[Opcode.IDENTITY]
+    identities: dict[tuple[str, int, int], ModuleIdentity] = {}  # by channel, node and serial number
+    missing = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
-    end = time.monotonic() + limit_s
-    ask_at = 0.0
+    end_s = time.monotonic() + limit_s
+    ask_at_s = 0.0
     complete = False
-    while (now := time.monotonic()) < end:
-        if now >= ask_at:
+    while (now_s := time.monotonic()) < end_s:
+        if now_s >= ask_at_s:
             for wire in wires:
-                wire.send(commands.command(Action.IDENTIFY))
-            ask_at = now + ASK_EVERY_S
-        for wire, frame in arrivals(wires, end - now):
-            if opcode_of(frame.id) == Opcode.IDENTITY and len(frame.data) == codec()[Opcode.IDENTITY].length:
-                identity = _identity(wire.channel, node_of(frame.id), read(frame.data))
-                found[identity.channel, identity.node, identity.serial] = identity
+                wire.send(commands.make_command(CommandAction.IDENTIFY))
+            ask_at_s = now_s + ASK_EVERY_S
+        for wire, frame in receive_frames(wires, end_s - now_s):
+            is_identity = parse_opcode(frame.id) == Opcode.IDENTITY and len(frame.data) == layout.length
+            if is_identity:
+                identity = _make_identity(wire.channel, parse_node(frame.id), layout.decode(frame.data))
+                identities[identity.channel, identity.node, identity.serial] = identity
+                missing.discard((identity.channel, identity.node))
             elif on_frame is not None:
                 on_frame(frame)
-        if not complete and wanted <= {(i.channel, i.node) for i in found.values()}:
-            complete, end = True, min(end, time.monotonic() + LISTEN_ON_S)
-    return sorted(found.values(), key=lambda i: (i.node, i.channel, i.serial))
+        if not complete and not missing:
+            complete = True
+            end_s = min(end_s, time.monotonic() + LISTEN_ON_S)
+    return sorted(identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial))
 
 
-def discovery_errors(
-    buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence[str], *, lockstep: bool
-) -> list[str]:
-    """Errors of the discovered nodes; empty when the robot is complete."""
-    wrong: list[str] = []
-    home = {node: bus.wire.channel for bus in buses for node in bus.nodes}
-    by_node: dict[int, list[Identity]] = defaultdict(list)
-    for identity in found:
-        by_node[identity.node].append(identity)
-    for node, channel in home.items():
-        who = f"{joints[node - 1]} (node {node} on {channel})"
-        here = [i for i in by_node[node] if i.channel == channel]
-        if not here:
-            elsewhere = f"; a node {node} answers on {by_node[node][0].channel}" if by_node[node] else ""
-            wrong.append(f"{who} does not answer{elsewhere}")
-        if len(here) > 1:
-            serials = " and ".join(f"{i.serial:08X}" for i in here)
-            wrong.append(f"{who} answers {len(here)} times, serials {serials}: give each module its own node id")
-        strays = [i for i in by_node[node] if here and i.channel != channel]
-        wrong += [
-            f"{who} is duplicated on {i.channel}, serial {i.serial:08X}: give that one another node id" for i in strays
-        ]
-        for identity in here:
-            if identity.protocol != VERSION:
-                wrong.append(f"{who} has protocol version {identity.protocol}, this driver {VERSION}: update one")
-            if lockstep and not identity.stepped:
-                wrong.append(f"{who} does not support lockstep: use --clock-mode realtime")
-            if identity.stepped and not lockstep:
-                wrong.append(f"{who} is an emulator whose time stands still between Syncs: start it without --stepped")
-    wrong += [
-        f"node {i.node} with serial {i.serial:08X} on {i.channel} is not a joint of this robot"
-        for i in found
-        if i.node not in home
-    ]
-    return wrong
-
-
-def configure(
-    buses: Sequence[Bus],
-    wanted: Mapping[int, Mapping[Parameter, float]],
-    limit_s: float,
-    on_frame: Callable[[Frame], None] | None = None,
-) -> dict[int, dict[Parameter, float]]:
-    """Write each node's parameters, read the others, and return the present values. Raises BackendError."""
-    wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
-    due = {node: list(Parameter) for node in wanted}
-    in_force: dict[int, dict[Parameter, float]] = {node: {} for node in wanted}
-    asked_at: dict[int, float] = {}
-    wires = [bus.wire for bus in buses]
-    end = time.monotonic() + limit_s
-    request, answers = codec()[Opcode.PARAMETER_REQUEST], codec()[Opcode.PARAMETER_ANSWER]
-    read, answer_length = answers.values, answers.length
-    while due:
-        now = time.monotonic()
-        if now > end:
-            raise BackendError(f"no answer about parameters from node {', '.join(map(str, due))} within {limit_s:g} s")
-        for node, left in due.items():
-            if now - asked_at.get(node, -1.0) > ASK_EVERY_S:
-                value = wanted[node].get(left[0])
-                operation = Operation.READ if value is None else Operation.WRITE
-                frame = request.frame(node, index=left[0], operation=operation, value=value or 0.0)
-                if wire_of[node].send(frame):
-                    asked_at[node] = now
-        for _, frame in arrivals(wires):
-            node = node_of(frame.id)
-            known = opcode_of(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
-            if not known or not due.get(node):
-                if on_frame is not None:
-                    on_frame(frame)
-                continue
-            answer = read(frame.data)
-            if answer["index"] != due[node][0]:
-                continue
-            parameter = due[node].pop(0)
-            asked_at.pop(node, None)
-            _check(node, parameter, wanted[node].get(parameter), int(answer["result"]))
-            in_force[node][parameter] = answer["value"]
-        due = {node: left for node, left in due.items() if left}
-    return in_force
-
-
-def _check(node: int, parameter: Parameter, asked: float | None, result: int) -> None:
-    if result == Result.DONE:
-        return
-    allowed = PARAMETERS[parameter]
-    why = Result(result).name.lower().replace("_", " ") if result < len(Result) else f"result {result}"
-    raise BackendError(
-        f"node {node} refuses parameter {parameter.name.lower()} = {asked} {allowed.unit}: "
-        f"{why} (allowed: {allowed.low:g} to {allowed.high:g})"
-    )
-
-
-def _identity(channel: str, node: int, values: Mapping[str, float]) -> Identity:
-    return Identity(
+def _make_identity(channel: str, node: int, values: Mapping[str, float]) -> ModuleIdentity:
+    return ModuleIdentity(
         node=node,
         channel=channel,
         serial=int(values["serial"]),
@@ -176,4 +101,150 @@ def _identity(channel: str, node: int, values: Mapping[str, float]) -> Identity:
         protocol=int(values["protocol"]),
         emulated=bool(values["emulated"]),
         stepped=bool(values["stepped"]),
+    )
+
+
+def discovery_errors(
+    buses: Sequence[ModuleBus], found: Sequence[ModuleIdentity], joints: Sequence[str], *, lockstep: bool
+) -> list[str]:
+    """Return what is wrong with the modules that answered; nothing if the robot is complete.
+
+    Args:
+        buses: the buses, with the nodes that are expected there.
+        found: the modules that answered.
+        joints: names of the joints, tail to head.
+        lockstep: whether the run is in lockstep, which only stepped emulators support.
+    """
+    errors: list[str] = []
+    channel_of = {node: bus.wire.channel for bus in buses for node in bus.nodes}
+    by_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
+    for identity in found:
+        by_node[identity.node].append(identity)
+    for node, channel in channel_of.items():
+        subject = f"{joints[node - 1]} (node {node} on {channel})"
+        here = [identity for identity in by_node[node] if identity.channel == channel]
+        elsewhere = [identity for identity in by_node[node] if identity.channel != channel]
+        errors += _node_errors(subject, here, elsewhere)
+        for identity in here:
+            errors += _identity_errors(subject, identity, lockstep=lockstep)
+    for identity in found:
+        if identity.node not in channel_of:
+            errors.append(
+                f"node {identity.node} with serial {identity.serial:08X} on {identity.channel} is not a joint of this "
+                f"robot"
+            )
+    return errors
+
+
+def _node_errors(subject: str, here: Sequence[ModuleIdentity], elsewhere: Sequence[ModuleIdentity]) -> list[str]:
+    """Return errors of a joint whose module is missing, or is there more than once."""
+    if not here:
+        hint = ""
+        if elsewhere:
+            hint = f"; a node {elsewhere[0].node} answers on {elsewhere[0].channel}"
+        return [f"{subject} does not answer{hint}"]
+    errors: list[str] = []
+    if len(here) > 1:
+        serials = " and ".join(f"{identity.serial:08X}" for identity in here)
+        errors.append(f"{subject} answers {len(here)} times, serials {serials}: give each module its own node id")
+    for identity in elsewhere:
+        errors.append(
+            f"{subject} is duplicated on {identity.channel}, serial {identity.serial:08X}: give that one another node "
+            f"id"
+        )
+    return errors
+
+
+def _identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) -> list[str]:
+    """Return errors of a module whose protocol or clock does not match this driver's."""
+    errors: list[str] = []
+    if identity.protocol != PROTOCOL_VERSION:
+        errors.append(f"{subject} has protocol version {identity.protocol}, this driver {PROTOCOL_VERSION}: update one")
+    if lockstep and not identity.stepped:
+        errors.append(f"{subject} does not support lockstep: use --clock-mode realtime")
+    if identity.stepped and not lockstep:
+        errors.append(f"{subject} is an emulator whose time stands still between Syncs: start it without --stepped")
+    return errors
+
+
+# --- parameters ---------------------------------------------------------------------------------------------------
+
+
+def configure_modules(
+    buses: Sequence[ModuleBus],
+    wanted: Mapping[int, Mapping[ModuleParameter, float]],
+    limit_s: float,
+    on_frame: Callable[[Frame], None] | None = None,
+) -> dict[int, dict[ModuleParameter, float]]:
+    """Write parameters to modules, and read all others.
+
+    Every module gets one request at a time, so that each answer is known to be that of the newest request.
+
+    Args:
+        buses: the buses, with the nodes on them.
+        wanted: parameters to write, by node.
+        limit_s: how long to wait at most.
+        on_frame: gets all frames that are no expected answers.
+
+    Returns:
+        The present value of every parameter, by node.
+
+    Raises:
+        BackendError: a module did not answer in time, or refused a value.
+    """
+    wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
+    wires = [bus.wire for bus in buses]
+    answer_layout = load_layouts()[Opcode.PARAMETER_ANSWER]
+    due = {node: list(ModuleParameter) for node in wanted}  # not answered yet
+    asked_at_s: dict[int, float] = {}  # when the request that a node has not answered was sent
+    in_force: dict[int, dict[ModuleParameter, float]] = {node: {} for node in wanted}
+    end_s = time.monotonic() + limit_s
+    while due:
+        now_s = time.monotonic()
+        if now_s > end_s:
+            raise BackendError(f"no answer about parameters from node {', '.join(map(str, due))} within {limit_s:g} s")
+        for node, parameters in due.items():
+            if now_s - asked_at_s.get(node, -1.0) > ASK_EVERY_S:
+                parameter = parameters[0]
+                request = _make_request(node, parameter, wanted[node].get(parameter))
+                if wire_of[node].send(request):
+                    asked_at_s[node] = now_s
+        for _, frame in receive_frames(wires):
+            node = parse_node(frame.id)
+            is_answer = parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_layout.length
+            if not is_answer or not due.get(node):
+                if on_frame is not None:
+                    on_frame(frame)
+                continue
+            answer = answer_layout.decode(frame.data)
+            parameter = due[node][0]
+            if answer["index"] != parameter:
+                continue
+            due[node].pop(0)
+            asked_at_s.pop(node, None)
+            _check_result(node, parameter, wanted[node].get(parameter), int(answer["result"]))
+            in_force[node][parameter] = answer["value"]
+        due = {node: parameters for node, parameters in due.items() if parameters}
+    return in_force
+
+
+def _make_request(node: int, parameter: ModuleParameter, value: float | None) -> Frame:
+    """Return a request to write a parameter, or to read it if there is no value."""
+    layout = load_layouts()[Opcode.PARAMETER_REQUEST]
+    if value is None:
+        return layout.encode(node, index=parameter, operation=ParameterOperation.READ, value=0.0)
+    return layout.encode(node, index=parameter, operation=ParameterOperation.WRITE, value=value)
+
+
+def _check_result(node: int, parameter: ModuleParameter, value: float | None, result: int) -> None:
+    """Raise BackendError if a module refused a request."""
+    if result == ParameterResult.DONE:
+        return
+    allowed = PARAMETERS[parameter]
+    reason = f"result {result}"
+    if result < len(ParameterResult):
+        reason = ParameterResult(result).name.lower().replace("_", " ")
+    raise BackendError(
+        f"node {node} refuses parameter {parameter.name.lower()} = {value} {allowed.unit}: "
+        f"{reason} (allowed: {allowed.low:g} to {allowed.high:g})"
     )

@@ -1,115 +1,160 @@
-"""Detects module and bus faults, and reports each with a cause that helps a person to locate it.
+"""Detects faults of joint modules and buses, and reports each with a cause that helps a person to locate it.
 
-Pure: checks a `Reading` and the bus errors once a tick. Each finding is reported once, until the robot's fault is
-cleared; a persistent one is then reported again.
+This module is pure: once in every control cycle it checks the `ModuleReports` and the bus errors. It reports each
+finding once, until the robot's fault is cleared; a finding that persists is then reported again.
 """
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS, BusError
-from snakesim_can_backend.driver.reports import Module, Reading
+from snakesim_can_backend.driver.reports import ModuleReports, ModuleStatus
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
 from snakesim_drivers.kit.findings import Finding, ReportedFindings
 from snakesim_hal.wire.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer
 IN_A_ROW = 3  # bad frames of one kind, or periods with a full bus, that make a fault instead of a glitch
-CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
-ARM_GRACE = 5  # Syncs that a module may take to follow an arming
-STRANGER_FRAMES = 3  # of an unexpected node, in consecutive ticks
-MAX_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
+CLEAR_GRACE = 5  # Syncs that a module may take to follow a Clear
+ARM_GRACE = 5  # Syncs that a module may take to follow an Arm
+UNKNOWN_NODE_FRAMES = 3  # of an unexpected node, in consecutive cycles
+MAX_FRAMES = 16  # of one module in a cycle; a healthy one sends 8 at most
 
-# Faults of one module that concern all others: two modules with one id, a full bus, water,
-# the common supply, an emergency; and a robot that is not complete does not start.
 NEVER_ARMED = "module_never_armed"
+# Faults of one module that concern all others: two modules with one id, a full bus, water, the common supply, and an
+# emergency. A robot that is not complete does not start, either.
 CONCERNS_ALL = {"duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED}
 
+Report = Callable[[str, str], None]  # gets the kind of a finding and its cause
 
-class Watch:
-    """Remembers which findings have been reported."""
+
+class ModuleMonitor:
+    """Finds what is wrong with modules and buses, and remembers which findings it has reported."""
 
     def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float) -> None:
-        """joints, channel_of: name and bus of every joint, tail to head."""
-        self._names, self._channels = joints, channel_of
-        self._period_s = period_s
-        self._told = ReportedFindings()
-        self._restarts = [0] * len(joints)
-        self._unarmed = [0] * len(joints)  # Syncs in a row in which a module was not armed although the robot was
-        self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime decreased
-        self._quiet_until = -1  # last Sync at which modules may not have followed a clear yet
-        self._armed_sync: int | None = None
-        self._unsent: dict[str, int] = {}  # ticks in a row in which a bus rejected frames
-        self._unasked: dict[str, int] = {}  # the newest Sync at which it did
-        self._down: set[str] = set()  # buses whose interface is
-        self._strangers: dict[int, int] = {}  # frames of unexpected nodes, in ticks in a row
-        self._restarted: set[int] = set()  # joints, until a clear
-        self._changed: set[int] = set()  # joints whose parameters may have changed
-        self._was_armed: set[int] = set()  # joints, in this arming
-        self.seen: dict[str, int] = {}  # bus errors that are not faults, counted
+        """Create the monitor of a robot.
 
-    def forget(self, sync: int) -> None:
-        """The fault was cleared: report persistent findings again once the modules have followed."""
-        self._told.reset()
+        Args:
+            joints: name of every joint, tail to head.
+            channel_of: channel of every joint's module, tail to head.
+            period_s: time between two Syncs.
+        """
+        self._names = joints
+        self._channels = channel_of
+        self._period_s = period_s
+        self._reported = ReportedFindings()
+
+        # By joint.
+        self._restarts = [0] * len(joints)  # uptime decreases that were seen before
+        self._unarmed = [0] * len(joints)  # consecutive Syncs in which a module did not follow the robot's arming
+        self._restart_sync: dict[int, int] = {}  # Sync at which a module's uptime decreased
+        self._restarted: set[int] = set()  # modules that restarted since the last clear
+        self._changed: set[int] = set()  # modules whose parameters may have changed
+        self._was_armed: set[int] = set()  # modules that have been armed in this arm session
+
+        # Of the robot.
+        self._quiet_until = -1  # last Sync at which modules may not have followed a clear yet
+        self._armed_sync: int | None = None  # first Sync of this arm session
+
+        # By bus.
+        self._unsent: dict[str, int] = {}  # consecutive cycles in which a bus rejected frames
+        self._unsent_sync: dict[str, int] = {}  # newest Sync at which a bus rejected frames
+        self._down: set[str] = set()  # buses whose interface is down
+        self._unknown_nodes: dict[int, int] = {}  # frames of unexpected nodes in consecutive cycles
+        self.minor_error_counts: dict[str, int] = {}  # bus errors that are not faults, by kind
+
+    def reset(self, sync: int) -> None:
+        """Report persistent findings again, because the robot's fault was cleared at this Sync.
+
+        The modules get CLEAR_GRACE Syncs to follow the clear.
+        """
+        self._reported.reset()
         self._restarted.clear()
         self._quiet_until = sync + CLEAR_GRACE
 
-    def look(
+    def find_faults(
         self,
-        reading: Reading,
+        reading: ModuleReports,
         lifecycle: LifecycleState,
         errors: Iterable[BusError] = (),
         unsent: Iterable[str] = (),
         unconfigured: Iterable[int] = (),
         isolated: Set[int] = frozenset(),
     ) -> list[Finding]:
-        """New findings.
+        """Return the findings of this cycle that were not reported before.
 
-        unsent: buses that rejected a frame of this tick; unconfigured: joints that must not be armed;
-        isolated: isolated joints, whose findings are ignored if they concern no other joint.
+        Args:
+            reading: reports of the modules.
+            lifecycle: state of the robot.
+            errors: bus errors since the last call.
+            unsent: channels of the buses that rejected a frame in this cycle.
+            unconfigured: joints that must not be armed, because their parameters may be wrong.
+            isolated: isolated joints; findings that concern only an isolated joint are ignored.
         """
+        unsent_channels = set(unsent)
+        self._follow_lifecycle(lifecycle, reading.sync)
+        for channel in unsent_channels:
+            self._unsent_sync[channel] = reading.sync
+
+        findings = self._check_buses(errors, unsent_channels)
+        findings += self._check_unknown_senders(reading)
+        for joint, module in enumerate(reading.modules):
+            findings += self._check_answers(joint, module, reading)
+            findings += self._check_state(joint, module, reading, lifecycle, isolated=joint in isolated)
+        if lifecycle == "armed":
+            findings += [self._unconfigured_finding(joint) for joint in unconfigured if joint not in isolated]
+        relevant = [finding for finding in findings if not (finding.alone and finding.joint in isolated)]
+        return self._reported.filter_new(relevant)
+
+    def take_changed(self) -> set[int]:
+        """Return the joints whose parameters may have changed since the last call."""
+        changed = self._changed
+        self._changed = set()
+        return changed
+
+    def _follow_lifecycle(self, lifecycle: LifecycleState, sync: int) -> None:
+        """Remember the first Sync of an arm session, and forget the session when it ends."""
         if lifecycle != "armed":
             self._armed_sync = None
             self._was_armed.clear()
         elif self._armed_sync is None:
-            self._armed_sync = reading.sync
-        self._unasked |= dict.fromkeys(unsent := set(unsent), reading.sync)
-        found = [*self._of_bus(errors, unsent), *self._of_strangers(reading)]
-        for i, module in enumerate(reading.modules):
-            found += self._of_answers(i, module, reading)
-            found += self._of_state(i, module, reading, lifecycle, aside=i in isolated)
-        if lifecycle == "armed":
-            found += [self._bare(i) for i in unconfigured if i not in isolated]
-        found = [finding for finding in found if not (finding.alone and finding.joint in isolated)]
-        return self._told.filter_new(found)
-
-    def take_changed(self) -> set[int]:
-        """Joints whose parameters may have changed since the last call."""
-        changed, self._changed = self._changed, set()
-        return changed
+            self._armed_sync = sync
 
     # --- one module -------------------------------------------------------------------------------------------
 
-    def _finding(self, i: int, module: Module, what: str, cause: str, *also: str) -> Finding:
-        """also: further kinds that apply."""
-        who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
-        return Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also)))
+    def _make_finding(
+        self, joint: int, module: ModuleStatus, what: str, cause: str, also: Sequence[str] = ()
+    ) -> Finding:
+        """Return a finding about a module; `also` names further kinds that apply."""
+        subject = f"{self._names[joint]} (node {module.node} on {self._channels[joint]})"
+        concerns_only_this_joint = CONCERNS_ALL.isdisjoint((what, *also))
+        return Finding(what, f"{subject} {cause}", joint, alone=concerns_only_this_joint)
 
-    def _of_answers(self, i: int, module: Module, reading: Reading) -> list[Finding]:
-        """Findings about its frames, or that there are none."""
-        found: list[Finding] = []
+    def _check_answers(self, joint: int, module: ModuleStatus, reading: ModuleReports) -> list[Finding]:
+        """Return findings about the frames of a module, or about their absence."""
+        findings: list[Finding] = []
 
         def report(what: str, cause: str) -> None:
-            found.append(self._finding(i, module, what, cause))
+            findings.append(self._make_finding(joint, module, what, cause))
 
-        if self._has_restarted(i, module, reading):
-            self._restarted.add(i)
-            self._changed.add(i)
-        if i in self._restarted:
-            up_s = module.uptime_ms / 1000
+        self._check_restart(joint, module, reading, report)
+        self._check_frames(module, reading, report)
+        if not findings:
+            self._check_silence(joint, module, reading, report)
+        return findings
+
+    def _check_restart(self, joint: int, module: ModuleStatus, reading: ModuleReports, report: Report) -> None:
+        if self._has_restarted(joint, module, reading):
+            self._restarted.add(joint)
+            self._changed.add(joint)
+        if joint in self._restarted:
+            uptime_s = module.uptime_ms / 1000
             report(
                 "module_restarted",
-                f"has restarted, its uptime is {up_s:.2f} s: a clear writes its parameters again",
+                f"has restarted, its uptime is {uptime_s:.2f} s: a clear writes its parameters again",
             )
+
+    def _check_frames(self, module: ModuleStatus, reading: ModuleReports, report: Report) -> None:
+        """Report wrong counters and checksums, a second module with the same id, and too many frames."""
         if module.repeats >= IN_A_ROW:
             report("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
         elif module.wrong_counts >= IN_A_ROW:
@@ -120,106 +165,133 @@ class Watch:
             report("duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id")
         if module.frames > MAX_FRAMES:
             report("module_babbling", f"floods the bus: {module.frames} frames within one period")
-        unanswered = reading.sync - module.sync - module.corrupt - max(module.repeats, module.wrong_counts)
-        unanswered = min(unanswered, reading.sync - self._unasked.get(self._channels[i], -1))
-        if unanswered >= SILENT_AFTER and not found:
-            report(
-                "module_silent",
-                f"is silent: no state for {unanswered * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
-            )
-        return found
 
-    def _of_state(
-        self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState, *, aside: bool
+    def _check_silence(self, joint: int, module: ModuleStatus, reading: ModuleReports, report: Report) -> None:
+        wrong_answers = module.corrupt + max(module.repeats, module.wrong_counts)
+        without_answer = reading.sync - module.sync - wrong_answers
+        # A Sync that the bus rejected did not reach the module.
+        since_unsent = reading.sync - self._unsent_sync.get(self._channels[joint], -1)
+        unanswered = min(without_answer, since_unsent)
+        if unanswered >= SILENT_AFTER:
+            silence_ms = unanswered * self._period_s * 1000
+            report("module_silent", f"is silent: no state for {silence_ms:.0f} ms{_explain_silence(module, reading)}")
+
+    def _check_state(
+        self, joint: int, module: ModuleStatus, reading: ModuleReports, lifecycle: LifecycleState, *, isolated: bool
     ) -> list[Finding]:
-        """Findings about faults that it reports, or that it does not follow."""
-        state = module.state.name.lower()
-        # An emergency stop says nothing of a fault that had stopped the module before it.
-        as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
-        if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
-            faults = module.fault_names()
-            kinds = [f"module_{word}" for word in (*faults, state)]
-            why = f"it stopped because of {module.last_stop.name.lower()}"
-            return [self._finding(i, module, kinds[0], f"reports {', '.join(faults) or state}; {why}", *kinds)]
-        if aside or not self._refuses_to_arm(i, module, reading):
+        """Return a finding if the module reports a fault, or does not follow the robot's arming."""
+        # An emergency stop is no reason to report a module that had no fault before it.
+        stopped_on_command = lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
+        may_report = reading.sync >= self._quiet_until
+        if module.needs_clearing and not stopped_on_command and may_report:
+            return [self._fault_finding(joint, module)]
+        if isolated or not self._refuses_to_arm(joint, module, reading):
             return []
-        if i in self._was_armed:
-            return [self._finding(i, module, "module_not_armed", f"is not armed any more: it is {state}")]
-        return [self._finding(i, module, "module_not_armed", f"does not arm: it is {state}", NEVER_ARMED)]
+        state = module.state.name.lower()
+        if joint in self._was_armed:
+            return [self._make_finding(joint, module, "module_not_armed", f"is not armed any more: it is {state}")]
+        cause = f"does not arm: it is {state}"
+        return [self._make_finding(joint, module, "module_not_armed", cause, [NEVER_ARMED])]
 
-    def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
-        """A second module with the same id also makes the uptime decrease, but then every Sync is answered twice."""
-        if module.restarts > self._restarts[i]:
-            self._restarts[i] = module.restarts
-            self._restart_at.setdefault(i, reading.sync)
-        if module.answered_twice(reading.sync) or reading.sync - self._restart_at.get(i, reading.sync) <= IN_A_ROW:
+    def _fault_finding(self, joint: int, module: ModuleStatus) -> Finding:
+        """Return the finding about a module that is in a latched state."""
+        state = module.state.name.lower()
+        faults = module.fault_names()
+        kinds = [f"module_{name}" for name in (*faults, state)]
+        reported = ", ".join(faults) or state
+        cause = f"reports {reported}; it stopped because of {module.last_stop.name.lower()}"
+        return self._make_finding(joint, module, kinds[0], cause, kinds)
+
+    def _has_restarted(self, joint: int, module: ModuleStatus, reading: ModuleReports) -> bool:
+        """Return whether a module has restarted, once for every restart.
+
+        A second module with the same id also makes the uptime decrease, but then every Sync is answered twice. So the
+        decision waits for IN_A_ROW Syncs.
+        """
+        if module.restarts > self._restarts[joint]:
+            self._restarts[joint] = module.restarts
+            self._restart_sync.setdefault(joint, reading.sync)
+        restart_sync = self._restart_sync.get(joint, reading.sync)
+        if module.answered_twice(reading.sync) or reading.sync - restart_sync <= IN_A_ROW:
             return False
-        del self._restart_at[i]
+        del self._restart_sync[joint]
         return True
 
-    def _refuses_to_arm(self, i: int, module: Module, reading: Reading) -> bool:
+    def _refuses_to_arm(self, joint: int, module: ModuleStatus, reading: ModuleReports) -> bool:
+        """Return whether a module is not armed although the robot has been for long enough."""
         if self._armed_sync is None:
             return False
         if module.state == ModuleState.ARMED:
-            self._was_armed.add(i)
-        late = reading.sync - self._armed_sync > ARM_GRACE or i in self._was_armed
-        apart = (
-            late
-            and reading.sync == module.sync
-            and module.state != ModuleState.ARMED
-            and not module.answered_twice(reading.sync)
-        )
-        self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
-        fell_back = i in self._was_armed and module.state in (ModuleState.BOOT, ModuleState.DISARMED)
-        return self._unarmed[i] >= (1 if fell_back else IN_A_ROW)
+            self._was_armed.add(joint)
+        was_armed = joint in self._was_armed
+        had_time = reading.sync - self._armed_sync > ARM_GRACE or was_armed
+        answered = reading.sync == module.sync and not module.answered_twice(reading.sync)
+        if had_time and answered and module.state != ModuleState.ARMED:
+            self._unarmed[joint] += 1
+        else:
+            self._unarmed[joint] = 0
+        # A module that was armed and is passive now has stopped: no further Sync is needed to be sure.
+        fell_back = was_armed and module.state in (ModuleState.BOOT, ModuleState.DISARMED)
+        needed_syncs = 1 if fell_back else IN_A_ROW
+        return self._unarmed[joint] >= needed_syncs
 
-    def _bare(self, i: int) -> Finding:
-        cause = f"{self._names[i]} has not accepted its parameters, and is not armed; clear, or power-cycle it"
-        return Finding("module_not_configured", cause, i)
+    def _unconfigured_finding(self, joint: int) -> Finding:
+        cause = f"{self._names[joint]} has not accepted its parameters, and is not armed; clear, or power-cycle it"
+        return Finding("module_not_configured", cause, joint)
 
-    # --- the bus ----------------------------------------------------------------------------------------------
+    # --- the buses --------------------------------------------------------------------------------------------
 
-    def _of_bus(self, errors: Iterable[BusError], unsent: set[str]) -> list[Finding]:
-        found: list[Finding] = []
+    def _check_buses(self, errors: Iterable[BusError], unsent: set[str]) -> list[Finding]:
+        """Return findings about bus errors, and about buses that send nothing."""
+        findings: list[Finding] = []
         for error in errors:
             if error.kind == "interface_down":
                 self._down.add(error.channel)
             elif error.kind == "interface_up":
                 self._down.discard(error.channel)
             advice = BUS_FAULTS.get(error.kind)
-            if advice is not None:
-                found.append(Finding(error.kind, f"{error.channel}: {error.detail}; {advice}"))
+            if advice is None:
+                self.minor_error_counts[error.kind] = self.minor_error_counts.get(error.kind, 0) + 1
             else:
-                self.seen[error.kind] = self.seen.get(error.kind, 0) + 1
+                findings.append(Finding(error.kind, f"{error.channel}: {error.detail}; {advice}"))
         self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
-        for channel, ticks in self._unsent.items():
-            if ticks >= IN_A_ROW:
-                took_ms = 1000 * IN_A_ROW * self._period_s
-                cause = (
-                    f"{channel}: no frames sent for {took_ms:.0f} ms, its transmit queue stays "
-                    f"full: no node acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
-                )
-                found.append(Finding("bus_stuck", cause))
-        return found
+        for channel, cycles in self._unsent.items():
+            if cycles >= IN_A_ROW:
+                findings.append(self._stuck_finding(channel))
+        return findings
 
-    def _of_strangers(self, reading: Reading) -> list[Finding]:
-        found: list[Finding] = []
-        self._strangers = {node: self._strangers.get(node, 0) + n for node, n in reading.strangers.items()}
-        for node, frames in self._strangers.items():
-            if frames >= STRANGER_FRAMES:
-                found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
-        reading.strangers.clear()
-        others = reading.from_other_host
-        if others[Opcode.EMERGENCY]:
-            found.append(Finding("emergency", "a node on the bus sent an Emergency"))
-        if others.keys() - {Opcode.EMERGENCY}:
-            found.append(Finding("second_host", "another program commands the modules on this bus; end one of the two"))
-            self._changed |= set(range(len(reading.modules)))
-        others.clear()
-        return found
+    def _stuck_finding(self, channel: str) -> Finding:
+        duration_ms = 1000 * IN_A_ROW * self._period_s
+        cause = (
+            f"{channel}: no frames sent for {duration_ms:.0f} ms, its transmit queue stays "
+            f"full: no node acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
+        )
+        return Finding("bus_stuck", cause)
+
+    def _check_unknown_senders(self, reading: ModuleReports) -> list[Finding]:
+        """Return findings about nodes that are no joints, and about other programs that command the modules."""
+        findings: list[Finding] = []
+        self._unknown_nodes = {
+            node: self._unknown_nodes.get(node, 0) + frames for node, frames in reading.unknown_nodes.items()
+        }
+        for node, frames in self._unknown_nodes.items():
+            if frames >= UNKNOWN_NODE_FRAMES:
+                findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
+        reading.unknown_nodes.clear()
+
+        other_host = reading.from_other_host
+        if other_host[Opcode.EMERGENCY]:
+            findings.append(Finding("emergency", "a node on the bus sent an Emergency"))
+        if other_host.keys() - {Opcode.EMERGENCY}:
+            cause = "another program commands the modules on this bus; end one of the two"
+            findings.append(Finding("second_host", cause))
+            self._changed |= set(range(len(reading.modules)))  # it may have written their parameters
+        other_host.clear()
+        return findings
 
 
-def _alive(module: Module, reading: Reading) -> str:
+def _explain_silence(module: ModuleStatus, reading: ModuleReports) -> str:
+    """Return what a module's heartbeats show about the cause of its silence, as the end of a sentence."""
     if module.heartbeat_sync > module.sync:
         return "; it still sends heartbeats, so it receives no Sync or its main loop hangs"
     if reading.sync < 0 or module.uptime_ms < 0:

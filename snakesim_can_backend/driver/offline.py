@@ -1,7 +1,7 @@
-"""A log of the bus through the driver's own reading of it, without a bus: the joint states of every tick.
+"""Replays a log of the bus through the driver's own reading of it: the joint states of every tick, without a bus.
 
-A tick begins at its Sync. Its sample is taken when all awaited modules have answered, or when they would no longer have
-been waited for. Frames that were received together have one time in the log, and are read together here.
+A tick begins at its Sync. Its sample is taken when all awaited modules have answered, or when the driver would no
+longer have waited for them. Frames that were received together have one time in the log, and are read together here.
 """
 
 from collections import Counter
@@ -12,65 +12,85 @@ from itertools import groupby
 import can
 import numpy as np
 
-from snakesim_can_backend.bus.load import Reports
-from snakesim_can_backend.bus.strangers import is_ours, whose
-from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.bus.load import ReportSchedule
+from snakesim_can_backend.bus.unknown_frames import guess_origin, matches_protocol
+from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.driver.sensors import contacts_due, joint_values
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, opcode_of
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, parse_opcode
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.run_log.black_box import Layout
 
-SYNC_BYTES = codec()[Opcode.SYNC].length
-BRING_UP_SYNCS = 64  # before the first tick, at most
+SYNC_BYTES = load_layouts()[Opcode.SYNC].length
+SYNC_COUNT_MASK = 0xFF  # the first byte of a Sync is the lowest 8 bits of its number
+MAX_BRING_UP_SYNCS = 64  # before the first tick
 VALUES = ("angle_rad", "velocity_rad_s", "torque_nm")
 
 
-class Replay:
-    """A log, read frame by frame as the driver reads a bus."""
+class LogReplay:
+    """Reads a log frame by frame as the driver reads a bus, and collects the joint states of every Sync."""
 
-    def __init__(self, mounting: Mounting, reports: Reports, answer_limit_s: float) -> None:
-        """answer_limit_s: how long the driver waits for the answers to a Sync."""
+    def __init__(self, mounting: Mounting, reports: ReportSchedule, answer_limit_s: float) -> None:
+        """Start a replay.
+
+        Args:
+            mounting: how the modules' shafts move the joints.
+            reports: which reports the modules send, and how often.
+            answer_limit_s: how long the driver waits for the answers to a Sync.
+        """
+        joints = len(mounting.sign)
         self._mounting = mounting
-        self.reading = Reading(len(mounting.sign))
+        self._reports = reports
+        self._answer_limit_s = answer_limit_s
+        self._open_until_s: float | None = None  # end of the wait for the newest Sync; None: its sample is taken
+        self.reading = ModuleReports(joints)
+
+        # Results.
         self.frames = 0
-        self.foreign: Counter[str] = Counter()  # frames that are none of the protocol, by whose they look like
-        self.joints: list[Floats] = []  # by Sync: angle, velocity and torque, (3, n_joints)
-        self.silent = [0] * len(mounting.sign)  # Syncs that a joint did not answer in time
-        self._reports, self._answer_limit_s = reports, answer_limit_s
-        self._open_until_s: float | None = None  # of the newest Sync, whose sample is not taken yet
+        self.foreign: Counter[str] = Counter()  # frames that are none of the protocol, by their likely origin
+        self.joints: list[Floats] = []  # by Sync: VALUES of all joints, (3, n_joints)
+        self.silent = [0] * joints  # Syncs that each joint did not answer in time
 
-    def take(self, log: Iterable[can.Message]) -> None:
-        """Read a whole log."""
-        for (time_s, _), together in groupby(log, key=lambda message: (message.timestamp, message.channel)):
+    def read(self, log: Iterable[can.Message]) -> None:
+        """Read a whole log.
+
+        It may end in the middle of a tick. Then the missing answers to the last Sync are unknown, and no sample is
+        taken.
+        """
+        for (time_s, _), messages in groupby(log, key=lambda message: (message.timestamp, message.channel)):
             if self._open_until_s is not None and time_s > self._open_until_s:
-                self._sample()
-            for message in together:
-                self.frames += 1
-                self.foreign[whose(message)] += not is_ours(message)
-                if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
-                    self._take(Frame(message.arbitration_id, bytes(message.data)), time_s)
+                self._take_sample()
+            for message in messages:
+                self._read_message(message, time_s)
             if self._open_until_s is not None and self.reading.complete:
-                self._sample()
-        # The log may end in the middle of a tick: what is missing of the last Sync's answers is not known.
+                self._take_sample()
 
-    def _take(self, frame: Frame, time_s: float) -> None:
-        opcode = opcode_of(frame.id)
+    def _read_message(self, message: can.Message, time_s: float) -> None:
+        self.frames += 1
+        self.foreign[guess_origin(message)] += not matches_protocol(message)
+        is_standard_data_frame = not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
+        if not is_standard_data_frame:
+            return
+        frame = Frame(message.arbitration_id, bytes(message.data))
+        opcode = parse_opcode(frame.id)
         if opcode not in FROM_HOST:
-            self.reading.take(frame)
-            return
-        if opcode != Opcode.SYNC or len(frame.data) != SYNC_BYTES:
-            return
-        if frame.data[0] == self.reading.sync & 0xFF:  # the same Sync, on another bus
+            self.reading.process_frame(frame)
+        elif opcode == Opcode.SYNC and len(frame.data) == SYNC_BYTES:
+            self._begin_sync(frame, time_s)
+
+    def _begin_sync(self, frame: Frame, time_s: float) -> None:
+        count = frame.data[0]
+        if count == self.reading.sync & SYNC_COUNT_MASK:  # the same Sync, on another bus
             return
         if self._open_until_s is not None:
-            self._sample()
-        number = self.reading.sync + 1
-        self.reading.begin(number, contacts=contacts_due(self._reports, number), tail=self._reports.tail)
+            self._take_sample()
+        sync = self.reading.sync + 1
+        self.reading.begin_sync(sync, contacts=contacts_due(self._reports, sync), tail=self._reports.tail)
         self._open_until_s = time_s + self._answer_limit_s
 
-    def _sample(self) -> None:
+    def _take_sample(self) -> None:
+        """Store the joint states of the newest Sync, and count the joints that did not answer it."""
         self.joints.append(joint_values(self.reading, self._mounting))
         for joint, module in enumerate(self.reading.modules):
             self.silent[joint] += module.sync != self.reading.sync
@@ -78,34 +98,60 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """A replay held against a record of the same run."""
+class ReplayComparison:
+    """How far a replay agrees with the run log of the same run."""
 
     compared: int  # ticks
-    first_wrong: str  # empty: all are equal to the bit
+    first_wrong: str  # the first difference, as text; empty: all values are equal to the bit
 
 
-def against_record(done: Replay, layout: Layout, rows: dict[str, Floats]) -> Verdict:
-    """Compare the joint states of every tick. The Syncs of the bring-up, before the first tick, are found by trying."""
-    recorded = np.stack([rows[name] for name in VALUES], axis=1)  # (ticks, 3, n_joints)
+def compare_with_run_log(replay: LogReplay, layout: Layout, rows: dict[str, Floats]) -> ReplayComparison:
+    """Compare the joint states of every tick with the run log.
+
+    Args:
+        replay: the replay of the bus log.
+        layout: layout of the run log, with the names of the joints.
+        rows: columns of the run log: "tick", and VALUES with shape (n_ticks, n_joints).
+    """
+    recorded = np.stack([rows[name] for name in VALUES], axis=1)  # (n_ticks, 3, n_joints)
     ticks = rows["tick"].astype(int)
-    found = np.array(done.joints).reshape(-1, *recorded.shape[1:])
-    most, best = -1, 0
-    for before in range(min(BRING_UP_SYNCS, len(found))):
-        known = ticks + before < len(found)
-        equal = int(np.all(found[ticks[known] + before] == recorded[known], axis=(1, 2)).sum())
-        if equal > most:
-            most, best = equal, before
-    known = ticks + best < len(found)
-    wrong = np.argwhere(found[ticks[known] + best] != recorded[known])
-    if not known.any():
-        return Verdict(0, "no tick of the record is in the log")
-    if not len(wrong):
-        return Verdict(int(known.sum()), "")
-    row, value, joint = wrong[0]
-    was, now = recorded[known][row, value, joint], found[ticks[known][row] + best, value, joint]
-    return Verdict(
-        int(known.sum()),
-        f"tick {ticks[known][row]}, {layout.joints[joint]}, {VALUES[value]}: {was:.9g} in the record, "
-        f"{now:.9g} in the log; {known.sum() - most} of {known.sum()} ticks differ",
+    replayed = np.array(replay.joints).reshape(-1, *recorded.shape[1:])  # (n_syncs, 3, n_joints)
+    bring_up_syncs, equal_ticks = _find_first_tick(replayed, recorded, ticks)
+
+    syncs = ticks + bring_up_syncs
+    in_log = syncs < len(replayed)
+    compared = int(in_log.sum())
+    if compared == 0:
+        return ReplayComparison(0, "no tick of the record is in the log")
+    syncs = syncs[in_log]
+    ticks = ticks[in_log]
+    recorded = recorded[in_log]
+    differences = np.argwhere(replayed[syncs] != recorded)
+    if not len(differences):
+        return ReplayComparison(compared, "")
+    row, value, joint = differences[0]
+    recorded_value = recorded[row, value, joint]
+    replayed_value = replayed[syncs[row], value, joint]
+    return ReplayComparison(
+        compared,
+        f"tick {ticks[row]}, {layout.joints[joint]}, {VALUES[value]}: {recorded_value:.9g} in the record, "
+        f"{replayed_value:.9g} in the log; {compared - equal_ticks} of {compared} ticks differ",
     )
+
+
+def _find_first_tick(replayed: Floats, recorded: Floats, ticks: np.ndarray) -> tuple[int, int]:
+    """Find how many Syncs the bring-up sent before the first tick, by trying all numbers.
+
+    Returns:
+        The number of Syncs with which most ticks are equal to the bit, and the number of these ticks.
+    """
+    max_equal = -1
+    best_syncs = 0
+    for bring_up_syncs in range(min(MAX_BRING_UP_SYNCS, len(replayed))):
+        in_log = ticks + bring_up_syncs < len(replayed)
+        is_equal = np.all(replayed[ticks[in_log] + bring_up_syncs] == recorded[in_log], axis=(1, 2))
+        equal = int(is_equal.sum())
+        if equal > max_equal:
+            max_equal = equal
+            best_syncs = bring_up_syncs
+    return best_syncs, max_equal

@@ -20,14 +20,14 @@ from snakesim_hal.model.fault_plan import check_backend_can
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.service import START_LIMIT_S
 
-READY = "modules ready"
-STOP_LIMIT_S = 5.0
+READY = "modules ready"  # a child prints it when its modules are on the bus
+STOP_LIMIT_S = 5.0  # after which a child that ignores SIGTERM is killed
 POLL_S = 0.02
 
 
 def check_emulators(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError for impossible settings of the emulators."""
-    from snakesim_can_backend.emulator.faults import parse
+    from snakesim_can_backend.emulator.faults import parse_fault
 
     if settings.emulators_run == "here" and settings.channels:
         raise ConfigError(
@@ -44,63 +44,93 @@ def check_emulators(config: RunConfig, settings: CanSettings) -> None:
     if settings.faults and settings.emulators_run == "none":
         raise ConfigError("`backends.can.faults` are for emulators; give them to `snakesim modules --fault` instead")
     for text in settings.faults:
-        parse(text, config.robot.chain.modules)
+        parse_fault(text, config.robot.chain.modules)
 
 
 def check_faults(config: RunConfig, settings: CanSettings) -> None:
     """Check that the planned faults of joints and buses are possible. Raises ConfigError."""
-    from snakesim_can_backend.emulator.faults import ABOUT
+    from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
 
-    own, virtual = settings.emulators_run != "none", not settings.channels
-    does = {*KINDS["bus"]} - {"slow", "" if virtual else "full"} | ({*ABOUT} if own else set())
-    because = f"its modules support {', '.join(ABOUT)}" if own else "its modules are not the driver's own emulators"
-    because += "" if virtual else "; and a program cannot fill the queue of a kernel interface"
-    check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)
+    has_emulators = settings.emulators_run != "none"
+    has_virtual_bus = not settings.channels
+    supported = set(KINDS["bus"]) - {"slow"}
+    reason = "its modules are not the driver's own emulators"
+    if has_emulators:
+        supported |= set(FAULT_DESCRIPTIONS)
+        reason = f"its modules support {', '.join(FAULT_DESCRIPTIONS)}"
+    if not has_virtual_bus:
+        supported -= {"full"}
+        reason += "; and a program cannot fill the queue of a kernel interface"
+    check_backend_can(config, does=supported, buses=max(len(settings.channels), 1), because=reason)
 
 
-def modules_know(injection: Injection, joints: int) -> bool:
-    """Whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
-    from snakesim_can_backend.emulator.faults import ABOUT, checked
+def supports_fault(injection: Injection, joints: int) -> bool:
+    """Return whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
+    from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS, check_fault
 
-    if injection.target_type != "joint" or injection.kind not in ABOUT:
+    if injection.target_type != "joint" or injection.kind not in FAULT_DESCRIPTIONS:
         return False
-    checked(injection, joints)
+    check_fault(injection, joints)
     return True
 
 
-def emulators_here(
+def start_local_emulators(
     config: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
 ) -> VirtualPeer:
-    """Emulators at the other end of a virtual bus; the returned function runs them."""
-    from snakesim_can_backend.emulator.server import here
+    """Start emulators at the other end of a virtual bus, in this process.
 
-    return here(config, settings, channel, pose, stepped=stepped)
+    Args:
+        config: the run, with the robot.
+        settings: settings of the backend.
+        channel: name of the virtual bus.
+        pose: address, HOST:PORT, to which they send motion capture; None: nowhere.
+        stepped: whether their time advances only from Sync to Sync.
+
+    Returns:
+        A function that runs them.
+    """
+    from snakesim_can_backend.emulator.server import make_local_emulators
+
+    return make_local_emulators(config, settings, channel, pose, stepped=stepped)
 
 
 class EmulatorProcess:
     """`snakesim modules` as a child that dies with this process."""
 
     def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
-        """Start it, and wait until its modules are on the bus. Raises BackendError."""
-        changed = msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)})
+        """Start the child, and wait until its modules are on the bus.
+
+        Args:
+            config: the run, with the robot.
+            settings: settings of the backend, which replace those in the configuration.
+            pose: address, HOST:PORT, to which the child sends motion capture; None: nowhere.
+            stepped: whether the emulators' time advances only from Sync to Sync.
+
+        Raises:
+            BackendError: the child cannot be started, or ended at once.
+        """
+        backends = {**config.backends, "can": msgspec.to_builtins(settings)}
+        child_config = msgspec.structs.replace(config, backends=backends)
         arguments = ["--parent", str(os.getpid()), "--pose", pose or "none"]
         for channel in settings.channels:
             arguments += ["--channel", channel]
-        arguments += ["--stepped"] if stepped else []
+        if stepped:
+            arguments.append("--stepped")
         try:
             self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-", ignore_cleanup_errors=True)
-            self._said = Path(self._folder.name, "modules.log")
-            self._process = self._started(changed, arguments)
+            self._output = Path(self._folder.name, "modules.log")
+            self._process = self._start(child_config, arguments)
         except OSError as error:
             raise BackendError(f"the emulated joint modules cannot be started: {error}") from error
         self._await_ready()
 
-    def _started(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
-        run = Path(self._folder.name, "config.json")
-        write(config, run)
-        with self._said.open("wb") as output:
+    def _start(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
+        config_path = Path(self._folder.name, "config.json")
+        write(config, config_path)
+        module = "snakesim_can_backend.emulator.command"
+        with self._output.open("wb") as output:
             return subprocess.Popen(
-                python_command("-m", "snakesim_can_backend.emulator.command", str(run), *arguments, "--interactive"),
+                python_command("-m", module, str(config_path), *arguments, "--interactive"),
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -108,24 +138,40 @@ class EmulatorProcess:
                 start_new_session=True,
             )
 
-    def how_it_ended(self) -> str | None:
-        """Its exit as text; None while it runs."""
+    def _await_ready(self) -> None:
+        """Wait until the child prints READY. Raises BackendError."""
+        end_s = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < end_s:
+            with contextlib.suppress(OSError):
+                if READY in self._output.read_text(encoding="utf-8", errors="replace"):
+                    return
+            if self._process.poll() is not None:
+                break
+            time.sleep(POLL_S)
+        self.stop()
+        raise BackendError("the emulated joint modules did not start; see their output above")
+
+    def describe_exit(self) -> str | None:
+        """Return a sentence about the exit of the child; None while it runs."""
         code = self._process.poll()
-        return None if code is None else f"the emulated joint modules have ended, with exit code {code}"
+        if code is None:
+            return None
+        return f"the emulated joint modules have ended, with exit code {code}"
 
     def inject(self, fault: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of a module. Raises BackendError when the child is gone."""
-        from snakesim_can_backend.emulator.faults import typed
+        """Begin or end a fault of a module. Raises BackendError if the child has ended."""
+        from snakesim_can_backend.emulator.faults import format_typed_fault
 
         assert self._process.stdin is not None
+        line = f"{format_typed_fault(fault, begins=begins)}\n"
         try:
-            self._process.stdin.write(f"{typed(fault, begins=begins)}\n".encode())
+            self._process.stdin.write(line.encode())
             self._process.stdin.flush()
         except (OSError, ValueError) as error:  # the latter when it was stopped
             raise BackendError(f"the emulated joint modules do not accept {fault}: {error}") from error
 
     def stop(self) -> None:
-        """Terminate it, then kill it. Its output goes to this process's stderr."""
+        """Terminate the child, and kill it if it does not end. Its output goes to this process's stderr."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -137,18 +183,6 @@ class EmulatorProcess:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
         with contextlib.suppress(OSError):  # an unreadable log does not prevent ending
-            for line in self._said.read_text(encoding="utf-8", errors="replace").splitlines():
+            for line in self._output.read_text(encoding="utf-8", errors="replace").splitlines():
                 print_stderr(line)
         self._folder.cleanup()
-
-    def _await_ready(self) -> None:
-        end = time.monotonic() + START_LIMIT_S
-        while time.monotonic() < end:
-            with contextlib.suppress(OSError):
-                if READY in self._said.read_text(encoding="utf-8", errors="replace"):
-                    return
-            if self._process.poll() is not None:
-                break
-            time.sleep(POLL_S)
-        self.stop()
-        raise BackendError("the emulated joint modules did not start; see their output above")

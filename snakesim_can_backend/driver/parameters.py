@@ -1,10 +1,10 @@
-"""Module parameters from a robot file, and checks that modules and protocol support that file."""
+"""Plans the modules' parameters from a robot file, and checks that modules and protocol support that file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-from snakesim_can_backend.bus.load import Reports
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Opcode, Parameter, SafeMotion
+from snakesim_can_backend.bus.load import ReportSchedule
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Drive, Joint
@@ -13,38 +13,40 @@ from snakesim_hal.model.scenario import RunConfig
 
 MIN_PERIODS = 2.2  # in a watchdog's time: one setpoint may be lost, and the next be a little late
 SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
+RATING_TOLERANCE = 0.999  # a rating has single precision on the bus
 
 
-def parameters_of(robot: RobotFile, settings: CanSettings, reports: Reports) -> dict[int, dict[Parameter, float]]:
-    """The parameters to write to each node."""
-    safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
-    common = {
-        Parameter.WATCHDOG: settings.watchdog_s,
-        Parameter.STOP_MODE: float(safe),
-        Parameter.CONTACT_EVERY: float(reports.contact_every),
-        Parameter.IMU_EVERY: float(reports.imu_every),
-    }
-    found: dict[int, dict[Parameter, float]] = {}
+def plan_parameters(
+    robot: RobotFile, settings: CanSettings, reports: ReportSchedule
+) -> dict[int, dict[ModuleParameter, float]]:
+    """Return the parameters to write to each node, converted from the joints to the modules' shafts."""
+    stop_mode = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
+    planned: dict[int, dict[ModuleParameter, float]] = {}
     for node, joint in enumerate(robot.joint_table, start=1):
-        motor, gear = joint.motor, joint.drive.gear
-        found[node] = {
-            Parameter.STIFFNESS: motor.stiffness_nm_per_rad / gear**2,
-            Parameter.DAMPING: motor.damping_nm_s_per_rad / gear**2,
-            Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
-            Parameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
-            Parameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
-            Parameter.ANGLE_LIMIT: _furthest_rad(joint),  # the limiter keeps to the nearer side
-            **common,
-            Parameter.TAIL: float(node == 1 and reports.tail),
+        motor = joint.motor
+        gear = joint.drive.gear
+        sends_tail_contact = node == 1 and reports.tail
+        planned[node] = {
+            ModuleParameter.STIFFNESS: motor.stiffness_nm_per_rad / gear**2,
+            ModuleParameter.DAMPING: motor.damping_nm_s_per_rad / gear**2,
+            ModuleParameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
+            ModuleParameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
+            ModuleParameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
+            ModuleParameter.ANGLE_LIMIT: _max_shaft_angle_rad(joint),  # the limiter keeps to the nearer side
+            ModuleParameter.WATCHDOG: settings.watchdog_s,
+            ModuleParameter.STOP_MODE: float(stop_mode),
+            ModuleParameter.CONTACT_EVERY: float(reports.contact_every),
+            ModuleParameter.IMU_EVERY: float(reports.imu_every),
+            ModuleParameter.TAIL: float(sends_tail_contact),
         }
-    return found
+    return planned
 
 
-def _furthest_rad(joint: Joint) -> float:
-    """Of the module's shaft, from its own zero."""
+def _max_shaft_angle_rad(joint: Joint) -> float:
+    """Return the largest angle of the module's shaft from its own zero, to either side."""
     drive = joint.drive
-    ends = (drive.zero_rad + drive.sign * drive.gear * end for end in (joint.limits.lower_rad, joint.limits.upper_rad))
-    return max(map(abs, ends))
+    joint_limits_rad = (joint.limits.lower_rad, joint.limits.upper_rad)
+    return max(abs(drive.zero_rad + drive.sign * drive.gear * limit_rad) for limit_rad in joint_limits_rad)
 
 
 def check_drives(robot: RobotFile, settings: CanSettings) -> None:
@@ -67,54 +69,89 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
             )
 
 
-def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:
-    """Raise ConfigError or BackendError when the robot file exceeds the protocol's range or a module's rating."""
-    signals = codec()[Opcode.JOINT_STATE].signals
-    joints, hottest_c = robot.joint_table, codec()[Opcode.HEALTH].signals["motor_temperature"].high
-    for joint in joints:
-        limits, gear = joint.limits, joint.drive.gear
-        for what, value, most, unit in (
-            ("limits.angle_rad", _furthest_rad(joint), signals["angle"].high, "rad"),
-            ("limits.speed_rad_s", limits.speed_rad_s * gear, signals["velocity"].high / SPEED_ROOM, "rad/s"),
-            ("limits.torque_nm", limits.torque_nm / gear, signals["torque"].high, "N·m"),
-            ("limits.stop_at_c", limits.stop_at_c, hottest_c, "°C"),
-        ):
-            if value > most:
-                behind = "" if joint.drive == Drive() else " at the module's shaft, by `gear` and `zero_rad`,"
-                raise ConfigError(
-                    f"robot {robot.name!r}, {joint.name}: `{what}` = {value} {unit}{behind} exceeds the range of the "
-                    f"bus protocol, which ends at {most:.3g} {unit}"
-                )
-    reach_m = max(robot.link_lengths_m) + robot.module.radius_m
-    along_m = codec()[Opcode.CONTACT].signals["along"].high
-    if robot.sensors.contacts is not None and reach_m > along_m:
-        raise ConfigError(
-            f"robot {robot.name!r}: a contact at a link's end, {reach_m:.3g} m from its joint (`module.length_m` + "
-            f"`module.radius_m`), exceeds the range of the bus protocol, which ends at {along_m:.3g} m"
-        )
+def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[ModuleParameter, float]] | None = None) -> None:
+    """Check that the robot file stays within the protocol's ranges and the modules' ratings.
+
+    Args:
+        robot: the robot file.
+        in_force: present parameters of the modules, by node; None: they are not known yet.
+
+    Raises:
+        ConfigError: the robot file exceeds a range of the protocol, or needs what no module supports.
+        BackendError: the robot file exceeds the rating of a module.
+    """
+    for joint in robot.joint_table:
+        _check_ranges(robot, joint)
+    _check_contact_range(robot)
     if robot.safety.action == "hold":
         raise ConfigError(
             f'robot {robot.name!r}: `safety.action` = "hold" is not supported by joint modules: servos '
             f'that hold stiffly overheat. Use "damp" or "passive"'
         )
     for node, values in (in_force or {}).items():
-        for parameter, asked, unit in (
-            (Parameter.RATED_TORQUE, joints[node - 1].limits.torque_nm / joints[node - 1].drive.gear, "N·m"),
-            (Parameter.RATED_SPEED, joints[node - 1].limits.speed_rad_s * joints[node - 1].drive.gear, "rad/s"),
-        ):
-            if not values[parameter] >= asked * 0.999:  # also rejects a rating of NaN, which the bus can carry
-                raise BackendError(
-                    f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
-                    f"{asked:g}: lower the limit in the robot file"
-                )
+        _check_module(robot, node, values)
+
+
+def _check_ranges(robot: RobotFile, joint: Joint) -> None:
+    """Raise ConfigError if a limit of a joint exceeds the range of the bus protocol."""
+    for key, value, max_value, unit in _limits_at_shaft(joint):
+        if value > max_value:
+            has_default_drive = joint.drive == Drive()
+            place = "" if has_default_drive else " at the module's shaft, by `gear` and `zero_rad`,"
+            raise ConfigError(
+                f"robot {robot.name!r}, {joint.name}: `{key}` = {value} {unit}{place} exceeds the range of the "
+                f"bus protocol, which ends at {max_value:.3g} {unit}"
+            )
+
+
+def _limits_at_shaft(joint: Joint) -> Iterator[tuple[str, float, float, str]]:
+    """Yield key, value, largest value on the bus and unit of every limit of a joint."""
+    layouts = load_layouts()
+    state = layouts[Opcode.JOINT_STATE].signals
+    max_winding_c = layouts[Opcode.HEALTH].signals["motor_temperature"].high
+    limits = joint.limits
+    gear = joint.drive.gear
+    yield "limits.angle_rad", _max_shaft_angle_rad(joint), state["angle"].high, "rad"
+    yield "limits.speed_rad_s", limits.speed_rad_s * gear, state["velocity"].high / SPEED_ROOM, "rad/s"
+    yield "limits.torque_nm", limits.torque_nm / gear, state["torque"].high, "N·m"
+    yield "limits.stop_at_c", limits.stop_at_c, max_winding_c, "°C"
+
+
+def _check_contact_range(robot: RobotFile) -> None:
+    """Raise ConfigError if a contact at the end of a link would be further away than the protocol can represent."""
+    max_distance_m = max(robot.link_lengths_m) + robot.module.radius_m
+    max_along_m = load_layouts()[Opcode.CONTACT].signals["along"].high
+    if robot.sensors.contacts is not None and max_distance_m > max_along_m:
+        raise ConfigError(
+            f"robot {robot.name!r}: a contact at a link's end, {max_distance_m:.3g} m from its joint "
+            f"(`module.length_m` + `module.radius_m`), exceeds the range of the bus protocol, which ends at "
+            f"{max_along_m:.3g} m"
+        )
+
+
+def _check_module(robot: RobotFile, node: int, values: Mapping[ModuleParameter, float]) -> None:
+    """Raise BackendError if the robot file needs more torque or speed than a module is rated for."""
+    joint = robot.joint_table[node - 1]
+    gear = joint.drive.gear
+    for parameter, needed, unit in (
+        (ModuleParameter.RATED_TORQUE, joint.limits.torque_nm / gear, "N·m"),
+        (ModuleParameter.RATED_SPEED, joint.limits.speed_rad_s * gear, "rad/s"),
+    ):
+        is_sufficient = values[parameter] >= needed * RATING_TOLERANCE  # False for NaN, which the bus can carry
+        if not is_sufficient:
+            raise BackendError(
+                f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
+                f"{needed:g}: lower the limit in the robot file"
+            )
 
 
 def check_watchdog(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError if one lost setpoint would stop the modules."""
-    min_s = MIN_PERIODS / config.rate_hz
-    if settings.watchdog_s < min_s:
+    min_watchdog_s = MIN_PERIODS / config.rate_hz
+    if settings.watchdog_s < min_watchdog_s:
         min_rate_hz = MIN_PERIODS / settings.watchdog_s
         raise ConfigError(
             f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
-            f"setpoint would stop the modules; give them {min_s:.3g} s or more, or a rate from {min_rate_hz:.0f} Hz on"
+            f"setpoint would stop the modules; give them {min_watchdog_s:.3g} s or more, or a rate from "
+            f"{min_rate_hz:.0f} Hz on"
         )

@@ -1,7 +1,7 @@
-"""The modules' reports: raw numbers per joint, and counts of wrong frames.
+"""Collects the reports of the joint modules: the raw numbers of every joint, and counts of wrong frames.
 
-Pure: frames and Sync numbers in, no clock and no bus. Values are stored as raw integers, and scaled for all joints at
-once when a tick reads them.
+This module is pure: it gets frames and the numbers of Syncs, and uses neither a clock nor a bus. It stores values as
+raw integers, and scales them for all joints at once when a control cycle reads them.
 """
 
 from binascii import crc_hqx
@@ -11,281 +11,347 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
-    COUNTS,
+    COUNTER_MODULUS,
     FROM_HOST,
     MAX_UPTIME_MS,
     UPTIME_RANGE_MS,
-    Action,
+    CommandAction,
     Frame,
     LastStop,
     ModuleFault,
     ModuleState,
     Opcode,
     frame_id,
-    node_of,
-    opcode_of,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.base.arrays import Floats
 
-TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
-ONE_CLOCK_MS = 350  # two heartbeats whose uptimes differ by no more are of the same module
-LATE_SYNCS = 3  # a state this many Syncs late is still accepted, with its age; older counts are wrong
-COUNT_AT, STATE_AT = 3, 4  # in the result of `_read_state`
-UNTOUCHED = b""
-# Unknown ones count as FAULT.
+MAX_REPORT_DELAY_SYNCS = 3  # from a module's fault to the heartbeat that gives its reason
+MAX_HEARTBEAT_GAP_MS = 350  # heartbeats whose uptimes differ by less are of one module; it sends one every 100 ms
+MAX_LATE_SYNCS = 3  # a state that is later has a wrong counter; one that is not is accepted, with its age
+NO_CONTACT = b""  # report of a link that touches nothing
+
+# Signals of each frame in the order in which this module reads them.
+STATE_SIGNALS = ("angle", "velocity", "torque", "count", "state")
+SHAFT_SIGNALS = STATE_SIGNALS[:3]
+COUNT_INDEX = STATE_SIGNALS.index("count")
+STATE_INDEX = STATE_SIGNALS.index("state")
+CONTACT_SIGNALS = ("force_x", "force_y", "force_z", "along", "bearing")
+GYRO_SIGNALS = ("rate_x", "rate_y", "rate_z", "count")
+ACCELERATION_SIGNALS = ("acceleration_x", "acceleration_y", "acceleration_z", "count")
+HEALTH_SIGNALS = ("voltage", "current", "motor_temperature", "board_temperature", "leak")
+HEARTBEAT_SIGNALS = ("state", "last_stop", "uptime", *(f"fault_{fault.name.lower()}" for fault in ModuleFault))
+
+# The state field has four bits; a number that the protocol does not define counts as FAULT.
 STATES = [ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)]
-STOPPED = (ModuleState.FAULT, ModuleState.EMERGENCY)  # until a Clear
+LATCHED_STATES = (ModuleState.FAULT, ModuleState.EMERGENCY)  # a module leaves them only after a Clear
 
 
 @dataclass
-class Module:
-    """The state of one module. Numbers of Syncs are not modulo."""
+class ModuleStatus:
+    """What the driver knows of one module. Numbers of Syncs count from the start, without wrapping around."""
 
     node: int
-    sync: int = -1  # that the newest good state answers; -1: none yet
+
+    # Newest joint state.
+    sync: int = -1  # the Sync that the newest good state answers; -1: none yet
     state: ModuleState = ModuleState.BOOT
-    last_count: int = -1
-    repeats: int = 0  # states in a row with the same count
-    wrong_counts: int = 0  # in a row
-    corrupt: int = 0  # in a row
-    twice: int = 0  # Syncs in a row that were answered more than once, up to `twice_at`
-    twice_at: int = -1
-    frames: int = 0  # in this tick
-    awaited: bool = True  # whether it has answered recently
-    uptime_ms: int = -1
-    uptime_before_ms: int = -1
-    went_back: bool = False  # whether its uptime decreased in the newest heartbeat
-    restarts: int = 0  # times that its uptime decreased and continued from there, unlike after a late heartbeat
-    faults: int = 0  # bits, from the newest heartbeat
+    last_count: int = -1  # 0 to 15, as in the frame
+    awaited: bool = True  # whether the module has answered recently
+    stopped_syncs: int = 0  # consecutive states that were FAULT or EMERGENCY
+
+    # Wrong frames.
+    repeats: int = 0  # consecutive states with the same count
+    wrong_counts: int = 0  # consecutive
+    corrupt: int = 0  # consecutive states with a wrong checksum
+    double_answers: int = 0  # consecutive Syncs that were answered more than once, up to `double_answer_sync`
+    double_answer_sync: int = -1
+    frames: int = 0  # in this control cycle
+
+    # Heartbeats and Health reports.
+    uptime_ms: int = -1  # -1: no heartbeat yet
+    previous_uptime_ms: int = -1
+    uptime_decreased: bool = False  # in the newest heartbeat
+    restarts: int = 0  # times that the uptime decreased and continued from there, unlike after a late heartbeat
+    faults: int = 0  # bits of ModuleFault, from the newest heartbeat
     last_stop: LastStop = LastStop.NONE
-    heartbeat_sync: int = -1
-    health_sync: int = -1  # of the last Health report
-    stopped_syncs: int = 0  # in a row, in which its state was fault or emergency
+    heartbeat_sync: int = -1  # the Sync before the newest heartbeat
+    health_sync: int = -1  # the Sync before the newest Health report
 
     @property
     def needs_clearing(self) -> bool:
-        """Whether it is in a latched state, and its heartbeat had the time to report the reason."""
-        return self.state in STOPPED and (bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN)
+        """Return whether the state is latched and the module has had time to report the reason in a heartbeat."""
+        reason_is_due = bool(self.faults) or self.stopped_syncs >= MAX_REPORT_DELAY_SYNCS
+        return self.state in LATCHED_STATES and reason_is_due
 
     def answered_twice(self, sync: int) -> int:
-        """Syncs in a row, up to now, that were answered more than once."""
-        return self.twice if self.twice_at >= sync - 1 else 0
+        """Return how many consecutive Syncs, up to this one, the module answered more than once."""
+        if self.double_answer_sync < sync - 1:
+            return 0
+        return self.double_answers
 
     def fault_names(self) -> list[str]:
-        """Names of the fault bits."""
+        """Return the names of the active fault bits, in lower case."""
         return [fault.name.lower() for fault in ModuleFault if self.faults >> fault & 1]
 
 
-class Reading:
-    """The reports of all modules of a robot so far; joint i is node i + 1."""
+class ModuleReports:
+    """The newest reports of all modules of a robot. Joint i is node i + 1."""
 
     def __init__(self, joints: int) -> None:
-        self.modules = [Module(node) for node in range(1, joints + 1)]
-        self.sync = -1  # the newest one sent
+        self.modules = [ModuleStatus(node) for node in range(1, joints + 1)]
+
+        # What is still missing of the answers to the newest Sync.
+        self.sync = -1  # number of the newest Sync; -1: none was sent
         self.states_missing = joints
         self.contacts_missing = 0
         self.answers_missing = 0  # to parameter requests
-        self.strangers: Counter[int] = Counter()  # frames of unexpected nodes, since the last tick
+
+        # Frames that no module of this robot should send.
+        self.unknown_nodes: Counter[int] = Counter()  # frames by node, since the last control cycle
         self.from_other_host: Counter[Opcode] = Counter()
-        self.malformed = 0
-        layouts = codec()
-        self._joint = [(0,) * 5 for _ in range(joints)]  # as returned by `_read_state`
-        self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: no report yet
+        self.malformed = 0  # frames of known modules with a wrong length
+
+        # Raw numbers of the newest reports, by joint or link; None: no report yet.
+        self._shafts = [(0,) * len(STATE_SIGNALS) for _ in range(joints)]
+        self._contacts: list[bytes | None] = [None] * (joints + 1)
         self._gyro: list[tuple[int, ...] | None] = [None] * joints
         self._acceleration: list[tuple[int, ...] | None] = [None] * joints
         self._health: list[tuple[int, ...] | None] = [None] * joints
         self.shaft_raw: list[int | None] = [None] * joints
-        self._read_state = layouts[Opcode.JOINT_STATE].reader("angle", "velocity", "torque", "count", "state")
-        signals = layouts[Opcode.JOINT_STATE].signals
-        self._state_scale = np.array([[signals[name].scale] for name in ("angle", "velocity", "torque")])
+
+        # Frame layouts.
+        layouts = load_layouts()
+        joint_state = layouts[Opcode.JOINT_STATE]
         contact = layouts[Opcode.CONTACT]
-        self._read_contact = contact.reader("force_x", "force_y", "force_z", "along", "bearing")
-        self._read_touch = contact.reader("count", "touched")
-        self._read_gyro = layouts[Opcode.GYRO].reader("rate_x", "rate_y", "rate_z", "count")
-        names = ("acceleration_x", "acceleration_y", "acceleration_z", "count")
-        self._read_acceleration = layouts[Opcode.ACCELEROMETER].reader(*names)
-        names = ("voltage", "current", "motor_temperature", "board_temperature", "leak")
-        self._read_health = layouts[Opcode.HEALTH].reader(*names)
-        self._read_shaft = layouts[Opcode.SHAFT_LOAD].reader("torque")
         command = layouts[Opcode.COMMAND]
-        self._read_action, self._command_length = command.reader("action"), command.length
-        faults = [f"fault_{fault.name.lower()}" for fault in ModuleFault]
-        self._read_heartbeat = layouts[Opcode.HEARTBEAT].reader("state", "last_stop", "uptime", *faults)
-        # Functions rather than bound methods, which would keep this object until the garbage collector comes.
-        takers = {
-            Opcode.JOINT_STATE: Reading._take_state,
-            Opcode.CONTACT: Reading._take_contact,
-            Opcode.TAIL_CONTACT: Reading._take_tail_contact,
-            Opcode.HEARTBEAT: Reading._take_heartbeat,
-            Opcode.GYRO: Reading._take_gyro,
-            Opcode.ACCELEROMETER: Reading._take_acceleration,
-            Opcode.SHAFT_LOAD: Reading._take_shaft,
-            Opcode.HEALTH: Reading._take_health,
+        self._read_state = joint_state.make_reader(*STATE_SIGNALS)
+        self._shaft_scale = np.array([[joint_state.signals[name].scale] for name in SHAFT_SIGNALS])
+        self._read_contact = contact.make_reader(*CONTACT_SIGNALS)
+        self._read_touch = contact.make_reader("count", "touched")
+        self._read_gyro = layouts[Opcode.GYRO].make_reader(*GYRO_SIGNALS)
+        self._read_acceleration = layouts[Opcode.ACCELEROMETER].make_reader(*ACCELERATION_SIGNALS)
+        self._read_health = layouts[Opcode.HEALTH].make_reader(*HEALTH_SIGNALS)
+        self._read_shaft_load = layouts[Opcode.SHAFT_LOAD].make_reader("torque")
+        self._read_heartbeat = layouts[Opcode.HEARTBEAT].make_reader(*HEARTBEAT_SIGNALS)
+        self._read_action = command.make_reader("action")
+        self._command_length = command.length
+
+        # Functions rather than bound methods, which would keep this object until the garbage collector runs.
+        handlers = {
+            Opcode.JOINT_STATE: ModuleReports._on_joint_state,
+            Opcode.CONTACT: ModuleReports._on_contact,
+            Opcode.TAIL_CONTACT: ModuleReports._on_tail_contact,
+            Opcode.HEARTBEAT: ModuleReports._on_heartbeat,
+            Opcode.GYRO: ModuleReports._on_gyro,
+            Opcode.ACCELEROMETER: ModuleReports._on_acceleration,
+            Opcode.SHAFT_LOAD: ModuleReports._on_shaft_load,
+            Opcode.HEALTH: ModuleReports._on_health,
         }
-        self._known = {
-            frame_id(opcode, module.node): (take, module, layouts[opcode].length)
-            for opcode, take in takers.items()
+        self._handlers = {
+            frame_id(opcode, module.node): (handler, module, layouts[opcode].length)
+            for opcode, handler in handlers.items()
             for module in self.modules
         }
 
-    def begin(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
-        """A Sync is sent. Only modules that have answered recently are waited for.
+    # --- one Sync ---------------------------------------------------------------------------------------------
 
-        contacts, tail: whether force reports are due, and whether the tail link sends one of its own.
-        questions: number of parameter requests that are sent with it.
+    def begin_sync(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
+        """Start to count the answers to a Sync. Only modules that have answered recently are waited for.
+
+        Args:
+            sync: number of this Sync.
+            contacts: whether the modules report contact forces at this Sync.
+            tail: whether the tail link sends a contact report of its own.
+            questions: number of parameter requests that are sent with this Sync.
         """
         self.sync = sync
         for module in self.modules:
-            module.awaited = module.sync >= sync - 1 - LATE_SYNCS or module.sync < 0
+            module.awaited = module.sync >= sync - 1 - MAX_LATE_SYNCS or module.sync < 0
         self.states_missing = sum(module.awaited for module in self.modules)
-        self.contacts_missing = (self.states_missing + (tail and self.modules[0].awaited)) if contacts else 0
-        self.answers_missing = questions
+        self.contacts_missing = 0
         if contacts:
-            self._contact = [None] * len(self._contact)
-        self.forget_frames()
+            tail_is_awaited = tail and self.modules[0].awaited
+            self.contacts_missing = self.states_missing + tail_is_awaited
+            self._contacts = [None] * len(self._contacts)
+        self.answers_missing = questions
+        self.reset_frame_counts()
 
     @property
     def complete(self) -> bool:
-        """Whether all awaited modules have answered."""
+        """Return whether all awaited modules have answered."""
         return self.states_missing <= 0 and self.contacts_missing <= 0 and self.answers_missing <= 0
 
-    def take(self, frame: Frame) -> None:
-        """Process one frame."""
-        known = self._known.get(frame.id)
+    def reset_frame_counts(self) -> None:
+        """Forget how many frames each module sent, because the counts cover more than one period."""
+        for module in self.modules:
+            module.frames = 0
+
+    def process_frame(self, frame: Frame) -> None:
+        """Store the report in one received frame, or count the frame if it is none of this robot's."""
+        known = self._handlers.get(frame.id)
         if known is None:
-            self._take_other(frame)
+            self._count_other_frame(frame)
             return
-        take, module, length = known
+        handler, module, length = known
         module.frames += 1
         if len(frame.data) == length:
-            take(self, module, frame)
+            handler(self, module, frame)
         else:
             self.malformed += 1
 
-    def _take_other(self, frame: Frame) -> None:
-        opcode, node = opcode_of(frame.id), node_of(frame.id)
+    def _count_other_frame(self, frame: Frame) -> None:
+        opcode = parse_opcode(frame.id)
+        node = parse_node(frame.id)
         if opcode in FROM_HOST:
-            if not self._only_asks(frame):
+            if not self._is_identify(frame):
                 self.from_other_host[Opcode(opcode)] += 1
         elif not 1 <= node <= len(self.modules):
-            self.strangers[node] += 1
+            self.unknown_nodes[node] += 1
         else:
             self.modules[node - 1].frames += 1
             self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
-    def _only_asks(self, frame: Frame) -> bool:
-        """Whether it is only an `identify` of another host."""
-        is_command = opcode_of(frame.id) == Opcode.COMMAND and len(frame.data) == self._command_length
-        return is_command and self._read_action(frame.data) == (Action.IDENTIFY,)
+    def _is_identify(self, frame: Frame) -> bool:
+        """Return whether a frame of another host only asks modules for their identity, which disturbs nothing."""
+        if parse_opcode(frame.id) != Opcode.COMMAND or len(frame.data) != self._command_length:
+            return False
+        return self._read_action(frame.data) == (CommandAction.IDENTIFY,)
 
-    def forget_frames(self) -> None:
-        """Reset the frame counts, which cover more than one period."""
-        for module in self.modules:
-            module.frames = 0
+    # --- values -----------------------------------------------------------------------------------------------
 
-    # --- joint states, in SI units ----------------------------------------------------------------------------
+    def shaft_values(self) -> Floats:
+        """Return the angle in rad, velocity in rad/s and torque in N·m of every module's shaft, (3, n_joints)."""
+        return np.array(self._shafts).T[: len(SHAFT_SIGNALS)] * self._shaft_scale
 
-    def joints(self) -> Floats:
-        """Angle, velocity and torque of every module's shaft, (3, n_joints)."""
-        return np.array(self._joint).T[:COUNT_AT] * self._state_scale
+    def list_contacts(self) -> list[tuple[int, tuple[int, ...]]]:
+        """Return every link that reported a contact at this Sync, with the raw numbers of CONTACT_SIGNALS."""
+        return [(link, self._read_contact(data)) for link, data in enumerate(self._contacts) if data]
 
-    def links_touched(self) -> list[tuple[int, tuple[int, ...]]]:
-        """(link, raw force x y z, place along and bearing) of every link that reported a contact at this Sync."""
-        return [(link, self._read_contact(data)) for link, data in enumerate(self._contact) if data]
+    def take_imu_reports(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
+        """Return and forget the reports of every IMU that has reported since the last call.
 
-    def imus(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
-        """(link, raw rates, raw accelerations) of every link whose IMU has reported since the last call."""
-        found = []
-        for i, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
-            if gyro is not None and acceleration is not None and gyro[3] == acceleration[3]:  # of one Sync
-                found.append((i + 1, gyro[:3], acceleration[:3]))
-                self._gyro[i] = self._acceleration[i] = None
-        return found
+        Returns:
+            Link, raw angular rates (3,) and raw accelerations (3,), both sampled at the same Sync.
+        """
+        reports = []
+        for joint, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
+            if gyro is None or acceleration is None:
+                continue
+            gyro_count = gyro[-1]
+            acceleration_count = acceleration[-1]
+            if gyro_count != acceleration_count:
+                continue
+            reports.append((joint + 1, gyro[:-1], acceleration[:-1]))
+            self._gyro[joint] = None
+            self._acceleration[joint] = None
+        return reports
 
     def health(self) -> list[tuple[int, ...] | None]:
-        """Raw voltage, current, two temperatures and leak of every module; None: no report yet."""
+        """Return the raw numbers of HEALTH_SIGNALS of every module; None where no report has arrived yet."""
         return self._health
 
-    # --- one kind of frame each ---------------------------------------------------------------------------------
+    # --- one kind of frame each -------------------------------------------------------------------------------
 
-    def _take_state(self, module: Module, frame: Frame) -> None:
+    def _on_joint_state(self, module: ModuleStatus, frame: Frame) -> None:
         identifier, data = frame
-        if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `intact`, without a call
+        if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `has_valid_checksum`, without the cost of a call
             module.corrupt += 1
             return
         numbers = self._read_state(data)
-        count = numbers[COUNT_AT]
-        module.repeats = module.repeats + 1 if count == module.last_count else 0
+        count = numbers[COUNT_INDEX]
+        if count == module.last_count:
+            module.repeats += 1
+        else:
+            module.repeats = 0
         module.last_count = count
-        late = (self.sync - count) % COUNTS
-        if late > LATE_SYNCS:
+        late_syncs = (self.sync - count) % COUNTER_MODULUS
+        if late_syncs > MAX_LATE_SYNCS:
             module.wrong_counts += 1
             return
-        sync = self.sync - late
+        sync = self.sync - late_syncs
         if sync <= module.sync:
-            if late == 0:
-                self._answered_twice(module)
+            if late_syncs == 0:
+                self._count_double_answer(module)
             return
-        module.corrupt = module.wrong_counts = 0
+        module.corrupt = 0
+        module.wrong_counts = 0
         module.sync = sync
-        module.state = STATES[numbers[STATE_AT]]
-        module.stopped_syncs = module.stopped_syncs + 1 if module.state in STOPPED else 0
-        self._joint[module.node - 1] = numbers
-        if late == 0:
+        module.state = STATES[numbers[STATE_INDEX]]
+        if module.state in LATCHED_STATES:
+            module.stopped_syncs += 1
+        else:
+            module.stopped_syncs = 0
+        self._shafts[module.node - 1] = numbers
+        if late_syncs == 0:
             self.states_missing -= module.awaited
 
-    def _answered_twice(self, module: Module) -> None:
-        if module.twice_at < self.sync:
-            module.twice = module.twice + 1 if module.twice_at == self.sync - 1 else 1
-            module.twice_at = self.sync
+    def _count_double_answer(self, module: ModuleStatus) -> None:
+        """Count a Sync that a module answered more than once; a third answer to it is not counted again."""
+        if module.double_answer_sync >= self.sync:
+            return
+        if module.double_answer_sync == self.sync - 1:
+            module.double_answers += 1
+        else:
+            module.double_answers = 1
+        module.double_answer_sync = self.sync
 
-    def _take_contact(self, module: Module, frame: Frame) -> None:
-        self._take_link(module, module.node, frame.data)
+    def _on_contact(self, module: ModuleStatus, frame: Frame) -> None:
+        self._store_contact(module, module.node, frame.data)
 
-    def _take_tail_contact(self, module: Module, frame: Frame) -> None:
-        self._take_link(module, module.node - 1, frame.data)
+    def _on_tail_contact(self, module: ModuleStatus, frame: Frame) -> None:
+        self._store_contact(module, module.node - 1, frame.data)
 
-    def _take_link(self, module: Module, link: int, data: bytes) -> None:
+    def _store_contact(self, module: ModuleStatus, link: int, data: bytes) -> None:
+        """Store the first contact report of a link that answers the newest Sync."""
         count, touched = self._read_touch(data)
-        if (self.sync - count) % COUNTS == 0 and self._contact[link] is None:
-            self._contact[link] = data if touched else UNTOUCHED
+        answers_this_sync = (self.sync - count) % COUNTER_MODULUS == 0
+        if answers_this_sync and self._contacts[link] is None:
+            self._contacts[link] = data if touched else NO_CONTACT
             self.contacts_missing -= module.awaited
 
-    def _take_heartbeat(self, module: Module, frame: Frame) -> None:
-        state, last_stop, uptime_ms, *bits = self._read_heartbeat(frame.data)
-        goes_on = 0 <= uptime_ms - module.uptime_ms < ONE_CLOCK_MS
-        if module.went_back and goes_on and uptime_ms < module.uptime_before_ms:
-            module.restarts += 1
-        module.went_back = uptime_ms < module.uptime_ms and not has_wrapped(module.uptime_ms, uptime_ms)
-        module.uptime_before_ms, module.uptime_ms = module.uptime_ms, uptime_ms
+    def _on_heartbeat(self, module: ModuleStatus, frame: Frame) -> None:
+        state, last_stop, uptime_ms, *fault_bits = self._read_heartbeat(frame.data)
+        self._update_uptime(module, uptime_ms)
         module.heartbeat_sync = self.sync
-        module.faults = sum(bit << i for i, bit in enumerate(bits))
+        module.faults = sum(bit << i for i, bit in enumerate(fault_bits))
         module.last_stop = LastStop(last_stop) if last_stop < len(LastStop) else LastStop.NONE
         module.state = STATES[state]
 
-    def _take_gyro(self, module: Module, frame: Frame) -> None:
+    def _update_uptime(self, module: ModuleStatus, uptime_ms: int) -> None:
+        """Store an uptime, and count a restart if the uptime decreased and then continued from the lower value."""
+        continues = 0 <= uptime_ms - module.uptime_ms < MAX_HEARTBEAT_GAP_MS
+        if module.uptime_decreased and continues and uptime_ms < module.previous_uptime_ms:
+            module.restarts += 1
+        module.uptime_decreased = uptime_ms < module.uptime_ms and not has_wrapped(module.uptime_ms, uptime_ms)
+        module.previous_uptime_ms = module.uptime_ms
+        module.uptime_ms = uptime_ms
+
+    def _on_gyro(self, module: ModuleStatus, frame: Frame) -> None:
         self._gyro[module.node - 1] = self._read_gyro(frame.data)
 
-    def _take_acceleration(self, module: Module, frame: Frame) -> None:
+    def _on_acceleration(self, module: ModuleStatus, frame: Frame) -> None:
         self._acceleration[module.node - 1] = self._read_acceleration(frame.data)
 
-    def _take_shaft(self, module: Module, frame: Frame) -> None:
-        self.shaft_raw[module.node - 1] = self._read_shaft(frame.data)[0]
+    def _on_shaft_load(self, module: ModuleStatus, frame: Frame) -> None:
+        (torque,) = self._read_shaft_load(frame.data)
+        self.shaft_raw[module.node - 1] = torque
 
-    def _take_health(self, module: Module, frame: Frame) -> None:
+    def _on_health(self, module: ModuleStatus, frame: Frame) -> None:
         self._health[module.node - 1] = self._read_health(frame.data)
         module.health_sync = self.sync
 
 
 def has_wrapped(before_ms: int, now_ms: int) -> bool:
-    """Return whether an uptime went on from 0 because its 32 bits were full, after 49.7 days.
+    """Return whether an uptime continued from 0 because its 32 bits were full, after 49.7 days.
 
-    The protocol forbids that, but a firmware that does so must not stop the robot: such a module goes on, and a restart
-    of it in that third of a second would show in its state. An uptime at the end of its range has stayed there, as the
-    protocol demands; from there a lower one is a restart.
+    The protocol forbids that, but a firmware that does so must not stop the robot. A real restart within that third of
+    a second is still detected, by the module's state. The protocol demands that an uptime at the end of its range stays
+    there; a lower uptime after that is a restart.
     """
     if before_ms >= MAX_UPTIME_MS:
         return False
-    return (now_ms - before_ms) % UPTIME_RANGE_MS < ONE_CLOCK_MS
+    return (now_ms - before_ms) % UPTIME_RANGE_MS < MAX_HEARTBEAT_GAP_MS

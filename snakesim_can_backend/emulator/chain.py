@@ -1,28 +1,36 @@
 """All modules of a robot, their motors and the physics model that they move, on one clock.
 
-    at a Sync: the physics model is advanced to now, sensors are read, every module answers, then enacts its setpoint
+At a Sync the chain advances the physics model to the present, reads the sensors, and lets every module answer; then
+every module follows its newest setpoint.
 
-With `stepped`, time advances only when a Sync's time is later than that of the one before, and frames are sent at once:
-a host may compute for any time, and every run is the same. Otherwise the caller passes in the time.
+With `stepped`, time advances only when a Sync's time is later than that of the Sync before, and frames are sent at
+once: a host may compute for any time, and every run is the same. Otherwise the caller passes in the time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from math import inf
 from zlib import crc32
 
 import msgspec
 
-from snakesim_can_backend.bus.load import shares
+from snakesim_can_backend.bus.load import joints_per_bus
 from snakesim_can_backend.emulator.bus_time import BusTime, Traffic
-from snakesim_can_backend.emulator.faults import parse
-from snakesim_can_backend.emulator.firmware import BOOT_US, Module
+from snakesim_can_backend.emulator.faults import parse_fault
+from snakesim_can_backend.emulator.firmware import BOOT_US, ModuleFirmware
 from snakesim_can_backend.emulator.frames import LENGTHS, read_sync
 from snakesim_can_backend.emulator.module_sensors import ModuleSensors
-from snakesim_can_backend.emulator.module_slot import ModuleSlot
-from snakesim_can_backend.emulator.node_ids import node_ids
-from snakesim_can_backend.emulator.parameters import Parameters, from_factory
-from snakesim_can_backend.protocol.definitions import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
+from snakesim_can_backend.emulator.module_slot import ModuleSlot, assign_node_ids
+from snakesim_can_backend.emulator.parameters import ParameterStore, make_factory_defaults
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    FROM_HOST,
+    Frame,
+    ModuleParameter,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import build_config, build_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
@@ -35,16 +43,16 @@ from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Mode
 
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
-HEAT_EVERY = 10  # steps
-ROUND_US = 1 << 32  # Sync times wrap around
-# A Sync that is later by more is of another clock; no bus is cut for that long in lockstep.
-LONGEST_STEP_US = 60_000_000
+HEAT_EVERY = 10  # physics steps; windings heat up slowly
+SYNC_TIME_RANGE_US = 1 << 32  # the time in a Sync has 32 bits and wraps around
+MAX_STEP_US = 60_000_000  # a Sync that is later by more is of another clock; no lockstep bus is cut for that long
 NEW_HOST_US = 1_000_000  # a Sync that is earlier by this much is of a restarted host, not a late one of another bus
-OTHER_SERIAL = 0x0D0B1E00
+DUPLICATE_SERIAL_MASK = 0x0D0B1E00  # makes the serial number of an injected duplicate
+HEARTBEAT_BYTES = 8
 
 
 class ModuleChain:
-    """Every module, tail to head; joint_i is node i."""
+    """Every module of a robot, tail to head. Joint i moves with node i, unless the settings mount it elsewhere."""
 
     def __init__(
         self,
@@ -55,72 +63,122 @@ class ModuleChain:
         stepped: bool,
         send_pose: Callable[[bytes], None] | None = None,
     ) -> None:
-        """send_pose: gets a MocapSample as JSON after every Sync, before the joint states. Raises ConfigError."""
-        robot, self.stepped, self.physics_model = config.robot, stepped, physics_model
-        self.count = robot.chain.modules
-        self.counts = shares(config, settings)  # modules on each bus
+        """Create all modules; they boot.
+
+        Args:
+            config: the run, with the robot.
+            settings: settings of the backend: buses, faults, and how the modules are really mounted.
+            physics_model: what the motors move.
+            stepped: whether time advances only from Sync to Sync.
+            send_pose: gets a MocapSample as JSON after every Sync, before the joint states.
+
+        Raises:
+            ConfigError: the modules do not fit on the buses, or a fault or a node id is impossible.
+        """
+        robot = config.robot
+
+        # Modules and buses.
+        self.stepped = stepped
+        self.module_count = robot.chain.modules
+        self.modules_per_bus = joints_per_bus(config, settings)
+        self.buses = [BusTime(settings.bit_rate) for _ in self.modules_per_bus]
+        self.slots: list[ModuleSlot] = []  # tail to head; then injected duplicates
+        self._node_ids = assign_node_ids(robot, settings)
+        self._configured_joints = robot.joint_table  # as the robot file describes them
+        self._joints = build_joints(robot, settings.mounted)  # as they are really built
+        unconnected = {name for name, mount in settings.mounted.items() if not mount.connected}
+        self._unconnected = {i for i, joint in enumerate(self._joints) if joint.name in unconnected}
+
+        # The body.
+        self.physics_model = physics_model
         self.motors = Motors(build_config(config, settings.mounted).robot, physics_model.step_s)
-        self._joints, self._told = build_joints(robot, settings.mounted), robot.joint_table
-        self._nodes = node_ids(robot, settings)
-        loose = {name for name, truth in settings.mounted.items() if not truth.connected}
-        self._loose = {i for i, joint in enumerate(self._joints) if joint.name in loose}
         self.thermal = Thermal(self._joints)
-        self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
-        self.now_us = 0.0  # module time: since the emulators were started
+
+        # Time.
+        self.now_us = 0.0  # module time, since the emulators were started
         self.skipped_us = 0.0  # time in which this process did not run
+        self._step_us = physics_model.step_s * 1e6
+        self._steps = 0
+        self._due_us = 0.0  # when `_poll` is due
+        self._sync_time: int | None = None  # time in the newest Sync; None: none yet
+
+        # Frames.
         self.refused = 0  # frames that no host sends
-        self.happened: list[str] = []  # injected faults, each begin and end
-        self._plan = Plan(parse(text, self.count) for text in settings.faults)
-        self._step_us, self._steps, self._due_us = physics_model.step_s * 1e6, 0, 0.0
-        self._sync_time: int | None = None
-        self._pose_time: int | None = None
-        starts = [0, *accumulate(self.counts)]
-        self.slots: list[ModuleSlot] = []
-        for channel, count in enumerate(self.counts):
-            for joint in range(starts[channel], starts[channel] + count):
-                serial = crc32(f"{config.seed}:{joint + 1}".encode())
-                self._seat(joint, channel, serial, -BOOT_US if stepped else 0.0)
-        self._senses = [
-            ModuleSensors(
-                robot, physics_model, Mounting(self._joints[start : start + count]), start, (config.seed, channel)
-            )
-            for channel, (start, count) in enumerate(zip(starts, self.counts, strict=False))
-        ]
+        self._outgoing: list[list[Frame]] = [[] for _ in self.modules_per_bus]  # by bus, in stepped time
+
+        # Injected faults.
+        self.fault_log: list[str] = []  # each begin and end
+        self._plan = Plan(parse_fault(text, self.module_count) for text in settings.faults)
+        self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
+
+        # Motion capture.
         self._send_pose = send_pose
         self._camera: PoseCamera | None = None
-        if send_pose is not None and robot.sensors.pose is not None:
-            self._camera = PoseCamera(
-                robot.sensors.pose, physics_model, (config.seed, len(self.counts)), config.period_ns
-            )
+        self._pose_time: int | None = None  # time in the Sync that the newest pose belongs to
         self._encode = msgspec.json.Encoder().encode
-        self._out: list[list[Frame]] = [[] for _ in self.counts]
-        self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
+        if send_pose is not None and robot.sensors.pose is not None:
+            camera_seed = (config.seed, len(self.modules_per_bus))
+            self._camera = PoseCamera(robot.sensors.pose, physics_model, camera_seed, config.period_ns)
+
+        self._sensors: list[ModuleSensors] = []  # by bus
+        starts = [0, *accumulate(self.modules_per_bus)]
+        for channel, count in enumerate(self.modules_per_bus):
+            first = starts[channel]
+            joints = range(first, first + count)
+            for joint in joints:
+                serial = crc32(f"{config.seed}:{joint + 1}".encode())
+                self._add_module(joint, channel, serial, -BOOT_US if stepped else 0.0)
+            mounting = Mounting(self._joints[first : first + count])
+            self._sensors.append(ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel)))
         self._poll(0.0)
+
+    def _add_module(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
+        """Put a module of a joint on a bus; drives: whether a motor of its own moves the joint."""
+        joint_model = self._joints[joint]
+        limits = joint_model.limits
+        # The manufacturer sets the ratings, and does not know which gear the module will get.
+        gear = self._configured_joints[joint].drive.gear
+        firmware = ModuleFirmware(
+            self._node_ids[joint],
+            serial,
+            ParameterStore(make_factory_defaults(limits.torque_nm / gear, limits.speed_rad_s * gear)),
+            self.thermal.limits[joint],
+            min_voltage_v=limits.min_voltage_v,
+            stepped=self.stepped,
+            now_us=now_us,
+        )
+        has_motor = drives and joint not in self._unconnected
+        self.slots.append(ModuleSlot(len(self.slots), channel, joint, firmware, joint_model, drives=has_motor))
 
     # --- time ----------------------------------------------------------------------------------------------
 
     def advance_to(self, clock_us: float) -> None:
         """Advance everything to a time since the start. Not for stepped chains, whose time advances at Syncs."""
         now_us = clock_us - self.skipped_us
-        if now_us - self.now_us > MAX_AT_ONCE_US:
+        delay_us = now_us - self.now_us
+        if delay_us > MAX_AT_ONCE_US:
             self.skipped_us += now_us - self.now_us - MAX_AT_ONCE_US
             now_us = self.now_us + MAX_AT_ONCE_US
         if now_us > self.now_us:
-            self._pass(now_us, int(now_us / self._step_us) - self._steps)
+            due_steps = int(now_us / self._step_us)
+            self._run_physics(now_us, due_steps - self._steps)
 
     def next_us(self) -> float:
-        """Module time at which a frame is sent or a module is due; inf for a stepped chain."""
+        """Return the module time at which a frame is sent or a module is due; inf for a stepped chain."""
         if self.stepped:
             return inf
         return min(self._due_us, *(bus.next_us() for bus in self.buses))
 
-    def _pass(self, until_us: float, steps: int) -> None:
-        physics_model, motors, step_us = self.physics_model, self.motors, self._step_us
+    def _run_physics(self, until_us: float, steps: int) -> None:
+        """Advance the physics model by some steps, and the modules to a time."""
+        physics_model = self.physics_model
+        motors = self.motors
+        step_us = self._step_us
         for _ in range(steps):
             physics_model.advance(motors.step(physics_model.angle_rad, physics_model.velocity_rad_s))
             self._steps += 1
             if self._steps % HEAT_EVERY == 0:
-                self._warm()
+                self._heat_motors()
             time_us = self._steps * step_us
             if time_us >= self._due_us:
                 self.now_us = max(min(time_us, until_us), self.now_us)
@@ -129,182 +187,225 @@ class ModuleChain:
         if until_us >= self._due_us:
             self._poll(until_us)
 
-    def _warm(self) -> None:
+    def _heat_motors(self) -> None:
+        """Update the temperatures of all motors, and poll the modules at once if one is too hot."""
         self.thermal.pass_time(HEAT_EVERY * self.physics_model.step_s, self.motors.take_heat())
-        self._derate()
+        self._derate_motors()
         if (self.thermal.winding_c >= self.thermal.stop_at_c).any():
             self._due_us = -inf
 
-    def _derate(self) -> None:
-        if (remaining_fraction := self.thermal.remaining_fraction()) is not None:
+    def _derate_motors(self) -> None:
+        remaining_fraction = self.thermal.remaining_fraction()
+        if remaining_fraction is not None:
             self.motors.derate(remaining_fraction)
 
     def _poll(self, now_us: float) -> None:
-        """Everything that depends on time, except physics."""
+        """Run everything that depends on time, except physics: planned faults, modules, babblers."""
         for change in self._plan.until(now_us / 1e6):
-            self._go_wrong(change, now_us)
-        speeds = self.physics_model.velocity_rad_s.tolist()
-        windings, boards = self.thermal.winding_c.tolist(), self.thermal.board_c().tolist()
-        watts = self.thermal.power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s).tolist()
+            self._apply_fault(change, now_us)
+        speeds_rad_s = self.physics_model.velocity_rad_s.tolist()
+        windings_c = self.thermal.winding_c.tolist()
+        boards_c = self.thermal.board_c().tolist()
+        powers_w = self.thermal.power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s).tolist()
         due_us = self._plan.next_s() * 1e6
         for slot in self.slots:
-            j = slot.joint
-            slot.feel(speeds[j], watts[j], windings[j], boards[j])
+            joint = slot.joint
+            slot.update_health(speeds_rad_s[joint], powers_w[joint], windings_c[joint], boards_c[joint])
             due_us = min(due_us, slot.module.poll(now_us))
-            self._follow_up(slot)
+            self._follow_module(slot)
+        if self._babblers:
+            self._send_babble(now_us)
+            due_us = now_us
+        self._due_us = due_us
+
+    def _send_babble(self, now_us: float) -> None:
+        """In stepped time, send as many heartbeats of babbling modules as the bus could have carried."""
         for slot, since_us in self._babblers.items():
-            frame_us = self.buses[slot.channel].frame_us[8]
-            burst = int((now_us - since_us) / frame_us)
-            self._out[slot.channel].extend([slot.module.heartbeat(now_us)] * burst)
-            self._babblers[slot] = since_us + burst * frame_us
-        self._due_us = now_us if self._babblers else due_us
+            frame_us = self.buses[slot.channel].frame_us[HEARTBEAT_BYTES]
+            frames = int((now_us - since_us) / frame_us)
+            self._outgoing[slot.channel].extend([slot.module.heartbeat(now_us)] * frames)
+            self._babblers[slot] = since_us + frames * frame_us
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
     def receive(self, channel: int, frame: Frame) -> None:
-        """A frame of the host has arrived."""
-        opcode, node = opcode_of(frame.id), node_of(frame.id)
+        """Process a frame of the host that has arrived on a bus."""
+        opcode = parse_opcode(frame.id)
+        node = parse_node(frame.id)
         # An Emergency is valid at any length.
-        wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)
-        if opcode not in FROM_HOST or wrong_length:
+        has_wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)
+        if opcode not in FROM_HOST or has_wrong_length:
             self.refused += 1
             return
         if self.stepped:
-            self.buses[channel].count(frame)
+            self.buses[channel].count_frame(frame)
         else:
-            self.buses[channel].heard(frame, self.now_us)
-        if opcode == Opcode.SYNC:
-            self._sync(channel, frame)
-        elif opcode == Opcode.SET_POINT:
-            for slot in self._at(channel, node):
-                slot.module.receive_setpoint(frame, self.now_us)
-                if slot.module.frames:
-                    self._follow_up(slot)
-        else:
-            everybody = node == BROADCAST and opcode != Opcode.PARAMETER_REQUEST
-            for slot in self.slots if everybody else self._at(channel, node):
-                if slot.channel == channel:
-                    slot.module.receive(frame, self.now_us)
-                    self._follow_up(slot)
-            if opcode != Opcode.PARAMETER_REQUEST:
+            self.buses[channel].record_host_frame(frame, self.now_us)
+        match opcode:
+            case Opcode.SYNC:
+                self._receive_sync(channel, frame)
+            case Opcode.SET_POINT:
+                for slot in self._slots_of_node(channel, node):
+                    slot.module.receive_setpoint(frame, self.now_us)
+                    if slot.module.frames:
+                        self._follow_module(slot)
+            case Opcode.PARAMETER_REQUEST:
+                self._deliver(self._slots_of_node(channel, node), frame)
+            case _:  # Emergency and Command
+                if node == BROADCAST:
+                    slots = [slot for slot in self.slots if slot.channel == channel]
+                else:
+                    slots = self._slots_of_node(channel, node)
+                self._deliver(slots, frame)
                 self._poll(self.now_us)
 
-    def take(self, channel: int) -> list[Frame]:
-        """Frames that are on the bus by now, in the order of arbitration, each once."""
+    def take_frames(self, channel: int) -> list[Frame]:
+        """Return the frames that are on a bus by now, in the order of arbitration, each once."""
         if not self.stepped:
-            return self.buses[channel].released(self.now_us)
-        frames, self._out[channel] = self._out[channel], []
+            return self.buses[channel].take_sent_frames(self.now_us)
+        frames = self._outgoing[channel]
+        self._outgoing[channel] = []
         for frame in frames:
-            self.buses[channel].count(frame)
+            self.buses[channel].count_frame(frame)
         return frames
 
     def traffic(self) -> list[Traffic]:
-        """Traffic of each bus until now."""
+        """Return the traffic of each bus until now."""
         return [bus.traffic(self.now_us) for bus in self.buses]
 
-    def _sync(self, channel: int, frame: Frame) -> None:
+    def _deliver(self, slots: Sequence[ModuleSlot], frame: Frame) -> None:
+        for slot in slots:
+            slot.module.receive(frame, self.now_us)
+            self._follow_module(slot)
+
+    def _slots_of_node(self, channel: int, node: int) -> list[ModuleSlot]:
+        """Return the modules with a node id on a bus: one, or several if there are duplicates."""
+        slots: list[ModuleSlot] = []
+        if 1 <= node <= self.module_count:
+            slots.append(self.slots[self._node_ids.index(node)])
+        if len(self.slots) > self.module_count:
+            slots += [slot for slot in self.slots[self.module_count :] if slot.module.node == node]
+        return [slot for slot in slots if slot.channel == channel]
+
+    # --- a Sync --------------------------------------------------------------------------------------------
+
+    def _receive_sync(self, channel: int, frame: Frame) -> None:
+        """Advance to a Sync, send the pose, and let every module of its bus answer and follow its setpoint."""
         count, time = read_sync(frame.data)
-        sent = len(self._out[channel])
+        frames = self._outgoing[channel]
+        sent_before = len(frames)
         if self.stepped:
             self._step_to(time)
-        if self._camera is not None and self._send_pose is not None and time != self._pose_time:
-            self._pose_time = time
-            sample = self._camera.capture(round(self.now_us * 1000))
-            if sample is not None:
-                self._send_pose(self._encode(sample))
-        first = sum(self.counts[:channel])
+        self._send_pose_once(time)
+
         slots = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
-        imu_due = [slot.module.imu_is_due() for slot in slots[: self.counts[channel]]]
-        readings = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
+        own_slots = slots[: self.modules_per_bus[channel]]
+        imu_due = [slot.module.imu_is_due() for slot in own_slots]
+        readings = self._sensors[channel].read(self.motors.torque_nm, self.motors.derated(), imu_due)
+        first_joint = sum(self.modules_per_bus[:channel])
         for slot in slots:
-            slot.module.sync(count, readings[slot.joint - first])
-            self._follow_up(slot)
-        out = self._out[channel]
-        out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # in the order of arbitration
+            slot.module.sync(count, readings[slot.joint - first_joint])
+            self._follow_module(slot)
+
+        answers = sorted(frames[sent_before:], key=lambda frame: frame.id)  # in the order of arbitration
+        frames[sent_before:] = answers
 
     def _step_to(self, sync_time: int) -> None:
         """Advance by the time from the latest Sync to this one. The first sets zero, as does one of another clock."""
-        later_us = 0 if self._sync_time is None else (sync_time - self._sync_time) % ROUND_US
-        if 0 < later_us <= LONGEST_STEP_US:
+        later_us = 0
+        if self._sync_time is not None:
+            later_us = (sync_time - self._sync_time) % SYNC_TIME_RANGE_US
+        earlier_us = SYNC_TIME_RANGE_US - later_us
+        if 0 < later_us <= MAX_STEP_US:
             until_us = self.now_us + later_us
-            self._pass(until_us, round(until_us / self._step_us) - self._steps)
-        elif 0 < ROUND_US - later_us < NEW_HOST_US:
+            self._run_physics(until_us, round(until_us / self._step_us) - self._steps)
+        elif 0 < earlier_us < NEW_HOST_US:
             return
         self._sync_time = sync_time
 
-    def _at(self, channel: int, node: int) -> list[ModuleSlot]:
-        found = [self.slots[self._nodes.index(node)]] if 1 <= node <= self.count else []
-        if len(self.slots) > self.count:
-            found += [slot for slot in self.slots[self.count :] if slot.module.node == node]
-        return [slot for slot in found if slot.channel == channel]
-
-    # --- what goes out -------------------------------------------------------------------------------------
-
-    def _follow_up(self, slot: ModuleSlot) -> None:
-        """Send a module's frames, and apply its demand to its motor."""
-        for frame in slot.outgoing():
-            if self.stepped:
-                self._out[slot.channel].append(frame)
-            else:
-                self.buses[slot.channel].offer(slot.sender, frame, self.now_us)
-        demand = slot.module.demand
-        if demand is slot.driven or not slot.drives:
+    def _send_pose_once(self, sync_time: int) -> None:
+        """Send the pose for a Sync; a Sync of the same time on another bus sends none."""
+        if self._camera is None or self._send_pose is None or sync_time == self._pose_time:
             return
+        self._pose_time = sync_time
+        sample = self._camera.capture(round(self.now_us * 1000))
+        if sample is not None:
+            self._send_pose(self._encode(sample))
+
+    # --- frames and demands of the modules -----------------------------------------------------------------
+
+    def _follow_module(self, slot: ModuleSlot) -> None:
+        """Send a module's frames, and apply its demand to its motor."""
+        for frame in slot.take_frames():
+            if self.stepped:
+                self._outgoing[slot.channel].append(frame)
+            else:
+                self.buses[slot.channel].enqueue(slot.sender, frame, self.now_us)
+        if slot.module.demand is not slot.driven and slot.drives:
+            self._drive_motor(slot)
+
+    def _drive_motor(self, slot: ModuleSlot) -> None:
+        """Apply a module's demand and gains to its motor, converted from the module's shaft to the joint."""
+        demand = slot.module.demand
         slot.driven = demand
         values = slot.module.parameters.values
-        damping = Parameter.DAMPING if demand.mode == Mode.POSITION else Parameter.VELOCITY_GAIN
-        mount = slot.built.drive
+        drive = slot.joint_model.drive
+        gear = drive.gear
+        damping = ModuleParameter.VELOCITY_GAIN
+        if demand.mode == Mode.POSITION:
+            damping = ModuleParameter.DAMPING
+        torque_limit_nm = inf
+        if demand.mode != Mode.PASSIVE:
+            torque_limit_nm = min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * gear
         self.motors.drive(
             slot.joint,
             demand.mode,
-            joint_target(mount, demand.mode, demand.target),
-            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) * mount.gear if demand.mode else inf,
-            values[Parameter.STIFFNESS] * mount.gear**2,
-            values[damping] * mount.gear**2,
-            values[Parameter.SPEED_LIMIT] / mount.gear,
+            joint_target(drive, demand.mode, demand.target),
+            torque_limit_nm,
+            values[ModuleParameter.STIFFNESS] * gear**2,
+            values[damping] * gear**2,
+            values[ModuleParameter.SPEED_LIMIT] / gear,
         )
 
     # --- injected faults -----------------------------------------------------------------------------------
 
     def inject(self, fault: Injection, *, begins: bool = True) -> None:
         """Begin or end a fault now."""
-        self._go_wrong(Change(self.now_us / 1e6, fault, begins), self.now_us)
+        self._apply_fault(Change(self.now_us / 1e6, fault, begins), self.now_us)
         self._poll(self.now_us)
 
-    def _go_wrong(self, change: Change, now_us: float) -> None:
-        fault, joint = change.injection, change.injection.number
+    def _apply_fault(self, change: Change, now_us: float) -> None:
+        fault = change.injection
+        begins = change.begins
+        joint = fault.number
         slot = self.slots[joint]
-        self.happened.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if change.begins else 'ends'}")
+        self.fault_log.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if begins else 'ends'}")
         match fault.kind:
             case "overheat":
-                self.thermal.inject(joint, heat=change.begins, hold=change.begins and fault.end_s != inf)
-                self._derate()
+                self.thermal.inject(joint, heat=begins, hold=begins and fault.end_s != inf)
+                self._derate_motors()
             case "duplicate":
-                if change.begins:
-                    self._seat(joint, slot.channel, slot.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False)
-                else:
-                    self.slots[self.count :] = [s for s in self.slots[self.count :] if s.joint != joint]
-            case "babble" if self.stepped:
-                self._babblers.pop(slot, None)
-                if change.begins:
-                    self._babblers[slot] = now_us
+                self._set_duplicate(slot, begins, now_us)
             case "babble":
-                frame = slot.module.heartbeat(now_us) if change.begins else None
-                self.buses[slot.channel].babble(slot.sender, frame, now_us)
+                self._set_babbling(slot, begins, now_us)
             case kind:
-                slot.go_wrong(kind, change.begins, now_us)
+                slot.set_fault(kind, begins, now_us)
 
-    def _seat(self, number: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
-        joint, gear = self._joints[number], self._told[number].drive.gear  # its maker does not know where it ends up
-        module = Module(
-            self._nodes[number],
-            serial,
-            Parameters(from_factory(joint.limits.torque_nm / gear, joint.limits.speed_rad_s * gear)),
-            self.thermal.limits[number],
-            min_voltage_v=joint.limits.min_voltage_v,
-            stepped=self.stepped,
-            now_us=now_us,
-        )
-        self.slots.append(
-            ModuleSlot(len(self.slots), channel, number, module, joint, drives=drives and number not in self._loose)
-        )
+    def _set_duplicate(self, slot: ModuleSlot, begins: bool, now_us: float) -> None:
+        """Add a second module with the node id of a module, or remove it."""
+        if begins:
+            serial = slot.module.serial ^ DUPLICATE_SERIAL_MASK
+            self._add_module(slot.joint, slot.channel, serial, now_us - BOOT_US, drives=False)
+            return
+        duplicates = self.slots[self.module_count :]
+        self.slots[self.module_count :] = [other for other in duplicates if other.joint != slot.joint]
+
+    def _set_babbling(self, slot: ModuleSlot, begins: bool, now_us: float) -> None:
+        """Let a module send heartbeats without a pause, or end that."""
+        if self.stepped:
+            self._babblers.pop(slot, None)
+            if begins:
+                self._babblers[slot] = now_us
+            return
+        frame = slot.module.heartbeat(now_us) if begins else None
+        self.buses[slot.channel].set_babbling(slot.sender, frame, now_us)

@@ -1,6 +1,7 @@
 """`snakesim modules`: the joint modules of a robot, emulated, as a process on SocketCAN interfaces."""
 
 import argparse
+import math
 import select
 import sys
 import time
@@ -11,10 +12,10 @@ import msgspec
 
 from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import Wire, wait
-from snakesim_can_backend.bus.load import mbit, shares
-from snakesim_can_backend.emulator.bus_time import Traffic, by_opcode
+from snakesim_can_backend.bus.load import format_bit_rate, joints_per_bus
+from snakesim_can_backend.emulator.bus_time import Traffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
-from snakesim_can_backend.emulator.faults import explain, parse, parse_typed
+from snakesim_can_backend.emulator.faults import describe_faults, parse_fault, parse_typed_fault
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import CanSettings
@@ -27,13 +28,18 @@ from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
 
 DEFAULT_CHANNEL = "vcan0"
-DEFAULT_POSE, NO_POSE = "127.0.0.1:7450", "none"
+DEFAULT_POSE = "127.0.0.1:7450"
+NO_POSE = "none"
 STATS_EVERY_S = 1.0
-LONGEST_PAUSE_S = 0.5  # until a stop signal is checked
+MAX_PAUSE_S = 0.5  # until a stop signal is checked
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code: 0 when stopped or done, 1 a fault, 2 wrong input and nothing started."""
+    """Run the command.
+
+    Returns:
+        Exit code: 0 when stopped or done, 1 after a fault, 2 for wrong input, when nothing was started.
+    """
     arguments = parser().parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
@@ -41,11 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+    """Return the parser of the command's arguments."""
     parser = argparse.ArgumentParser(
         prog="snakesim modules",
         description=__doc__,
-        epilog=f"faults:\n{explain()}",
+        epilog=f"faults:\n{describe_faults()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -76,12 +82,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    loaded = _configuration(arguments)
-    settings = _settings(arguments, loaded)
+    """Check everything, open the buses, and serve the emulators until the command is stopped."""
+    loaded = _load_configuration(arguments)
+    settings = _make_settings(arguments, loaded)
+    module_count = loaded.config.robot.chain.modules
     _check_names(settings.channels, on_real_bus=arguments.on_real_bus)
-    shares(loaded.config, settings)
+    joints_per_bus(loaded.config, settings)
     for text in settings.faults:
-        parse(text, loaded.config.robot.chain.modules)
+        parse_fault(text, module_count)
     with ExitStack() as opened:
         send_pose = None
         if arguments.pose != NO_POSE:
@@ -89,29 +97,31 @@ def _serve(arguments: argparse.Namespace) -> int:
         check_channels(settings.channels)
         wires: list[Wire] = []
         for channel in settings.channels:
-            wires.append(opened.enter_context(closing(open_wire(channel, FROM_HOST, settings.bit_rate))))
+            wire = open_wire(channel, FROM_HOST, settings.bit_rate)
+            wires.append(opened.enter_context(closing(wire)))
         physics_model = make_physics_model(loaded.config, settings, "can")
         chain = ModuleChain(loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose)
         loop = Loop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
         on_stop_signal(loop.stop)
         tune_garbage_collector()
-        count = loaded.config.robot.chain.modules
-        say(f"modules ready: {count} on {', '.join(settings.channels)}")
+        say(f"modules ready: {module_count} on {', '.join(settings.channels)}")
         loop.run()
         for line in loop.summary():
             say(line)
         return 0
 
 
-def _configuration(arguments: argparse.Namespace) -> Loaded:
-    overrides = [parse_set(text) for text in arguments.set]
+def _load_configuration(arguments: argparse.Namespace) -> Loaded:
+    """Load the scenario for the backend `can`, whatever backend it runs on otherwise."""
+    overrides = [Override("backend", "can", "snakesim modules")]
+    overrides += [parse_set(text) for text in arguments.set]
     if arguments.seed is not None:
         overrides.append(Override("seed", arguments.seed, f"--seed {arguments.seed}"))
-    # The emulators are the robot of `--backend can`, whatever the scenario runs on otherwise.
-    return load(arguments.scenario, [Override("backend", "can", "snakesim modules"), *overrides])
+    return load(arguments.scenario, overrides)
 
 
-def _settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings:
+def _make_settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings:
+    """Return the settings of the backend, with those that the command line replaces or adds."""
     section = loaded.config.backends.get("can", {})
     settings: CanSettings = decode(Table(section, arguments.scenario), CanSettings, "backends.can")
     return msgspec.structs.replace(
@@ -123,6 +133,7 @@ def _settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings:
 
 
 def _check_names(channels: Sequence[str], *, on_real_bus: bool) -> None:
+    """Raise ConfigError for a bus that may have real modules, unless that is allowed."""
     for channel in channels:
         if not is_emulated(channel) and not on_real_bus:
             raise ConfigError(
@@ -132,79 +143,100 @@ def _check_names(channels: Sequence[str], *, on_real_bus: bool) -> None:
 
 
 class Loop:
-    """Serves until it is stopped, and keeps count."""
+    """Serves the emulators until it is stopped, and keeps statistics."""
 
     def __init__(self, server: EmulatorServer, arguments: argparse.Namespace, bit_rate: int) -> None:
+        self._server = server
+        self._chain = server.chain
         self._bit_rate = bit_rate
-        self._server, self._chain = server, server.chain
-        self._duration_s, self._stats = arguments.duration, arguments.stats
-        self._interactive = arguments.interactive
         self._running = True
-        self._late_s = 0.0
-        self._start = self._chain.traffic()
+
+        # Options.
+        self._duration_s: float | None = arguments.duration
+        self._shows_stats: bool = arguments.stats
+        self._interactive: bool = arguments.interactive  # until the terminal is closed
+
+        # Statistics.
         self._start_s = time.monotonic()
+        self._start_traffic = self._chain.traffic()
+        self._max_lateness_s = 0.0  # of a wake-up
 
     def stop(self) -> None:
         """End after this cycle."""
         self._running = False
 
     def run(self) -> None:
-        """Handle, send, sleep."""
-        server, wires = self._server, self._server.wires
-        end_s = None if self._duration_s is None else self._start_s + self._duration_s
-        shown, shown_s = self._start, self._start_s
+        """Serve the buses until the loop is stopped or its duration is over."""
+        end_s = math.inf if self._duration_s is None else self._start_s + self._duration_s
+        shown_traffic = self._start_traffic
+        shown_s = self._start_s
         while self._running:
-            pause_s = server.run_due(time.monotonic_ns())
+            pause_s = self._server.run_due(time.monotonic_ns())
             now_s = time.monotonic()
-            if end_s is not None and now_s >= end_s:
+            if now_s >= end_s:
                 return
-            if self._stats and now_s - shown_s >= STATS_EVERY_S:
-                shown, shown_s = self._show(shown, now_s), now_s
+            if self._shows_stats and now_s - shown_s >= STATS_EVERY_S:
+                shown_traffic = self._show_loads(shown_traffic, now_s)
+                shown_s = now_s
             if self._interactive:
                 self._read_terminal()
-            asked_s = LONGEST_PAUSE_S if pause_s is None else pause_s
-            wait(wires, asked_s)
-            if pause_s is not None:
-                self._late_s = max(self._late_s, time.monotonic() - now_s - asked_s)
+            if pause_s is None:  # stepped: only a frame can make something due
+                wait(self._server.wires, MAX_PAUSE_S)
+                continue
+            wait(self._server.wires, pause_s)
+            lateness_s = time.monotonic() - now_s - pause_s
+            self._max_lateness_s = max(self._max_lateness_s, lateness_s)
 
     def summary(self) -> list[str]:
-        """Traffic of the buses, and timing accuracy."""
-        seconds = time.monotonic() - self._start_s
-        lines = [f"{seconds:.1f} s; latest wake-up {1e3 * self._late_s:.1f} ms after its time"]
-        for wire, before, after in zip(self._server.wires, self._start, self._chain.traffic(), strict=True):
-            frames = sum(after.frames) - sum(before.frames)
-            lines.append(
-                f"{wire.channel}: {frames} frames, {after.load_since(before):.1%} of {mbit(self._bit_rate)}; "
-                f"longest wait for the bus {after.late_us / 1e3:.1f} ms, {after.replaced} frames replaced by newer ones"
-            )
-            lines += [f"  {op.name.lower():<18}{n:8d} frames {share:7.2%}" for op, n, share in by_opcode(before, after)]
+        """Return lines about the traffic of the buses, the timing accuracy, and injected faults."""
+        duration_s = time.monotonic() - self._start_s
+        lines = [f"{duration_s:.1f} s; latest wake-up {1e3 * self._max_lateness_s:.1f} ms after its time"]
+        for wire, before, after in zip(self._server.wires, self._start_traffic, self._chain.traffic(), strict=True):
+            lines += self._describe_traffic(wire.channel, before, after)
         if self._server.unsent:
             lines.append(f"{self._server.unsent} frames were not accepted by their interface")
         if self._chain.skipped_us:
             lines.append(f"{self._chain.skipped_us / 1e3:.0f} ms skipped: this computer was too busy")
-        return lines + [f"fault: {text}" for text in self._chain.happened]
+        lines += [f"fault: {text}" for text in self._chain.fault_log]
+        return lines
 
-    def _show(self, before: list[Traffic], now_s: float) -> list[Traffic]:
-        after = self._chain.traffic()
-        loads = [
-            f"{wire.channel} {b.load_since(a):.1%}"
-            for wire, a, b in zip(self._server.wires, before, after, strict=True)
+    def _describe_traffic(self, channel: str, before: Traffic, after: Traffic) -> list[str]:
+        frames = sum(after.frames) - sum(before.frames)
+        load = after.load_since(before)
+        lines = [
+            f"{channel}: {frames} frames, {load:.1%} of {format_bit_rate(self._bit_rate)}; "
+            f"longest wait for the bus {after.late_us / 1e3:.1f} ms, {after.replaced} frames replaced by newer ones"
         ]
+        for opcode, count, fraction in traffic_by_opcode(before, after):
+            lines.append(f"  {opcode.name.lower():<18}{count:8d} frames {fraction:7.2%}")
+        return lines
+
+    def _show_loads(self, before: list[Traffic], now_s: float) -> list[Traffic]:
+        """Print the load of every bus since an earlier point; return the traffic until now."""
+        after = self._chain.traffic()
+        loads: list[str] = []
+        for wire, bus_before, bus_after in zip(self._server.wires, before, after, strict=True):
+            loads.append(f"{wire.channel} {bus_after.load_since(bus_before):.1%}")
         say(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}")
         return after
 
     def _read_terminal(self) -> None:
+        """Inject the faults that a person has typed."""
         while self._interactive and select.select([sys.stdin], [], [], 0)[0]:
             line = sys.stdin.readline()
             if not line:
                 self._interactive = False
             elif line.strip():
-                try:
-                    fault, begins = parse_typed(line, self._chain.count, self._chain.now_us * 1e-6)
-                except ConfigError as error:
-                    say(str(error))
-                else:
-                    self._chain.inject(fault, begins=begins)
+                self._inject_typed(line)
+
+    def _inject_typed(self, line: str) -> None:
+        now_s = self._chain.now_us * 1e-6
+        try:
+            fault, begins = parse_typed_fault(line, self._chain.module_count, now_s)
+        except ConfigError as error:
+            say(str(error))
+        else:
+            self._chain.inject(fault, begins=begins)
 
 
 if __name__ == "__main__":

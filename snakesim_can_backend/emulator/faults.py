@@ -12,45 +12,68 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.model.fault_kinds import KINDS, Injection
 
-ABOUT: Mapping[str, str] = {
+# What each kind does to a module.
+FAULT_DESCRIPTIONS: Mapping[str, str] = {
     name: kind.in_module or kind.about for name, kind in KINDS["joint"].items() if "module" in kind.by
 }
 FORM = "KIND:JOINT@START or KIND:JOINT@START-END, in seconds, such as mute:joint_3@2.0 or leak:joint_1@1-4"
+SHOWN_CHARACTERS = 40  # of a text that is too long
 _typed = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<joint>joint_[0-9]+)(?: +(?P<off>off))?")
 
 
-def parse(text: str, joints: int) -> Injection:
-    """A fault from its text. Raises ConfigError."""
-    return checked(injection.parse(text), joints)
+def parse_fault(text: str, joints: int) -> Injection:
+    """Return the fault that a text describes, as FORM says.
+
+    Args:
+        text: the description.
+        joints: number of joints of the robot.
+
+    Raises:
+        ConfigError: the text has another form, or modules of this robot do not support the fault.
+    """
+    return check_fault(injection.parse(text), joints)
 
 
-def parse_typed(text: str, joints: int, now_s: float) -> tuple[Injection, bool]:
-    """A fault as typed in a terminal, `mute joint_3 off`, and whether it begins. Raises ConfigError."""
+def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, bool]:
+    """Return the fault that a person typed in a terminal, such as `mute joint_3 off`, and whether it begins.
+
+    Args:
+        text: the line.
+        joints: number of joints of the robot.
+        now_s: present time; a fault that is typed begins or ends now.
+
+    Raises:
+        ConfigError: the text has another form, or modules of this robot do not support the fault.
+    """
     if len(text) > injection.LONGEST_TEXT:
-        raise ConfigError(f"{text[:40]!r}...: {len(text)} characters, at most {injection.LONGEST_TEXT}")
+        raise ConfigError(f"{text[:SHOWN_CHARACTERS]!r}...: {len(text)} characters, at most {injection.LONGEST_TEXT}")
     match = _typed.fullmatch(text.strip())
     if match is None:
-        raise ConfigError(f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {', '.join(ABOUT)}")
+        kinds = ", ".join(FAULT_DESCRIPTIONS)
+        raise ConfigError(f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {kinds}")
     fault = injection.checked(Injection(match["kind"], match["joint"], now_s), text.strip())
-    return checked(fault, joints), match["off"] is None
+    begins = match["off"] is None
+    return check_fault(fault, joints), begins
 
 
-def typed(fault: Injection, *, begins: bool) -> str:
-    """A fault as `parse_typed` reads it."""
-    return f"{fault.kind} {fault.target}" if begins else f"{fault.kind} {fault.target} off"
+def format_typed_fault(fault: Injection, *, begins: bool) -> str:
+    """Return the text of a fault that `parse_typed_fault` reads."""
+    if begins:
+        return f"{fault.kind} {fault.target}"
+    return f"{fault.kind} {fault.target} off"
 
 
-def checked(fault: Injection, joints: int) -> Injection:
-    """The same fault, if modules of a robot support it. Raises ConfigError."""
-    if fault.target_type != "joint" or fault.kind not in ABOUT:
+def check_fault(fault: Injection, joints: int) -> Injection:
+    """Return the same fault. Raises ConfigError if modules of a robot with this many joints do not support it."""
+    if fault.target_type != "joint" or fault.kind not in FAULT_DESCRIPTIONS:
         raise ConfigError(
-            f"fault {str(fault)!r}: modules support {', '.join(ABOUT)}, as {FORM}; put other kinds into the "
-            f"scenario's `faults`"
+            f"fault {str(fault)!r}: modules support {', '.join(FAULT_DESCRIPTIONS)}, as {FORM}; put other kinds into "
+            f"the scenario's `faults`"
         )
     injection.check_targets([fault], services=(), joints=joints, buses=0)
     return fault
 
 
-def explain() -> str:
-    """Every kind, for a command's help."""
-    return "\n".join(f"  {kind:<13} {about}" for kind, about in ABOUT.items())
+def describe_faults() -> str:
+    """Return every kind with its description, one a line, for a command's help."""
+    return "\n".join(f"  {kind:<13} {description}" for kind, description in FAULT_DESCRIPTIONS.items())

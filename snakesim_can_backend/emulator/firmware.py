@@ -1,19 +1,22 @@
-"""One joint module's firmware, as a state machine: frames and time in, frames and a demand on the motor out.
+"""The firmware of one joint module, as a state machine: frames and time in, frames and a motor demand out.
 
     BOOT -> DISARMED -> ARMED -> STOPPING -> DISARMED
                ^          |         |
                +-- clear -- FAULT <-+          EMERGENCY from everywhere, left by clear only
 
-Only ARMED and STOPPING drive the motor. Only a valid setpoint feeds the watchdog. Times are microseconds on one clock,
-passed in; nothing here waits. `frames` collects frames to send; the caller empties it.
+Only ARMED and STOPPING drive the motor. Only a valid setpoint feeds the watchdog. Times are microseconds on one clock
+and are passed in; nothing here waits. `frames` collects the frames to send, and the caller empties it.
 """
 
 from typing import NamedTuple
 
 from snakesim_can_backend.emulator.frames import (
     LENGTHS,
-    LIMIT_STEP,
-    STEPS,
+    TARGET_STEPS,
+    TORQUE_LIMIT_STEP_NM,
+    ModuleHealth,
+    ModuleReadings,
+    encode_health,
     read_command,
     read_setpoint,
     write_acceleration,
@@ -26,26 +29,26 @@ from snakesim_can_backend.emulator.frames import (
     write_shaft_load,
     write_tail_contact,
 )
-from snakesim_can_backend.emulator.parameters import Parameters
-from snakesim_can_backend.emulator.reports import ModuleHealth, Readings, health
+from snakesim_can_backend.emulator.parameters import ParameterStore
 from snakesim_can_backend.protocol.definitions import (
     COMMAND_KEY,
-    COUNTS,
+    COUNTER_MODULUS,
     HEALTH_PERIOD_S,
     HEARTBEAT_PERIOD_S,
-    MAX_LOST,
+    MAX_LOST_SETPOINTS,
     MAX_UPTIME_MS,
-    VERSION,
-    WRONG_COUNTS,
-    Action,
+    MAX_WRONG_COUNTS,
+    PROTOCOL_VERSION,
+    CommandAction,
     Frame,
     LastStop,
     ModuleFault,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Parameter,
     SafeMotion,
-    intact,
+    has_valid_checksum,
+    parse_opcode,
 )
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
@@ -53,14 +56,18 @@ from snakesim_hal.wire.messages import Mode
 BOOT_US = 100_000
 HEARTBEAT_US = round(HEARTBEAT_PERIOD_S * 1e6)
 HEALTH_US = round(HEALTH_PERIOD_S * 1e6)
-AT_REST_RAD_S = 0.05
-FIRMWARE = (1, 0)
+HEALTH_PHASES = 16  # modules send their first Health at different times, so that the bus is not busy all at once
+AT_REST_RAD_S = 0.05  # a slower joint has come to rest, and STOPPING ends
+FIRMWARE_VERSION = (1, 0)  # major, minor
+IS_EMULATED = 1  # the bit of Identity that a real module does not set
 MODES = tuple(Mode)
 STOP_OF_FAULT = {fault: LastStop[fault.name] for fault in ModuleFault}
+DRIVEN_STATES = (ModuleState.ARMED, ModuleState.STOPPING)
+LATCHED_STATES = (ModuleState.FAULT, ModuleState.EMERGENCY)
 
 
 class Demand(NamedTuple):
-    """Setpoint of the motor."""
+    """What the firmware demands of its motor."""
 
     mode: Mode
     target: float  # rad, rad/s or N·m, as the mode says
@@ -70,87 +77,107 @@ class Demand(NamedTuple):
 PASSIVE = Demand(Mode.PASSIVE, 0.0, 0.0)
 
 
-class Module:
-    """One module on the bus."""
+class ModuleFirmware:
+    """The firmware of one module on the bus."""
 
     def __init__(
         self,
         node: int,
         serial: int,
-        parameters: Parameters,
+        parameters: ParameterStore,
         heat: HeatLimits,
         *,
         min_voltage_v: float = 18.0,
         stepped: bool = False,
         now_us: float = 0.0,
     ) -> None:
-        """heat: temperature of its winding that stops it, and below which a clear is possible again.
+        """Start to boot.
 
-        min_voltage_v: of its supply, below which it stops.
+        Args:
+            node: id of the module on its bus.
+            serial: serial number, reported in Identity.
+            parameters: parameters of the module, and its flash.
+            heat: winding temperature that stops the module, and the one below which a clear is possible again.
+            min_voltage_v: supply voltage below which the module stops.
+            stepped: whether time advances only from Sync to Sync; reported in Identity.
+            now_us: present time.
         """
+        # What the module is.
+        self.node = node
+        self.serial = serial
+        self.parameters = parameters
+        self.heat = heat
         self._min_voltage_v = min_voltage_v
-        self.node, self.serial, self.parameters, self.heat = node, serial, parameters, heat
-        self.frames: list[Frame] = []
-        self.inside = ModuleHealth()
-        self.hangs = False  # its main loop hangs; only hardware still works
-        self.refused = 0  # frames with a wrong checksum, count or length
         self._stepped = stepped
+
+        # What the caller exchanges with it.
+        self.frames: list[Frame] = []  # to send
+        self.health = ModuleHealth()  # present internal measurements
+        self.hangs = False  # whether the main loop hangs, so that only the hardware still works
+        self.refused = 0  # frames with a wrong checksum, count or length
+
         self._last_joint_state: Frame | None = None
-        self._forget(now_us)
+        self._reset_state(now_us)
         self.last_stop = LastStop.NONE
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
     def receive(self, frame: Frame, now_us: float) -> None:
-        """An Emergency, Command or ParameterRequest for this node or, the first two, for all."""
-        opcode = frame.id >> 6
+        """Process an Emergency, Command or ParameterRequest. The first two may be broadcasts."""
+        opcode = parse_opcode(frame.id)
         if self.hangs:
             return
-        if opcode == Opcode.EMERGENCY:
-            self._emergency(now_us)
-        elif self.state == ModuleState.BOOT or len(frame.data) != LENGTHS[opcode]:
-            self.refused += self.state != ModuleState.BOOT
+        if opcode == Opcode.EMERGENCY:  # valid at any length, and while the module boots
+            self._enter_emergency(now_us)
+            return
+        if self.state == ModuleState.BOOT:
+            return
+        if len(frame.data) != LENGTHS[opcode]:
+            self.refused += 1
         elif opcode == Opcode.PARAMETER_REQUEST:
-            driven = self.state in (ModuleState.ARMED, ModuleState.STOPPING)
-            self.frames.append(self.parameters.answer(self.node, frame.data, driven))
-        elif opcode == Opcode.COMMAND and intact(frame):
+            driven = self.state in DRIVEN_STATES
+            self.frames.append(self.parameters.answer_request(self.node, frame.data, driven))
+        elif opcode == Opcode.COMMAND and has_valid_checksum(frame):
             action, key = read_command(frame.data)
             if key == COMMAND_KEY:
-                self._carry_out(action, now_us)
+                self._execute(action, now_us)
         else:
             self.refused += 1
 
-    def _carry_out(self, action: int, now_us: float) -> None:
-        """Carry out the action of a Command; an unknown one has no effect."""
+    def _execute(self, action: int, now_us: float) -> None:
+        """Execute the action of a Command; an unknown one has no effect."""
         match action:
-            case Action.ARM:
+            case CommandAction.ARM:
                 self._arm(now_us)
-            case Action.DISARM:
+            case CommandAction.DISARM:
                 self._disarm(now_us)
-            case Action.STOP:
+            case CommandAction.STOP:
                 self._stop(now_us)
-            case Action.CLEAR:
+            case CommandAction.CLEAR:
                 self._clear(now_us)
-            case Action.REBOOT:
+            case CommandAction.REBOOT:
                 self.reboot(now_us)
-            case Action.IDENTIFY:
-                self._identify(now_us)
+            case CommandAction.IDENTIFY:
+                self._send_identity()
             case _:
                 pass
 
     def receive_setpoint(self, frame: Frame, now_us: float) -> None:
-        """A SetPoint for this node. It waits for the next Sync."""
+        """Check a setpoint for this node, and keep it until the next Sync.
+
+        A setpoint with a wrong length, checksum, counter or mode is refused. MAX_WRONG_COUNTS wrong counters in a row
+        are a fault.
+        """
         if self.state != ModuleState.ARMED or self.hangs:
             return
-        if len(frame.data) != LENGTHS[Opcode.SET_POINT] or not intact(frame):
+        if len(frame.data) != LENGTHS[Opcode.SET_POINT] or not has_valid_checksum(frame):
             self.refused += 1
             return
-        mode, count, number, limit = read_setpoint(frame.data)
-        expected, self._expected = self._expected, (count + 1) % COUNTS
-        if expected is not None and (count - expected) % COUNTS > MAX_LOST:
+        mode, count, target_steps, limit_steps = read_setpoint(frame.data)
+        if not self._accept_count(count):
             self.refused += 1
             self._wrong_counts += 1
-            if self._wrong_counts >= WRONG_COUNTS:
+            if self._wrong_counts >= MAX_WRONG_COUNTS:
                 self._fail(ModuleFault.STREAM, now_us)
             return
         self._wrong_counts = 0
@@ -158,182 +185,257 @@ class Module:
             self.refused += 1
             return
         if self._synced:  # otherwise a host without Syncs would keep an old demand active for ever
-            self._fed_us, self._synced = now_us, False
-        target = number * STEPS[mode]  # position, velocity and torque share their bits
+            self._fed_us = now_us
+            self._synced = False
+        target = target_steps * TARGET_STEPS[mode]  # position, velocity and torque share their bits
         if mode == Mode.POSITION:
-            target = self._within(target)
-        self._pending = Demand(MODES[mode], target, limit * LIMIT_STEP)
+            target = self._clamp_angle(target)
+        self._pending = Demand(MODES[mode], target, limit_steps * TORQUE_LIMIT_STEP_NM)
 
-    def sync(self, count: int, reading: Readings) -> None:
-        """Answer a Sync with the sensor readings of that instant, then enact the newest setpoint."""
+    def _accept_count(self, count: int) -> bool:
+        """Return whether a setpoint's counter follows the one before; a few setpoints in between may be lost."""
+        expected = self._expected_count
+        self._expected_count = (count + 1) % COUNTER_MODULUS
+        if expected is None:
+            return True
+        lost_setpoints = (count - expected) % COUNTER_MODULUS
+        return lost_setpoints <= MAX_LOST_SETPOINTS
+
+    def _clamp_angle(self, angle_rad: float) -> float:
+        limit_rad = self.parameters.values[ModuleParameter.ANGLE_LIMIT]
+        return min(max(angle_rad, -limit_rad), limit_rad)
+
+    def sync(self, count: int, reading: ModuleReadings) -> None:
+        """Answer a Sync with the sensor readings of that instant, then follow the newest setpoint.
+
+        Args:
+            count: number of the Sync, modulo 256.
+            reading: sensor readings at the Sync, in raw numbers.
+        """
         if self.state == ModuleState.BOOT:
             return
         if self.hangs:
             if self._last_joint_state is not None:  # a transmit mailbox that is no longer refilled
                 self.frames.append(self._last_joint_state)
             return
-        values = self.parameters.values
-        joint = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
-        self._last_joint_state = write_joint_state(self.node, joint)
-        self.frames.append(self._last_joint_state)
-        every = int(values[Parameter.CONTACT_EVERY])
-        if every and count % every == 0:
-            self.frames.append(write_contact(self.node, (*reading.contact, count)))
-            if values[Parameter.TAIL]:
-                self.frames.append(write_tail_contact(self.node, (*reading.tail_contact, count)))
+        self._report_joint_state(count, reading)
+        self._report_contacts(count, reading)
         if self.imu_is_due():
             self._report_imu(count, reading)
         self._syncs += 1
         self._synced = True
         if self._pending is not None:
-            self.demand, self._pending = self._pending, None
+            self.demand = self._pending
+            self._pending = None
 
     def imu_is_due(self) -> bool:
-        """Whether gyro, accelerometer and shaft load answer the next Sync; neighbors take turns."""
-        every = int(self.parameters.values[Parameter.IMU_EVERY])
+        """Return whether gyro, accelerometer and shaft load answer the next Sync; neighbors do so in turn."""
+        every = int(self.parameters.values[ModuleParameter.IMU_EVERY])
         return every > 0 and (self._syncs + self.node) % every == 0
 
     # --- time ----------------------------------------------------------------------------------------------
 
     def poll(self, now_us: float) -> float:
-        """Do what is due, with the present `inside`; returns the next due time."""
+        """Do everything that is due now: watchdog, fault detection, heartbeat and Health.
+
+        Returns:
+            The time at which the next call is due.
+        """
         if self.hangs:
             return self._poll_hanging(now_us)
         if self.state == ModuleState.BOOT:
             if now_us < self._booted_us + BOOT_US:
                 return self._booted_us + BOOT_US
-            self._heartbeat_us = now_us + HEARTBEAT_US
-            self._health_us = now_us + HEALTH_US * (1 + self.node % 16) / 16  # not all at once
-            self._enter(self._after_boot, now_us)
-        self._watch_conditions(now_us)
-        if self.state == ModuleState.ARMED and now_us >= self._fed_us + self.watchdog_us:
-            self._fail(ModuleFault.WATCHDOG, now_us)
-        elif self.state == ModuleState.STOPPING and (
-            abs(self.inside.speed_rad_s) < AT_REST_RAD_S or now_us >= self._stopping_us + self.watchdog_us
-        ):
-            self._enter(ModuleState.DISARMED, now_us)
+            self._finish_boot(now_us)
+        self._detect_faults(now_us)
+        match self.state:
+            case ModuleState.ARMED:
+                if now_us >= self._fed_us + self.watchdog_us:
+                    self._fail(ModuleFault.WATCHDOG, now_us)
+            case ModuleState.STOPPING:
+                at_rest = abs(self.health.speed_rad_s) < AT_REST_RAD_S
+                if at_rest or now_us >= self._stopping_us + self.watchdog_us:
+                    self._enter(ModuleState.DISARMED, now_us)
+            case _:
+                pass
         if now_us >= self._heartbeat_us:
             self._heartbeat_us = max(self._heartbeat_us + HEARTBEAT_US, now_us)
             self.frames.append(self.heartbeat(now_us))
         if now_us >= self._health_us:
             self._health_us = max(self._health_us + HEALTH_US, now_us)
-            self.frames.append(write_health(self.node, health(self.inside)))
-        return self._next_due(now_us)
+            self.frames.append(write_health(self.node, encode_health(self.health)))
+        return self._next_due_us(now_us)
 
     @property
     def watchdog_us(self) -> float:
-        """How long a module acts on one setpoint."""
-        return self.parameters.values[Parameter.WATCHDOG] * 1e6
+        """Return how long a module acts on one setpoint."""
+        return self.parameters.values[ModuleParameter.WATCHDOG] * 1e6
 
     def reboot(self, now_us: float) -> None:
         """Reset everything that is not saved, and restart."""
-        driven = self.state in (ModuleState.ARMED, ModuleState.STOPPING)
+        driven = self.state in DRIVEN_STATES
         self.parameters.restart()
-        self._forget(now_us)
+        self._reset_state(now_us)
         self.last_stop = LastStop.REBOOT if driven else LastStop.NONE
+
+    def _finish_boot(self, now_us: float) -> None:
+        self._heartbeat_us = now_us + HEARTBEAT_US
+        self._health_us = now_us + HEALTH_US * (1 + self.node % HEALTH_PHASES) / HEALTH_PHASES
+        self._enter(self._after_boot, now_us)
+
+    def _next_due_us(self, now_us: float) -> float:
+        report_us = min(self._heartbeat_us, self._health_us)
+        match self.state:
+            case ModuleState.ARMED:
+                return min(report_us, self._fed_us + self.watchdog_us)
+            case ModuleState.STOPPING:
+                return now_us
+            case _:
+                return report_us
+
+    def _poll_hanging(self, now_us: float) -> float:
+        """Run what still works while the main loop hangs; return when the next call is due.
+
+        The main loop fed the hardware watchdog with every valid setpoint. When the watchdog expires it opens the
+        motor's bridge.
+        """
+        watchdog_end_us = self._fed_us + self.watchdog_us
+        if self.demand.mode != Mode.PASSIVE and now_us >= watchdog_end_us:
+            self.demand = PASSIVE
+        if self.demand.mode == Mode.PASSIVE:
+            return now_us + HEARTBEAT_US
+        return watchdog_end_us
 
     # --- states --------------------------------------------------------------------------------------------
 
-    def _forget(self, now_us: float) -> None:
-        self.state, self._after_boot = ModuleState.BOOT, ModuleState.DISARMED
+    def _reset_state(self, now_us: float) -> None:
+        """Set everything as it is at the start of a boot."""
+        self.state = ModuleState.BOOT
+        self._after_boot = ModuleState.DISARMED
         self.faults = 0  # bits of ModuleFault
-        self.demand = PASSIVE
-        self._pending: Demand | None = None
-        self._expected: int | None = None
-        self._wrong_counts = 0
-        self._booted_us = self._fed_us = self._stopping_us = self._heartbeat_us = self._health_us = now_us
-        self._syncs = 0
-        self._synced = True  # since the setpoint that last fed the watchdog
 
-    def _enter(self, state: ModuleState, now_us: float, why: LastStop | None = None, demand: Demand = PASSIVE) -> None:
-        """Change state, and drop the demand; why: reported for a module that was ARMED."""
-        if self.state == ModuleState.ARMED and why is not None:
-            self.last_stop = why
+        # SafeSetpoints.
+        self.demand = PASSIVE
+        self._pending: Demand | None = None  # followed from the next Sync on
+        self._expected_count: int | None = None  # counter of the next setpoint; None: any
+        self._wrong_counts = 0  # in a row
+        self._syncs = 0
+        self._synced = True  # whether a Sync has come since the setpoint that last fed the watchdog
+
+        # Times.
+        self._booted_us = now_us
+        self._fed_us = now_us  # when a setpoint last fed the watchdog
+        self._stopping_us = now_us  # when STOPPING began
+        self._heartbeat_us = now_us  # when the next heartbeat is due
+        self._health_us = now_us  # when the next Health is due
+
+    def _enter(
+        self, state: ModuleState, now_us: float, reason: LastStop | None = None, demand: Demand = PASSIVE
+    ) -> None:
+        """Change state, forget all setpoints, and send a heartbeat.
+
+        Args:
+            state: the new state.
+            now_us: present time.
+            reason: why a module that was ARMED leaves this state; reported in heartbeats from now on.
+            demand: what the motor does in the new state.
+        """
+        if self.state == ModuleState.ARMED and reason is not None:
+            self.last_stop = reason
         self.state = state
-        self.demand, self._pending = demand, None
-        self._expected, self._wrong_counts = None, 0
+        self.demand = demand
+        self._pending = None
+        self._expected_count = None
+        self._wrong_counts = 0
         self.frames.append(self.heartbeat(now_us))
 
     def _arm(self, now_us: float) -> None:
-        if self.state == ModuleState.DISARMED and not self._conditions():
-            self._fed_us, self._synced = now_us, True
+        if self.state == ModuleState.DISARMED and not self._present_faults():
+            self._fed_us = now_us
+            self._synced = True
             self._enter(ModuleState.ARMED, now_us)
 
     def _disarm(self, now_us: float) -> None:
-        if self.state in (ModuleState.ARMED, ModuleState.STOPPING):
+        if self.state in DRIVEN_STATES:
             self._enter(ModuleState.DISARMED, now_us, LastStop.DISARM)
 
     def _stop(self, now_us: float) -> None:
         if self.state == ModuleState.ARMED:
             self._stopping_us = now_us
-            values = self.parameters.values
-            damped = Demand(Mode.VELOCITY, 0.0, values[Parameter.TORQUE_LIMIT])
-            safe = damped if values[Parameter.STOP_MODE] == SafeMotion.DAMP else PASSIVE
-            self._enter(ModuleState.STOPPING, now_us, LastStop.STOP, safe)
+            self._enter(ModuleState.STOPPING, now_us, LastStop.STOP, self._stopping_demand())
+
+    def _stopping_demand(self) -> Demand:
+        """Return the demand while the module comes to rest, as its stop mode says."""
+        values = self.parameters.values
+        if values[ModuleParameter.STOP_MODE] == SafeMotion.DAMP:
+            return Demand(Mode.VELOCITY, 0.0, values[ModuleParameter.TORQUE_LIMIT])
+        return PASSIVE
 
     def _clear(self, now_us: float) -> None:
-        if self.state in (ModuleState.FAULT, ModuleState.EMERGENCY) and not self._conditions():
+        if self.state in LATCHED_STATES and not self._present_faults():
             self.faults = 0
             self._enter(ModuleState.DISARMED, now_us)
 
-    def _emergency(self, now_us: float) -> None:
+    def _enter_emergency(self, now_us: float) -> None:
         if self.state == ModuleState.BOOT:
             self._after_boot = ModuleState.EMERGENCY
         elif self.state != ModuleState.EMERGENCY:
             self._enter(ModuleState.EMERGENCY, now_us, LastStop.EMERGENCY)
 
     def _fail(self, fault: ModuleFault, now_us: float) -> None:
+        """Latch a fault; an emergency is latched more strongly, and stays."""
         self.faults |= 1 << fault
         if self.state == ModuleState.EMERGENCY:
             self.frames.append(self.heartbeat(now_us))
         else:
             self._enter(ModuleState.FAULT, now_us, STOP_OF_FAULT[fault])
 
-    def _conditions(self) -> int:
-        """Bits of the faults whose cause is present. A winding that overheated must cool well below that."""
-        inside = self.inside
-        hot = self.heat.derate_from_c if self.faults >> ModuleFault.OVERHEAT & 1 else self.heat.stop_at_c
+    def _present_faults(self) -> int:
+        """Return the bits of the faults whose cause is present. A winding that overheated must first cool down."""
+        health = self.health
+        overheated = self.faults >> ModuleFault.OVERHEAT & 1
+        max_winding_c = self.heat.derate_from_c if overheated else self.heat.stop_at_c
         return (
-            (inside.winding_c >= hot) << ModuleFault.OVERHEAT
-            | inside.leak << ModuleFault.LEAK
-            | (inside.voltage_v < self._min_voltage_v) << ModuleFault.VOLTAGE
+            (health.winding_c >= max_winding_c) << ModuleFault.OVERHEAT
+            | health.leak << ModuleFault.LEAK
+            | (health.voltage_v < self._min_voltage_v) << ModuleFault.VOLTAGE
         )
 
-    def _watch_conditions(self, now_us: float) -> None:
-        new = self._conditions() & ~self.faults
-        for fault in ModuleFault if new else ():
-            if new >> fault & 1:
+    def _detect_faults(self, now_us: float) -> None:
+        new_faults = self._present_faults() & ~self.faults
+        if not new_faults:
+            return
+        for fault in ModuleFault:
+            if new_faults >> fault & 1:
                 self._fail(fault, now_us)
-
-    def _within(self, angle_rad: float) -> float:
-        most = self.parameters.values[Parameter.ANGLE_LIMIT]
-        return min(max(angle_rad, -most), most)
-
-    def _next_due(self, now_us: float) -> float:
-        due = min(self._heartbeat_us, self._health_us)
-        if self.state == ModuleState.ARMED:
-            return min(due, self._fed_us + self.watchdog_us)
-        return now_us if self.state == ModuleState.STOPPING else due
-
-    def _poll_hanging(self, now_us: float) -> float:
-        """The hardware watchdog, which the main loop fed with every valid setpoint, opens the motor's bridge."""
-        if self.demand.mode != Mode.PASSIVE and now_us >= self._fed_us + self.watchdog_us:
-            self.demand = PASSIVE
-        return now_us + HEARTBEAT_US if self.demand.mode == Mode.PASSIVE else self._fed_us + self.watchdog_us
 
     # --- reports -------------------------------------------------------------------------------------------
 
     def heartbeat(self, now_us: float) -> Frame:
-        """The present heartbeat."""
+        """Return the present heartbeat."""
         uptime_ms = min(round(now_us - self._booted_us) // 1000, MAX_UPTIME_MS)
-        faults = [self.faults >> fault & 1 for fault in ModuleFault]
-        state = (self.state, self.demand.mode, self.last_stop, *faults, uptime_ms)
-        return write_heartbeat(self.node, state)
+        fault_bits = [self.faults >> fault & 1 for fault in ModuleFault]
+        return write_heartbeat(self.node, (self.state, self.demand.mode, self.last_stop, *fault_bits, uptime_ms))
 
-    def _identify(self, _now_us: float) -> None:
-        self.frames.append(write_identity(self.node, (self.serial, *FIRMWARE, VERSION, 1, self._stepped)))
+    def _send_identity(self) -> None:
+        identity = (self.serial, *FIRMWARE_VERSION, PROTOCOL_VERSION, IS_EMULATED, self._stepped)
+        self.frames.append(write_identity(self.node, identity))
 
-    def _report_imu(self, count: int, reading: Readings) -> None:
+    def _report_joint_state(self, count: int, reading: ModuleReadings) -> None:
+        numbers = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
+        self._last_joint_state = write_joint_state(self.node, numbers)
+        self.frames.append(self._last_joint_state)
+
+    def _report_contacts(self, count: int, reading: ModuleReadings) -> None:
+        values = self.parameters.values
+        every = int(values[ModuleParameter.CONTACT_EVERY])
+        if every == 0 or count % every != 0:
+            return
+        self.frames.append(write_contact(self.node, (*reading.contact, count)))
+        if values[ModuleParameter.TAIL]:
+            self.frames.append(write_tail_contact(self.node, (*reading.tail_contact, count)))
+
+    def _report_imu(self, count: int, reading: ModuleReadings) -> None:
         if reading.gyro is not None and reading.acceleration is not None:
             self.frames.append(write_gyro(self.node, (*reading.gyro, count)))
             self.frames.append(write_acceleration(self.node, (*reading.acceleration, count)))

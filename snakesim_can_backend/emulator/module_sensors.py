@@ -1,4 +1,4 @@
-"""Sensor readings of modules at a Sync: the physics_model's state, with the noise and threshold of the robot file.
+"""Sensor readings of modules at a Sync: the state of the physics model, with the robot file's noise and threshold.
 
 The host sets the rates of the modules, and the bus is the delay: rates and delays of the robot file are not used here.
 """
@@ -9,21 +9,22 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.emulator.reports import (
+from snakesim_can_backend.emulator.frames import (
     ACCELERATION,
     ANGLE,
+    NO_CONTACT,
     RATE,
     SHAFT_LOAD,
     TORQUE,
-    UNTOUCHED,
     VELOCITY,
-    Readings,
-    touch,
+    ModuleReadings,
+    encode_contact,
 )
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
+from snakesim_hal.wire.messages import Imu
 
 
 class ModuleSensors:
@@ -32,72 +33,114 @@ class ModuleSensors:
     def __init__(
         self, robot: RobotFile, physics_model: PhysicsModel, mounting: Mounting, first: int, seed: Sequence[int]
     ) -> None:
-        """mounting: of these modules; first: index of their first joint, 0 at the tail."""
-        count = len(mounting.sign)
-        self._physics_model, self._mounting, self._first, self._count = physics_model, mounting, first, count
-        self._noise = np.random.default_rng(seed).standard_normal
-        joints = robot.sensors.joints
-        sigma = [joints.angle_noise_rad, joints.velocity_noise_rad_s, joints.torque_noise_nm]
-        self._joint_sigma = np.repeat(sigma, count).reshape(3, count)
-        self._noisy = any(sigma)
-        self._contacts, self._imu = robot.sensors.contacts, robot.sensors.imu
-        self._torque_sigma = joints.torque_noise_nm
+        """Create the sensors of one bus.
 
-    def look(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[Readings]:
-        """The readings of every module now; torque and derating are those of all motors of the chain."""
-        here = slice(self._first, self._first + self._count)
-        joints = np.stack(
-            (self._physics_model.angle_rad[here], self._physics_model.velocity_rad_s[here], torque_nm[here])
-        )
-        if self._noisy:
-            joints += self._joint_sigma * self._noise((3, self._count))
-        angles = self._mounting.drive_angle_rad(joints[0])
-        velocities, torques = self._mounting.drive_velocity_rad_s(joints[1]), self._mounting.drive_torque_nm(joints[2])
-        readings = [
-            Readings(angle, velocity, torque, bool(hot))
-            for angle, velocity, torque, hot in zip(
-                ANGLE.many(angles), VELOCITY.many(velocities), TORQUE.many(torques), derated[here], strict=True
-            )
-        ]
-        self._feel(readings)
+        Args:
+            robot: the robot file, with noise and thresholds.
+            physics_model: what the sensors measure.
+            mounting: how the shafts of these modules move their joints.
+            first: index of the first joint on this bus, 0 at the tail.
+            seed: seed of the noise.
+        """
+        # The joints of this bus.
+        self._physics_model = physics_model
+        self._mounting = mounting
+        self._first = first
+        self._count = len(mounting.sign)
+        self._joints = slice(first, first + self._count)
+
+        # Sensors and their noise.
+        self._noise = np.random.default_rng(seed).standard_normal
+        self._contact_sensor = robot.sensors.contacts
+        self._imu_sensor = robot.sensors.imu
+        joints = robot.sensors.joints
+        sigmas = [joints.angle_noise_rad, joints.velocity_noise_rad_s, joints.torque_noise_nm]
+        self._joint_sigma = np.repeat(sigmas, self._count).reshape(3, self._count)
+        self._has_joint_noise = any(sigmas)
+        self._torque_sigma_nm = joints.torque_noise_nm
+
+    def read(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[ModuleReadings]:
+        """Return the present readings of every module on this bus.
+
+        Args:
+            torque_nm: torques of all motors of the chain.
+            derated: whether each motor of the chain is derated.
+            imu_due: whether each module on this bus reports its IMU and shaft load.
+        """
+        readings = self._read_joints(torque_nm, derated)
+        self._add_contacts(readings)
         if any(imu_due):
-            self._weigh(readings, imu_due)
+            self._add_imus(readings, imu_due)
         return readings
 
-    def _feel(self, readings: list[Readings]) -> None:
-        sensor = self._contacts
+    def _read_joints(self, torque_nm: Floats, derated: NDArray[np.bool_]) -> list[ModuleReadings]:
+        """Return readings with angle, velocity and torque of the modules' shafts."""
+        model = self._physics_model
+        here = self._joints
+        joints = np.stack((model.angle_rad[here], model.velocity_rad_s[here], torque_nm[here]))
+        if self._has_joint_noise:
+            joints += self._joint_sigma * self._noise((3, self._count))
+        angle_rad, velocity_rad_s, joint_torque_nm = joints
+        rows = zip(
+            ANGLE.to_raw_array(self._mounting.drive_angle_rad(angle_rad)),
+            VELOCITY.to_raw_array(self._mounting.drive_velocity_rad_s(velocity_rad_s)),
+            TORQUE.to_raw_array(self._mounting.drive_torque_nm(joint_torque_nm)),
+            derated[here],
+            strict=True,
+        )
+        return [ModuleReadings(angle, velocity, torque, bool(hot)) for angle, velocity, torque, hot in rows]
+
+    def _add_contacts(self, readings: list[ModuleReadings]) -> None:
+        """Add the contacts whose force is above the threshold."""
+        sensor = self._contact_sensor
         if sensor is None:
             return
-        touches = {
-            load.link: touch(self._blurred(load))
-            for load in self._physics_model.loads()
-            if math.hypot(*load.force_l) >= sensor.threshold_n
-        }
-        for i, reading in enumerate(readings if touches else ()):
-            reading.tail_contact = touches.get(self._first + i, UNTOUCHED)
-            reading.contact = touches.get(self._first + i + 1, UNTOUCHED)
+        contacts: dict[int, tuple[int, ...]] = {}  # by link
+        for load in self._physics_model.loads():
+            if math.hypot(*load.force_l) >= sensor.threshold_n:
+                contacts[load.link] = encode_contact(self._add_contact_noise(load))
+        if not contacts:
+            return
+        for i, reading in enumerate(readings):
+            tail_link = self._first + i
+            reading.tail_contact = contacts.get(tail_link, NO_CONTACT)
+            reading.contact = contacts.get(tail_link + 1, NO_CONTACT)
 
-    def _blurred(self, load: LinkLoad) -> LinkLoad:
-        sensor = self._contacts
+    def _add_contact_noise(self, load: LinkLoad) -> LinkLoad:
+        sensor = self._contact_sensor
         if sensor is None or not (sensor.position_noise_m or sensor.force_noise_n):
             return load
-        a, b, c, d, e, f = self._noise(6).tolist()
-        (x, y, z), (fx, fy, fz) = load.position_l, load.force_l
-        m, n = sensor.position_noise_m, sensor.force_noise_n
-        return LinkLoad(load.link, (x + m * a, y + m * b, z + m * c), (fx + n * d, fy + n * e, fz + n * f))
+        noise = self._noise(6).tolist()
+        x, y, z = load.position_l
+        force_x, force_y, force_z = load.force_l
+        sigma_m = sensor.position_noise_m
+        sigma_n = sensor.force_noise_n
+        position = (x + sigma_m * noise[0], y + sigma_m * noise[1], z + sigma_m * noise[2])
+        force = (force_x + sigma_n * noise[3], force_y + sigma_n * noise[4], force_z + sigma_n * noise[5])
+        return LinkLoad(load.link, position, force)
 
-    def _weigh(self, readings: list[Readings], due: Sequence[bool]) -> None:
-        shaft = self._physics_model.shaft_torque_nm()[self._first : self._first + self._count]
-        noise = self._torque_sigma * self._noise(self._count)
-        shafts = SHAFT_LOAD.many(self._mounting.drive_torque_nm(shaft + noise))
-        imu = self._physics_model.imu() if self._imu is not None else None
+    def _add_imus(self, readings: list[ModuleReadings], due: Sequence[bool]) -> None:
+        """Add shaft load, gyro and accelerometer to the readings of the modules that report them."""
+        shaft_torque_nm = self._physics_model.shaft_torque_nm()[self._joints]
+        noise_nm = self._torque_sigma_nm * self._noise(self._count)
+        shaft_loads = SHAFT_LOAD.to_raw_array(self._mounting.drive_torque_nm(shaft_torque_nm + noise_nm))
+        imu = self._physics_model.imu() if self._imu_sensor is not None else None
         for i, reading in enumerate(readings):
             if not due[i]:
                 continue
-            reading.shaft_load = shafts[i]
-            if imu is not None and self._imu is not None and self._first + i + 1 in imu.link:
-                at = imu.link.index(self._first + i + 1)
-                rate = np.array(imu.angular_velocity_rad_s[at])
-                force = np.array(imu.acceleration_m_s2[at])
-                reading.gyro = RATE.many(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
-                reading.acceleration = ACCELERATION.many(force + self._imu.acceleration_noise_m_s2 * self._noise(3))
+            reading.shaft_load = shaft_loads[i]
+            if imu is not None:
+                self._add_imu(reading, imu, link=self._first + i + 1)
+
+    def _add_imu(self, reading: ModuleReadings, imu: Imu, link: int) -> None:
+        """Add the IMU of a link, if it has one."""
+        sensor = self._imu_sensor
+        if sensor is None or link not in imu.link:
+            return
+        index = imu.link.index(link)
+        rate_rad_s = np.array(imu.angular_velocity_rad_s[index])
+        acceleration_m_s2 = np.array(imu.acceleration_m_s2[index])
+        reading.gyro = RATE.to_raw_array(rate_rad_s + sensor.angular_velocity_noise_rad_s * self._noise(3))
+        reading.acceleration = ACCELERATION.to_raw_array(
+            acceleration_m_s2 + sensor.acceleration_noise_m_s2 * self._noise(3)
+        )

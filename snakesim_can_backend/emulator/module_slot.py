@@ -1,63 +1,78 @@
-"""A module's place on a bus, and its injected faults."""
+"""A module's place on a bus: its node id, its joint, and its injected faults."""
 
 from dataclasses import dataclass
 
-from snakesim_can_backend.emulator.firmware import Demand, Module
-from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, opcode_of
+from snakesim_can_backend.emulator.firmware import Demand, ModuleFirmware
+from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, parse_opcode
+from snakesim_can_backend.settings import CanSettings
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot import RobotFile
 
-SAGGED = 2 / 3  # of the least voltage
+SAGGED_FRACTION = 2 / 3  # of the minimum voltage, at an injected undervoltage
+
+# The end of a JointState, for injected faults.
+COUNT_BYTE = 6  # its lower four bits are the counter
+COUNT_MASK = 0x0F
+CHECKSUM_BYTE = 7
+WRONG_COUNT_OFFSET = 7  # further from the right counter than any lost or late frame
+WRONG_CHECKSUM_MASK = 0x5A
 
 
 @dataclass(slots=True, eq=False)
 class ModuleSlot:
-    """One module, the joint it moves, and the bus it is on."""
+    """One module, the joint that it moves, and the bus that it is on."""
 
-    sender: int  # its index in the bus's queue
-    channel: int
+    sender: int  # index in the queue of the bus
+    channel: int  # index of the bus
     joint: int  # 0 at the tail
-    module: Module
-    built: Joint
-    drives: bool = True  # False: it has no motor of its own; a duplicate
-    driven: Demand | None = None  # the last demand applied to its motor
+    module: ModuleFirmware
+    joint_model: Joint  # the joint as it is really built
+    drives: bool = True  # False: the module moves no motor, as a duplicate does not
+    driven: Demand | None = None  # the demand that was last applied to the motor
+
+    # Injected faults.
     mute: bool = False
     wrong_count: bool = False
     wrong_checksum: bool = False
 
     def __post_init__(self) -> None:
-        """Under its supply."""
-        self.module.inside.voltage_v = self.built.supply.voltage_v
+        """Switch the supply on."""
+        self.module.health.voltage_v = self.joint_model.supply.voltage_v
 
-    def go_wrong(self, kind: str, wrong: bool, now_us: float) -> None:
-        """Begin or end a fault of this module."""
+    def set_fault(self, kind: str, active: bool, now_us: float) -> None:
+        """Begin or end a fault of this module; a kind that is no fault of a single module has no effect."""
+        health = self.module.health
         match kind:
             case "mute":
-                self.mute = wrong
+                self.mute = active
             case "freeze":
-                self.module.hangs = wrong
+                self.module.hangs = active
             case "counter":
-                self.wrong_count = wrong
+                self.wrong_count = active
             case "checksum":
-                self.wrong_checksum = wrong
+                self.wrong_checksum = active
             case "leak":
-                self.module.inside.leak = wrong
+                health.leak = active
+            case "undervoltage" if active:
+                health.voltage_v = SAGGED_FRACTION * self.joint_model.limits.min_voltage_v
             case "undervoltage":
-                sagged_v = SAGGED * self.built.limits.min_voltage_v
-                self.module.inside.voltage_v = sagged_v if wrong else self.built.supply.voltage_v
-            case "reboot" if wrong:
+                health.voltage_v = self.joint_model.supply.voltage_v
+            case "reboot" if active:
                 self.module.reboot(now_us)
             case _:
                 pass
 
-    def feel(self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float) -> None:
-        """Update its internal measurements."""
-        inside = self.module.inside
-        inside.speed_rad_s, inside.winding_c = speed_rad_s, winding_c
-        inside.board_c = board_c
-        inside.current_a = self.built.supply.idle_a + power_w / inside.voltage_v
+    def update_health(self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float) -> None:
+        """Update the internal measurements of the module."""
+        health = self.module.health
+        health.speed_rad_s = speed_rad_s
+        health.winding_c = winding_c
+        health.board_c = board_c
+        health.current_a = self.joint_model.supply.idle_a + power_w / health.voltage_v
 
-    def outgoing(self) -> list[Frame]:
-        """The module's frames to send, with faults applied; each frame once."""
+    def take_frames(self) -> list[Frame]:
+        """Return the frames that the module sends, with injected faults applied; each frame once."""
         frames = self.module.frames
         if not frames:
             return frames
@@ -65,16 +80,40 @@ class ModuleSlot:
         if self.mute:
             return []
         if self.wrong_count or self.wrong_checksum:
-            return [self._corrupted(frame) for frame in frames]
+            return [self._corrupt(frame) for frame in frames]
         return frames
 
-    def _corrupted(self, frame: Frame) -> Frame:
-        if opcode_of(frame.id) != Opcode.JOINT_STATE:
+    def _corrupt(self, frame: Frame) -> Frame:
+        """Return a joint state with a wrong counter or checksum, and any other frame as it is."""
+        if parse_opcode(frame.id) != Opcode.JOINT_STATE:
             return frame
         data = bytearray(frame.data)
         if self.wrong_count:
-            data[6] = (data[6] & 0xF0) | (data[6] + 7 & 0x0F)
-            data[7] = checksum(frame.id, bytes(data[:7]))
+            count_byte = data[COUNT_BYTE]
+            wrong_count = (count_byte + WRONG_COUNT_OFFSET) & COUNT_MASK
+            data[COUNT_BYTE] = (count_byte & ~COUNT_MASK) | wrong_count
+            data[CHECKSUM_BYTE] = checksum(frame.id, bytes(data[:CHECKSUM_BYTE]))
         if self.wrong_checksum:
-            data[7] ^= 0x5A
+            data[CHECKSUM_BYTE] ^= WRONG_CHECKSUM_MASK
         return Frame(frame.id, bytes(data))
+
+
+def assign_node_ids(robot: RobotFile, settings: CanSettings) -> list[int]:
+    """Return the node id of every emulated module, tail to head.
+
+    A module has the number of its joint, unless the settings say that it is mounted with another id.
+
+    Raises:
+        ConfigError: an id occurs more than once, or not at all.
+    """
+    names = [joint.name for joint in robot.joint_table]
+    expected_ids = list(range(1, len(names) + 1))
+    node_ids = list(expected_ids)
+    for name, mount in settings.mounted.items():
+        if mount.id is not None and name in names:
+            node_ids[names.index(name)] = mount.id
+    if sorted(node_ids) != expected_ids:
+        raise ConfigError(
+            f"`backends.can.mounted`: the modules would have the ids {node_ids}; give each from 1 to {len(names)} once"
+        )
+    return node_ids

@@ -3,86 +3,119 @@
 import math
 from struct import Struct
 
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
     Frame,
+    ModuleParameter,
     Opcode,
-    Operation,
-    Parameter,
+    ParameterOperation,
     ParameterRange,
-    Result,
+    ParameterResult,
     SafeMotion,
 )
 
-WHOLE = frozenset((Parameter.STOP_MODE, Parameter.CONTACT_EVERY, Parameter.IMU_EVERY, Parameter.TAIL))
+INTEGER_PARAMETERS = frozenset(
+    (ModuleParameter.STOP_MODE, ModuleParameter.CONTACT_EVERY, ModuleParameter.IMU_EVERY, ModuleParameter.TAIL)
+)
+FACTORY_WATCHDOG_S = 0.1
+FACTORY_CONTACT_EVERY = 1.0  # Syncs
+RANGE_TOLERANCE = 1e-6  # of a range's largest bound; bounds have single precision on the bus
+FLOAT_BYTES = 4
+FLOAT_MASK = 0xFFFFFFFF
 _single = Struct("<f")
 
 
-def from_factory(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[Parameter, float]:
-    """The flash of a new module. Gains are 0: a module that has not been configured holds nothing."""
-    torque = min(rated_torque_nm, PARAMETERS[Parameter.RATED_TORQUE].high)
-    speed = min(rated_speed_rad_s, PARAMETERS[Parameter.RATED_SPEED].high)
-    return dict.fromkeys(Parameter, 0.0) | {
-        Parameter.TORQUE_LIMIT: torque,
-        Parameter.SPEED_LIMIT: speed,
-        Parameter.ANGLE_LIMIT: PARAMETERS[Parameter.ANGLE_LIMIT].high,
-        Parameter.WATCHDOG: 0.1,
-        Parameter.STOP_MODE: float(SafeMotion.DAMP),
-        Parameter.CONTACT_EVERY: 1.0,
-        Parameter.RATED_TORQUE: torque,
-        Parameter.RATED_SPEED: speed,
+def make_factory_defaults(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[ModuleParameter, float]:
+    """Return the flash of a new module. Gains are 0: a module that has not been configured holds nothing."""
+    torque_nm = min(rated_torque_nm, PARAMETERS[ModuleParameter.RATED_TORQUE].high)
+    speed_rad_s = min(rated_speed_rad_s, PARAMETERS[ModuleParameter.RATED_SPEED].high)
+    return dict.fromkeys(ModuleParameter, 0.0) | {
+        ModuleParameter.TORQUE_LIMIT: torque_nm,
+        ModuleParameter.SPEED_LIMIT: speed_rad_s,
+        ModuleParameter.ANGLE_LIMIT: PARAMETERS[ModuleParameter.ANGLE_LIMIT].high,
+        ModuleParameter.WATCHDOG: FACTORY_WATCHDOG_S,
+        ModuleParameter.STOP_MODE: float(SafeMotion.DAMP),
+        ModuleParameter.CONTACT_EVERY: FACTORY_CONTACT_EVERY,
+        ModuleParameter.RATED_TORQUE: torque_nm,
+        ModuleParameter.RATED_SPEED: speed_rad_s,
     }
 
 
-class Parameters:
-    """Reads, writes and saves; a write takes effect at once and is lost at a restart unless saved."""
+class ParameterStore:
+    """The parameters of one module. A write takes effect at once, and is lost at a restart unless it is saved."""
 
-    def __init__(self, flash: dict[Parameter, float]) -> None:
+    def __init__(self, flash: dict[ModuleParameter, float]) -> None:
         self._flash = dict(flash)
         self.values = dict(flash)
 
     def restart(self) -> None:
-        """Reload the saved values."""
+        """Load the saved values."""
         self.values = dict(self._flash)
 
-    def answer(self, node: int, data: bytes, armed: bool) -> Frame:
-        """Carry out a ParameterRequest; returns the ParameterAnswer."""
+    def answer_request(self, node: int, data: bytes, armed: bool) -> Frame:
+        """Execute a ParameterRequest.
+
+        Args:
+            node: id of the module.
+            data: data of the request.
+            armed: whether the module drives its motor; then nothing can be changed.
+
+        Returns:
+            The ParameterAnswer, with the value that is present afterwards.
+        """
         index, operation, raw = _read_request(data)
-        parameter = Parameter(index) if index in PARAMETERS else None
-        result = Result.UNKNOWN_INDEX if parameter is None else self._do(parameter, operation, raw, armed)
-        value = 0.0 if parameter is None else self.values[parameter]
-        return _write_answer(node, (index, operation, result, int.from_bytes(_single.pack(value), "little")))
+        result = ParameterResult.UNKNOWN_INDEX
+        value = 0.0
+        if index in PARAMETERS:
+            parameter = ModuleParameter(index)
+            result = self._execute(parameter, operation, raw, armed)
+            value = self.values[parameter]
+        value_raw = int.from_bytes(_single.pack(value), "little")
+        return _write_answer(node, (index, operation, result, value_raw))
 
-    def _do(self, parameter: Parameter, operation: int, raw: int, armed: bool) -> Result:
-        if operation == Operation.READ:
-            return Result.DONE
-        if operation not in (Operation.WRITE, Operation.SAVE):
-            return Result.UNKNOWN_OPERATION
-        allowed = PARAMETERS[parameter]
-        if not allowed.writable:
-            return Result.READ_ONLY
+    def _execute(self, parameter: ModuleParameter, operation: int, raw: int, armed: bool) -> ParameterResult:
+        match operation:
+            case ParameterOperation.READ:
+                return ParameterResult.DONE
+            case ParameterOperation.WRITE | ParameterOperation.SAVE:
+                pass
+            case _:
+                return ParameterResult.UNKNOWN_OPERATION
+        if not PARAMETERS[parameter].writable:
+            return ParameterResult.READ_ONLY
         if armed:
-            return Result.NOT_WHILE_ARMED
-        if operation == Operation.SAVE:
+            return ParameterResult.NOT_WHILE_ARMED
+        if operation == ParameterOperation.SAVE:
             self._flash[parameter] = self.values[parameter]
-            return Result.DONE
-        value = within(allowed, _single.unpack((raw & 0xFFFFFFFF).to_bytes(4, "little"))[0])
-        if value is None or (parameter in WHOLE and value != int(value)):
-            return Result.OUT_OF_RANGE
+            return ParameterResult.DONE
+        return self._write(parameter, raw)
+
+    def _write(self, parameter: ModuleParameter, raw: int) -> ParameterResult:
+        """Set the present value of a parameter to the float with these bits, if it is allowed."""
+        (wanted,) = _single.unpack((raw & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
+        value = clamp_to_range(PARAMETERS[parameter], wanted)
+        if value is None:
+            return ParameterResult.OUT_OF_RANGE
+        if parameter in INTEGER_PARAMETERS and value != int(value):
+            return ParameterResult.OUT_OF_RANGE
         self.values[parameter] = value
-        return Result.DONE
+        return ParameterResult.DONE
 
 
-def within(allowed: ParameterRange, value: float) -> float | None:
-    """The value if it is in range, None if not. On the bus bounds are single precision: 0.1 becomes slightly more."""
+def clamp_to_range(allowed: ParameterRange, value: float) -> float | None:
+    """Return a value within the range, or None if the value is out of range.
+
+    A bound has single precision on the bus, where 0.1 becomes slightly more. So a value that is beyond a bound by no
+    more than that becomes the bound.
+    """
     if not math.isfinite(value):
         return None
-    slack = 1e-6 * max(abs(allowed.low), abs(allowed.high))
-    if not allowed.low - slack <= value <= allowed.high + slack:
+    tolerance = RANGE_TOLERANCE * max(abs(allowed.low), abs(allowed.high))
+    if not allowed.low - tolerance <= value <= allowed.high + tolerance:
         return None
     return min(max(value, allowed.low), allowed.high)
 
 
-_read_request = codec()[Opcode.PARAMETER_REQUEST].reader("index", "operation", "value")
-_write_answer = codec()[Opcode.PARAMETER_ANSWER].writer("index", "operation", "result", "value")
+_read_request = load_layouts()[Opcode.PARAMETER_REQUEST].make_reader("index", "operation", "value")
+_write_answer = load_layouts()[Opcode.PARAMETER_ANSWER].make_writer("index", "operation", "result", "value")

@@ -1,4 +1,4 @@
-"""Serves a chain of emulated joint modules on its buses: frames in, frames out, and time if it runs by the clock.
+"""Serves a chain of emulated joint modules on its buses: receives and sends frames, and advances wall-clock time.
 
 server = EmulatorServer(wires, chain)
 while ...:
@@ -19,25 +19,34 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
 
-IN_STEP_US = 2000.0  # the physics model lags now by at most this, so that a Sync needs little computing
-FINEST_US = 200.0  # frames are released in groups of this length, for fewer wake-ups
+MAX_LAG_US = 2000.0  # of the physics model behind the present, so that a Sync needs little computing
+MIN_PAUSE_US = 200.0  # frames are released in groups of this length, for fewer wake-ups
 
 
 class EmulatorServer:
-    """The far end of one or more buses, tail to head."""
+    """The emulated modules' end of one or more buses, tail to head."""
 
     def __init__(self, wires: Sequence[Wire], chain: ModuleChain) -> None:
-        if len(wires) != len(chain.counts):
-            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.counts)} buses")
-        self.wires, self.chain = wires, chain
+        """Connect a chain to its buses. Raises ConfigError if their numbers differ."""
+        if len(wires) != len(chain.modules_per_bus):
+            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses")
+        self.wires = wires
+        self.chain = chain
         self.unsent = 0  # frames that an interface did not accept
         self._start_ns: int | None = None
 
     def run_due(self, now_ns: int) -> float | None:
-        """Handle received frames, send due ones; seconds until the next run is due. None: never."""
-        arrived = [wire.receive() for wire in self.wires]
+        """Process received frames, and send the frames that are due.
+
+        Args:
+            now_ns: present time, on a steady clock. Not used by a stepped chain.
+
+        Returns:
+            Seconds until the next run is due; None for a stepped chain, which only reacts to frames.
+        """
+        received = [wire.receive() for wire in self.wires]
         if self.chain.stepped:
-            for channel, frames in enumerate(arrived):
+            for channel, frames in enumerate(received):
                 for frame in frames:
                     self.chain.receive(channel, frame)
             self._send()
@@ -45,48 +54,57 @@ class EmulatorServer:
         if self._start_ns is None:
             self._start_ns = now_ns
         clock_us = (now_ns - self._start_ns) / 1000
-        self._receive_in_time(arrived, clock_us)
+        self._receive_in_time(received, clock_us)
         self.chain.advance_to(clock_us)
         self._send()
-        now_us = self.chain.now_us
-        wait_us = min(self.chain.next_us() - now_us, IN_STEP_US)
-        return max(wait_us, FINEST_US) * 1e-6
+        pause_us = min(self.chain.next_us() - self.chain.now_us, MAX_LAG_US)
+        return max(pause_us, MIN_PAUSE_US) * 1e-6
 
-    def _receive_in_time(self, arrived: Sequence[Sequence[Frame]], clock_us: float) -> None:
-        """Handle frames at their estimated times of arrival.
+    def _receive_in_time(self, received: Sequence[Sequence[Frame]], clock_us: float) -> None:
+        """Process frames at their estimated times of arrival.
 
-        After a delay of this process several periods are in the queue: they are spread over the time that it took, so
-        that a delay here does not look like a delay of the host.
+        After a delay of this process several periods are in the queue. They are spread over the time since the last
+        run, so that a delay here does not look like a delay of the host.
+
+        Args:
+            received: the frames of every bus.
+            clock_us: present time since the start.
         """
         before_us = self.chain.now_us + self.chain.skipped_us
-        for channel, frames in enumerate(arrived):
+        for channel, frames in enumerate(received):
             if not frames:
                 continue
-            syncs = sum(frame.id >> NODE_BITS == Opcode.SYNC for frame in frames)
-            met = 0
-            if not syncs:
+            syncs = sum(_is_sync(frame) for frame in frames)
+            if syncs == 0:
                 self.chain.advance_to(clock_us)
+            syncs_so_far = 0
             for frame in frames:
-                if frame.id >> NODE_BITS == Opcode.SYNC:
-                    met += 1
-                    self.chain.advance_to(before_us + (clock_us - before_us) * met / syncs)
+                if _is_sync(frame):
+                    syncs_so_far += 1
+                    self.chain.advance_to(before_us + (clock_us - before_us) * syncs_so_far / syncs)
                 self.chain.receive(channel, frame)
 
     def _send(self) -> None:
         for channel, wire in enumerate(self.wires):
-            for frame in self.chain.take(channel):
-                self.unsent += not wire.send(frame)
+            for frame in self.chain.take_frames(channel):
+                if not wire.send(frame):
+                    self.unsent += 1
+
+
+def _is_sync(frame: Frame) -> bool:
+    return frame.id >> NODE_BITS == Opcode.SYNC
 
 
 class InProcessEmulators:
-    """Emulators in this process, at the other end of a virtual bus: calling it runs them."""
+    """Emulators in this process, at the other end of a virtual bus: a call runs them."""
 
     def __init__(self, server: EmulatorServer, send_pose: PoseSender | None, clock_ns: Callable[[], int]) -> None:
         self.server = server
-        self._send_pose, self._clock_ns = send_pose, clock_ns
+        self._send_pose = send_pose
+        self._clock_ns = clock_ns
 
     def __call__(self) -> float | None:
-        """Handle received frames and send due ones; seconds until the next run is due, None for never."""
+        """Process received frames and send due ones; return the seconds until the next run is due, None for never."""
         return self.server.run_due(self._clock_ns())
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
@@ -94,14 +112,14 @@ class InProcessEmulators:
         self.server.chain.inject(injection, begins=begins)
 
     def close(self) -> None:
-        """Close the bus."""
+        """Close the bus, and the sender of poses."""
         for wire in self.server.wires:
             wire.close()
         if self._send_pose is not None:
             self._send_pose.close()
 
 
-def here(
+def make_local_emulators(
     config: RunConfig,
     settings: CanSettings,
     channel: str,
@@ -109,8 +127,20 @@ def here(
     *,
     stepped: bool,
 ) -> InProcessEmulators:
-    """All emulators of a run on one virtual bus; pose: address for poses, HOST:PORT. Raises ConfigError."""
+    """Create the emulators of a run on one virtual bus, in this process.
+
+    Args:
+        config: the run, with the robot.
+        settings: settings of the backend.
+        channel: name of the virtual bus.
+        pose: address, HOST:PORT, to which they send motion capture; None: nowhere.
+        stepped: whether time advances only from Sync to Sync.
+
+    Raises:
+        ConfigError: the settings are impossible.
+    """
     send_pose = None if pose is None else PoseSender(pose)
     physics_model = make_physics_model(config, settings, "can")
     chain = ModuleChain(config, settings, physics_model, stepped=stepped, send_pose=send_pose)
-    return InProcessEmulators(EmulatorServer([VirtualWire(channel)], chain), send_pose, time.monotonic_ns)
+    server = EmulatorServer([VirtualWire(channel)], chain)
+    return InProcessEmulators(server, send_pose, time.monotonic_ns)

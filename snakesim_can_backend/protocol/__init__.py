@@ -1,5 +1,5 @@
-"""The bus protocol.
+"""The protocol of the joint modules on a CAN bus.
 
-`definitions`  ids, opcodes, states, parameters     `codec`     frames to values and back, by the DBC file
-`commands`     Commands and their answers           `expanded`  the DBC with a message for every module
+`definitions`  ids, opcodes, states and parameters     `codec`     frames to values and back, by the DBC file
+`commands`     frames that the host sends              `expanded`  the DBC file with a message for every module
 """

@@ -1,7 +1,8 @@
-"""Numbers to bytes and back, by the layouts of the DBC file.
+"""Converts values to frames and back, by the layouts of the DBC file.
 
-cantools reads the file once; what runs at every frame is made from it here and works on raw integers, which are scaled
-once a tick for all joints together. Frames are taken apart by bitstruct, as in cantools. Bus units end in this module.
+cantools reads the file once. The functions that run for every frame are made from it here, and work on raw integers;
+their callers scale the numbers of all joints together, once in every control cycle. As in cantools, bitstruct takes
+frames apart. Only this module knows the units of the bus.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,146 +16,193 @@ import bitstruct.c
 import cantools
 from cantools.database.can import Database
 
-from snakesim_can_backend.protocol.definitions import NODE_BITS, WITH_CHECKSUM, Frame, Opcode, checksum, frame_id
+from snakesim_can_backend.protocol.definitions import (
+    NODE_BITS,
+    NODE_MASK,
+    WITH_CHECKSUM,
+    Frame,
+    Opcode,
+    checksum,
+    frame_id,
+)
 from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.model.files import SCHEMAS
 
 DBC = "snakesim.dbc"
-OPCODE_MASK = 0x7FF & ~((1 << NODE_BITS) - 1)
+OPCODE_MASK = 0x7FF & ~NODE_MASK  # of an 11-bit id
+FLOAT_BYTES = 4
 _single = Struct("<f")
-Reader = Callable[[bytes], tuple[int, ...]]
-Writer = Callable[[int, Sequence[int]], Frame]
+
+Reader = Callable[[bytes], tuple[int, ...]]  # data of a frame -> raw numbers
+Writer = Callable[[int, Sequence[int]], Frame]  # node, raw numbers -> frame
 
 
 class CodecError(SnakesimError, ValueError):
-    """A value that does not fit its signal."""
+    """A value does not fit its signal, or a frame does not fit its message."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """Where a number stands in a frame, and what one step of it is worth."""
+    """The place of a number in a frame, and its conversion: value = raw * scale + offset."""
 
     name: str
-    shift: int
+
+    # Place.
+    shift: int  # bits before it
     bits: int
     signed: bool
-    scale: float
+    is_float: bool  # single precision; scale and offset are not used
+
+    # Conversion.
+    scale: float  # unit of one step
     offset: float
-    low: float
-    high: float
+    low: float  # smallest value
+    high: float  # largest value
     unit: str
-    is_float: bool
 
     @property
     def mask(self) -> int:
-        """All bits of it set."""
+        """Return a number of `bits` ones."""
         return (1 << self.bits) - 1
 
     @property
-    def format(self) -> str:
-        """As bitstruct writes it; of a float only the bits are taken."""
-        return f"{'s' if self.signed and not self.is_float else 'u'}{self.bits}"
+    def bitstruct_format(self) -> str:
+        """Return the signal's format for bitstruct. Of a float only the bits are read."""
+        kind = "s" if self.signed and not self.is_float else "u"
+        return f"{kind}{self.bits}"
 
-    def raw(self, value: float) -> int:
-        """The nearest step. Raises CodecError for what is out of range."""
+    def encode(self, value: float) -> int:
+        """Return the raw number that is nearest to a value. Raises CodecError for a value out of range."""
         if not self.low <= value <= self.high:  # which NaN fails too
             raise CodecError(f"{self.name} = {value} {self.unit} does not fit; it goes from {self.low} to {self.high}")
         if self.is_float:
             return int.from_bytes(_single.pack(value), "little")
         return round((value - self.offset) / self.scale)
 
-    def value(self, raw: int) -> float:
-        """What a raw number means."""
+    def decode(self, raw: int) -> float:
+        """Return the value of a raw number, in the signal's unit."""
         if self.is_float:
-            return _single.unpack(raw.to_bytes(4, "little"))[0]
+            (value,) = _single.unpack(raw.to_bytes(FLOAT_BYTES, "little"))
+            return value
         return raw * self.scale + self.offset
 
 
-class Layout:
-    """One message of the protocol."""
+class MessageLayout:
+    """The layout of one message of the protocol: its signals by name, and functions that read and write its frames."""
 
     def __init__(self, message: Any) -> None:
+        """Create the layout from a message of cantools."""
         self.name: str = message.name
         self.opcode = Opcode(message.frame_id >> NODE_BITS)
-        self.length: int = message.length
-        self.signals: dict[str, Signal] = {s.name: _signal(s) for s in message.signals}
-        self._checked = self.opcode in WITH_CHECKSUM
-        self._readers = {name: self.reader(name) for name in self.signals}
+        self.length: int = message.length  # bytes
+        self.signals: dict[str, Signal] = {signal.name: _make_signal(signal) for signal in message.signals}
+        self._has_checksum = self.opcode in WITH_CHECKSUM
+        self._readers = {name: self.make_reader(name) for name in self.signals}
 
-    def reader(self, *names: str) -> Reader:
-        """A function that takes these signals' raw numbers out of a frame of this length; they must not overlap."""
-        places, parts, at = dict[str, int](), list[str](), 8 * self.length
-        for signal in sorted((self.signals[name] for name in names), key=lambda s: -s.shift):  # from the last bit on
-            places[signal.name] = len(places)
-            parts += [_padding(at - signal.shift - signal.bits), signal.format]
-            at = signal.shift
-        unpack = bitstruct.c.compile("".join([*parts, _padding(at)])).unpack
-        if list(places) == list(names):
+    def make_reader(self, *names: str) -> Reader:
+        """Return a function that reads some signals' raw numbers, in this order, from the data of a frame.
+
+        The signals must not overlap, and the data must have the length of this message. Raises CodecError.
+        """
+        signals = [self.signals[name] for name in names]
+        # bitstruct begins with the highest bit, so the function reverses the bytes and reads the last signal first.
+        from_high_to_low = sorted(signals, key=lambda signal: -signal.shift)
+        formats: list[str] = []
+        end = 8 * self.length
+        for signal in from_high_to_low:
+            formats.append(_padding_format(end - signal.shift - signal.bits))
+            formats.append(signal.bitstruct_format)
+            end = signal.shift
+        formats.append(_padding_format(end))
+        unpack = bitstruct.c.compile("".join(formats)).unpack
+        read_names = [signal.name for signal in from_high_to_low]
+        if read_names == list(names):
             return lambda data: unpack(data[::-1])
-        in_order = itemgetter(*(places[name] for name in names))
-        return lambda data: in_order(unpack(data[::-1]))
+        select = itemgetter(*(read_names.index(name) for name in names))
+        return lambda data: select(unpack(data[::-1]))
 
-    def writer(self, *names: str) -> Writer:
-        """A function that makes the frame of a node from these signals' raw numbers; the checksum comes by itself."""
-        parts = [(s.shift, s.mask) for s in (self.signals[name] for name in names)]
-        opcode, length, checked = self.opcode, self.length, self._checked
-        payload = length - 1 if checked else length
+    def make_writer(self, *names: str) -> Writer:
+        """Return a function that makes the frame of a node from some signals' raw numbers, and adds the checksum."""
+        places = [(self.signals[name].shift, self.signals[name].mask) for name in names]
+        opcode = self.opcode
+        has_checksum = self._has_checksum
+        payload_bytes = self.length - 1 if has_checksum else self.length
 
         def write(node: int, raw: Sequence[int]) -> Frame:
             bits = 0
-            for (shift, mask), number in zip(parts, raw, strict=True):
+            for (shift, mask), number in zip(places, raw, strict=True):
                 bits |= (number & mask) << shift
             identifier = frame_id(opcode, node)
-            data = bits.to_bytes(payload, "little")
-            return Frame(identifier, data + bytes((checksum(identifier, data),)) if checked else data)
+            data = bits.to_bytes(payload_bytes, "little")
+            if has_checksum:
+                data += bytes((checksum(identifier, data),))
+            return Frame(identifier, data)
 
         return write
 
-    def frame(self, node: int, **values: float) -> Frame:
-        """The frame of a node from values in SI units; what is not named is 0. Raises CodecError."""
-        raw = [self.signals[name].raw(value) for name, value in values.items()]
-        return self.writer(*values)(node, raw)
+    def encode(self, node: int, **values: float) -> Frame:
+        """Return the frame of a node with some values.
 
-    def values(self, data: bytes) -> Mapping[str, float]:
-        """All signals in SI units. Of a multiplexed group only one means anything: look at `mode`."""
+        Args:
+            node: sender or receiver.
+            values: by signal, in the signal's unit. Signals that are not named are 0.
+
+        Raises:
+            CodecError: a value is out of range.
+        """
+        raw = [self.signals[name].encode(value) for name, value in values.items()]
+        return self.make_writer(*values)(node, raw)
+
+    def decode(self, data: bytes) -> Mapping[str, float]:
+        """Return the values of all signals in a frame's data, in their units.
+
+        Signals that share their bits all get a value; only the one that belongs to the frame's `mode` has a meaning.
+
+        Raises:
+            CodecError: the data has another length than this message.
+        """
         if len(data) != self.length:
             raise CodecError(f"{self.name} has {self.length} bytes, this one {len(data)}")
-        return {name: self.signals[name].value(read(data)[0]) for name, read in self._readers.items()}
+        values: dict[str, float] = {}
+        for name, read in self._readers.items():
+            (raw,) = read(data)
+            values[name] = self.signals[name].decode(raw)
+        return values
 
 
 @cache
-def codec() -> dict[Opcode, Layout]:
-    """The layout of every message of the DBC file, read once a process."""
-    layouts = map(Layout, load_database().messages)
+def load_layouts() -> dict[Opcode, MessageLayout]:
+    """Return the layout of every message of the DBC file, which is read once in a process."""
+    layouts = [MessageLayout(message) for message in load_database().messages]
     return {layout.opcode: layout for layout in layouts}
 
 
 def load_database() -> Database:
-    """The DBC file, which comes with the HAL, as cantools has it; ids of all nodes find their message."""
+    """Load the DBC file that comes with the HAL into cantools. The ids of all nodes find their message."""
     database = cantools.database.load_file(SCHEMAS / "can" / DBC, frame_id_mask=OPCODE_MASK)
     assert isinstance(database, Database)
     return database
 
 
-def _padding(bits: int) -> str:
+def _padding_format(bits: int) -> str:
+    """Return bitstruct's format of bits that are skipped."""
     if bits < 0:
         raise CodecError("signals that overlap are read one by one")
     return f"p{bits}" if bits else ""
 
 
-def _signal(signal: Any) -> Signal:
+def _make_signal(signal: Any) -> Signal:
     if signal.byte_order != "little_endian":
         raise CodecError(f"signal {signal.name}: only little-endian signals are meant here")
-    scale, offset = float(signal.scale), float(signal.offset)
     return Signal(
         name=signal.name,
         shift=signal.start,
         bits=signal.length,
         signed=signal.is_signed,
-        scale=scale,
-        offset=offset,
+        is_float=signal.is_float,
+        scale=float(signal.scale),
+        offset=float(signal.offset),
         low=float(signal.minimum),
         high=float(signal.maximum),
         unit=signal.unit or "",
-        is_float=signal.is_float,
     )

@@ -1,7 +1,7 @@
 """Frames to the modules: setpoints in raw numbers, and commands for changes of the robot's lifecycle.
 
-Pure: returns frames, and the caller sends them. A setpoint that the bus did not accept is replaced by the next;
-nothing is ever queued.
+This module is pure: it returns frames, and the caller sends them. A setpoint that the bus did not accept is replaced by
+the next one; nothing is ever queued.
 """
 
 import math
@@ -10,105 +10,124 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.protocol.codec import Writer, codec
+from snakesim_can_backend.protocol.codec import Writer, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     COMMAND_KEY,
-    COUNTS,
-    Action,
+    COUNTER_MODULUS,
+    CommandAction,
     EmergencyReason,
     Frame,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Operation,
-    Parameter,
+    ParameterOperation,
 )
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import LifecycleState
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
-MAX_RAW = 32767
-MAX_LIMIT_RAW = 65535
+MAX_TARGET_RAW = 32767  # of a signed number of 16 bits; -32768 is not used, so that the range is symmetric
+MAX_TORQUE_LIMIT_RAW = 65535  # of an unsigned number of 16 bits
+SYNC_COUNT_MASK = 0xFF
+SYNC_TIME_MASK = 0xFFFFFFFF
 
 
 class SetpointWriter:
-    """Makes the setpoint frames of all joints; tracks the next count that each module expects."""
+    """Makes the setpoint frames of all joints, and tracks the counter that each module expects next."""
 
     def __init__(self, joints: int) -> None:
-        layout = codec()[Opcode.SET_POINT]
-        self._write = layout.writer("mode", "count", "position", "torque_limit")  # the targets share their bits
+        layout = load_layouts()[Opcode.SET_POINT]
+        # Position, velocity and torque share their bits, so that writing one of them writes the target of every mode.
+        self._write = layout.make_writer("mode", "count", "position", "torque_limit")
         self._count = [0] * joints
         scales = [layout.signals[name].scale for name in ("position", "velocity", "torque")]
-        self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; the bits of a passive one are 0
-        self._limit_steps = 1.0 / layout.signals["torque_limit"].scale
+        self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; a passive joint has no target
+        self._limit_steps_per_nm = 1.0 / layout.signals["torque_limit"].scale
 
-    def frames(self, setpoints: SafeSetpoints) -> list[Frame]:
-        """One frame a joint, tail to head."""
+    def encode(self, setpoints: SafeSetpoints) -> list[Frame]:
+        """Return one frame a joint, tail to head."""
         modes = np.array(setpoints.mode, dtype=np.intp)
-        target = _steps(np.array(setpoints.target) * self._steps_per_unit[modes], -MAX_RAW, MAX_RAW)
-        limit = _steps(np.array(setpoints.torque_limit_nm) * self._limit_steps, 0, MAX_LIMIT_RAW)
-        rows = zip(setpoints.mode, self._count, target.tolist(), limit.tolist(), strict=True)
+        targets = np.array(setpoints.target) * self._steps_per_unit[modes]
+        limits = np.array(setpoints.torque_limit_nm) * self._limit_steps_per_nm
+        targets_raw = _round_steps(targets, -MAX_TARGET_RAW, MAX_TARGET_RAW).tolist()
+        limits_raw = _round_steps(limits, 0, MAX_TORQUE_LIMIT_RAW).tolist()
+        rows = zip(setpoints.mode, self._count, targets_raw, limits_raw, strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 
-    def sent(self, joint: int) -> None:
-        """The bus accepted the setpoint of a joint; only then does its module expect the next count."""
-        self._count[joint] = (self._count[joint] + 1) % COUNTS
+    def confirm_sent(self, joint: int) -> None:
+        """Advance the counter of a joint. Call it only for setpoints that the bus has accepted."""
+        self._count[joint] = (self._count[joint] + 1) % COUNTER_MODULUS
 
 
-def _steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
-    """The nearest integer steps. Values are finite: the limiter rejects NaN."""
+def _round_steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
+    """Return the nearest integer steps within a range. Values are finite, because the limiter rejects NaN."""
     return np.clip(np.rint(values), low, high).astype(np.int64)
 
 
-def on_change(before: LifecycleState, now: LifecycleState) -> list[Frame]:
-    """Frames to all modules when the robot's lifecycle changes; it may have passed through states in between."""
+def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[Frame]:
+    """Return the frames to all modules when the robot's lifecycle changes.
+
+    The lifecycle may have passed through other states between `before` and `now`, within one control cycle.
+    """
     if now == before:
         return []
     if now == "estop":
-        return [emergency()]
+        return [make_emergency()]
     if before == "armed":
-        return [command(Action.STOP if now == "fault" else Action.DISARM)]
-    first = [command(Action.CLEAR)] if before in LATCHED and now not in LATCHED else []
-    return [*first, command(Action.ARM)] if now == "armed" else first
+        action = CommandAction.STOP if now == "fault" else CommandAction.DISARM
+        return [make_command(action)]
+    frames: list[Frame] = []
+    if before in LATCHED and now not in LATCHED:
+        frames.append(make_command(CommandAction.CLEAR))
+    if now == "armed":
+        frames.append(make_command(CommandAction.ARM))
+    return frames
 
 
-def reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
-    """The frame to repeat to a module in an unexpected state, because one may have been lost."""
+def make_reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
+    """Return the frame to repeat to a module in an unexpected state, because an earlier one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
-            return command(Action.ARM, node)
+            return make_command(CommandAction.ARM, node)
         case "estop", ModuleState.DISARMED | ModuleState.ARMED | ModuleState.STOPPING | ModuleState.FAULT:
-            return emergency()
+            return make_emergency()
         case (("disarmed" | "fault"), ModuleState.ARMED):
-            return command(Action.STOP, node)
+            return make_command(CommandAction.STOP, node)
     return None
 
 
-def is_arming(frame: Frame) -> bool:
-    """Whether a frame would switch motors on."""
-    return frame == command(Action.ARM)
+def is_arm_command(frame: Frame) -> bool:
+    """Return whether a frame would switch the motors of all modules on."""
+    return frame == make_command(CommandAction.ARM)
 
 
-def command(action: Action, node: int = BROADCAST) -> Frame:
-    """A Command to one module, or to all."""
-    return codec()[Opcode.COMMAND].frame(node, action=action, key=COMMAND_KEY)
+def make_command(action: CommandAction, node: int = BROADCAST) -> Frame:
+    """Return a Command to one module, or to all."""
+    return load_layouts()[Opcode.COMMAND].encode(node, action=action, key=COMMAND_KEY)
 
 
-def question(node: int) -> Frame:
-    """A request for a constant value: its answer comes after all earlier frames of the module."""
-    return codec()[Opcode.PARAMETER_REQUEST].frame(node, index=Parameter.TAIL, operation=Operation.READ, value=0.0)
+def make_query(node: int) -> Frame:
+    """Return a request for a constant parameter. Its answer comes after all earlier frames of the module."""
+    layout = load_layouts()[Opcode.PARAMETER_REQUEST]
+    return layout.encode(node, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0)
 
 
-def emergency() -> Frame:
-    """Motors off at once, on all modules."""
-    return codec()[Opcode.EMERGENCY].frame(BROADCAST, reason=EmergencyReason.HOST)
+def make_emergency() -> Frame:
+    """Return the frame that switches the motors of all modules off at once."""
+    return load_layouts()[Opcode.EMERGENCY].encode(BROADCAST, reason=EmergencyReason.HOST)
 
 
-def sync(count: int, time_us: int) -> Frame:
-    """All modules sample and enact now."""
-    return _sync_writer()(BROADCAST, (count & 0xFF, time_us & 0xFFFFFFFF))
+def make_sync(count: int, time_us: int) -> Frame:
+    """Return the frame at which all modules sample their sensors and then follow their newest setpoints.
+
+    Args:
+        count: number of the Sync; the frame has its lowest 8 bits.
+        time_us: time of the host; the frame has its lowest 32 bits.
+    """
+    return _sync_writer()(BROADCAST, (count & SYNC_COUNT_MASK, time_us & SYNC_TIME_MASK))
 
 
 @cache
 def _sync_writer() -> Writer:
-    return codec()[Opcode.SYNC].writer("count", "time")
+    return load_layouts()[Opcode.SYNC].make_writer("count", "time")

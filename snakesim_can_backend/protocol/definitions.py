@@ -9,23 +9,31 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-VERSION = 1
-BROADCAST = 0
-FIRST_NODE, LAST_NODE = 1, 62
+PROTOCOL_VERSION = 1
+
+# Ids: the upper five bits are the opcode, the lower six the node.
 NODE_BITS = 6
 NODE_MASK = (1 << NODE_BITS) - 1
-COMMAND_KEY = 0x5AAE
-COUNTS = 16  # setpoint and state counters have four bits
-MAX_LOST = 2  # setpoints that may be missing before one; a count further ahead, or an earlier one, is wrong
-WRONG_COUNTS = 5  # in a row, after which a module stops
+BROADCAST = 0  # node of frames to all modules
+FIRST_NODE = 1
+LAST_NODE = 62
+
+COMMAND_KEY = 0x5AAE  # in every Command, so that no other frame can be taken for one
+
+# Counters of setpoints and states.
+COUNTER_MODULUS = 16  # they have four bits
+MAX_LOST_SETPOINTS = 2  # that may be missing before one; a count further ahead, or an earlier one, is wrong
+MAX_WRONG_COUNTS = 5  # in a row, after which a module stops
+
+# Reports that modules send by themselves.
 HEARTBEAT_PERIOD_S = 0.1
+HEALTH_PERIOD_S = 0.5
 UPTIME_RANGE_MS = 1 << 32  # of a heartbeat: 49.7 days
 MAX_UPTIME_MS = UPTIME_RANGE_MS - 1  # where an uptime stays from then on
-HEALTH_PERIOD_S = 0.5
 
 
 class Opcode(IntEnum):
-    """Upper five bits of an id; the lowest wins arbitration."""
+    """The kind of a message: the upper five bits of an id. The lowest wins arbitration."""
 
     EMERGENCY = 0
     COMMAND = 1
@@ -59,7 +67,7 @@ class ModuleState(IntEnum):
     EMERGENCY = 5  # passive; latched until cleared or rebooted
 
 
-class Action(IntEnum):
+class CommandAction(IntEnum):
     """Action of a Command."""
 
     ARM = 1
@@ -98,14 +106,14 @@ class ModuleFault(IntEnum):
 
 
 class EmergencyReason(IntEnum):
-    """Who sent an Emergency."""
+    """What sent an Emergency."""
 
     UNSPECIFIED = 0
     PERSON = 1
     HOST = 2
 
 
-class Operation(IntEnum):
+class ParameterOperation(IntEnum):
     """Operation of a ParameterRequest."""
 
     READ = 0
@@ -113,7 +121,7 @@ class Operation(IntEnum):
     SAVE = 2
 
 
-class Result(IntEnum):
+class ParameterResult(IntEnum):
     """Result of a ParameterRequest."""
 
     DONE = 0
@@ -131,7 +139,7 @@ class SafeMotion(IntEnum):
     DAMP = 1
 
 
-class Parameter(IntEnum):
+class ModuleParameter(IntEnum):
     """Index of every parameter."""
 
     STIFFNESS = 1
@@ -159,20 +167,20 @@ class ParameterRange:
     writable: bool = True
 
 
-PARAMETERS: dict[Parameter, ParameterRange] = {
-    Parameter.STIFFNESS: ParameterRange(0.0, 1e5, "N·m/rad"),
-    Parameter.DAMPING: ParameterRange(0.0, 1e4, "N·m·s/rad"),
-    Parameter.VELOCITY_GAIN: ParameterRange(0.0, 1e4, "N·m·s/rad"),
-    Parameter.TORQUE_LIMIT: ParameterRange(0.0, 32.767, "N·m"),
-    Parameter.SPEED_LIMIT: ParameterRange(0.0, 32.767, "rad/s"),
-    Parameter.ANGLE_LIMIT: ParameterRange(0.0, 3.2767, "rad"),
-    Parameter.WATCHDOG: ParameterRange(0.02, 0.1, "s"),
-    Parameter.STOP_MODE: ParameterRange(0, 1, "0 passive, 1 damp"),
-    Parameter.CONTACT_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
-    Parameter.IMU_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
-    Parameter.TAIL: ParameterRange(0, 1, "1: sends TailContact too"),
-    Parameter.RATED_TORQUE: ParameterRange(0.0, 32.767, "N·m", writable=False),
-    Parameter.RATED_SPEED: ParameterRange(0.0, 32.767, "rad/s", writable=False),
+PARAMETERS: dict[ModuleParameter, ParameterRange] = {
+    ModuleParameter.STIFFNESS: ParameterRange(0.0, 1e5, "N·m/rad"),
+    ModuleParameter.DAMPING: ParameterRange(0.0, 1e4, "N·m·s/rad"),
+    ModuleParameter.VELOCITY_GAIN: ParameterRange(0.0, 1e4, "N·m·s/rad"),
+    ModuleParameter.TORQUE_LIMIT: ParameterRange(0.0, 32.767, "N·m"),
+    ModuleParameter.SPEED_LIMIT: ParameterRange(0.0, 32.767, "rad/s"),
+    ModuleParameter.ANGLE_LIMIT: ParameterRange(0.0, 3.2767, "rad"),
+    ModuleParameter.WATCHDOG: ParameterRange(0.02, 0.1, "s"),
+    ModuleParameter.STOP_MODE: ParameterRange(0, 1, "0 passive, 1 damp"),
+    ModuleParameter.CONTACT_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
+    ModuleParameter.IMU_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
+    ModuleParameter.TAIL: ParameterRange(0, 1, "1: sends TailContact too"),
+    ModuleParameter.RATED_TORQUE: ParameterRange(0.0, 32.767, "N·m", writable=False),
+    ModuleParameter.RATED_SPEED: ParameterRange(0.0, 32.767, "rad/s", writable=False),
 }
 
 
@@ -184,25 +192,28 @@ class Frame(NamedTuple):
 
 
 def frame_id(opcode: Opcode, node: int) -> int:
-    """The id of a message to or from a node; node 0 is broadcast."""
+    """Return the id of a message to or from a node; node 0 is broadcast."""
     return opcode << NODE_BITS | node
 
 
-def opcode_of(identifier: int) -> int:
-    """The opcode of an id."""
+def parse_opcode(identifier: int) -> int:
+    """Return the opcode in an id. It need not be one of `Opcode`."""
     return identifier >> NODE_BITS
 
 
-def node_of(identifier: int) -> int:
-    """The node of an id: sender or receiver."""
+def parse_node(identifier: int) -> int:
+    """Return the node in an id: the sender or the receiver."""
     return identifier & NODE_MASK
 
 
 def checksum(identifier: int, data: bytes) -> int:
-    """Low byte of CRC-16/XMODEM over `data`, with the id as initial value, so that frames cannot be confused."""
+    """Return the checksum of a frame: the low byte of CRC-16/XMODEM over the data before it.
+
+    The id is the initial value, so that a frame cannot be confused with one of another id.
+    """
     return crc_hqx(data, identifier) & 0xFF
 
 
-def intact(frame: Frame) -> bool:
-    """Whether the last byte of a frame is the checksum of the others."""
+def has_valid_checksum(frame: Frame) -> bool:
+    """Return whether the last byte of a frame is the checksum of the others."""
     return crc_hqx(frame.data[:-1], frame.id) & 0xFF == frame.data[-1]

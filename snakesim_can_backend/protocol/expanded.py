@@ -17,21 +17,22 @@ TO_ONE_OR_ALL = (Opcode.COMMAND,)
 
 
 def expanded_dbc() -> str:
-    """Text of the expanded file. `JointState` of node 5 is called `JointState_05`."""
+    """Return the text of the expanded file. `JointState` of node 5 is called `JointState_05`."""
     source = load_database()
     messages: list[Message] = []
     for message in source.messages:
-        for node in nodes_of(Opcode(message.frame_id >> NODE_BITS)):
-            emulator = copy.deepcopy(message)
-            emulator.frame_id = message.frame_id | node
-            emulator.name = message.name if node == BROADCAST else f"{message.name}_{node:02d}"
-            messages.append(emulator)
+        for node in list_nodes(Opcode(message.frame_id >> NODE_BITS)):
+            node_message = copy.deepcopy(message)
+            node_message.frame_id = message.frame_id | node
+            if node != BROADCAST:
+                node_message.name = f"{message.name}_{node:02d}"
+            messages.append(node_message)
     database = Database(messages, nodes=source.nodes, version=source.version, dbc_specifics=source.dbc, strict=True)
     return database.as_dbc_string(sort_signals="default").replace("\r\n", "\n")
 
 
-def nodes_of(opcode: Opcode) -> Iterable[int]:
-    """The nodes that send or receive a message."""
+def list_nodes(opcode: Opcode) -> Iterable[int]:
+    """Return the nodes that send or receive a message."""
     if opcode in TO_ALL:
         return [BROADCAST]
     each = list(range(FIRST_NODE, LAST_NODE + 1))

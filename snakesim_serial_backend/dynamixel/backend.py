@@ -118,7 +118,7 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are at most {LAST_ID}"
+                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}"
             )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
@@ -128,8 +128,8 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit amperes: "
-                f"take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
+                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
             )
 
 

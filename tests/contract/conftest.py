@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.protocol.definitions import Frame, node_of
+from snakesim_can_backend.protocol.definitions import Frame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
@@ -96,7 +96,7 @@ def cut_off(backend: Any, joint: int) -> None:
     take = backend.modules.reading.take
 
     def receive(frame: Frame) -> None:
-        if node_of(frame.id) != joint + 1:
+        if parse_node(frame.id) != joint + 1:
             take(frame)
 
     backend.modules.reading.take = receive

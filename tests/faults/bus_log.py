@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, opcode_of
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Opcode, parse_opcode
 
 
 def read(path: Path) -> list[Frame]:
@@ -16,13 +16,13 @@ def read(path: Path) -> list[Frame]:
     return found
 
 
-def commands(frames: list[Frame], action: Action) -> int:
+def commands(frames: list[Frame], action: CommandAction) -> int:
     """How many Commands of a kind the driver sent."""
-    layout = codec()[Opcode.COMMAND]
-    sent = [layout.values(frame.data)["action"] for frame in frames if opcode_of(frame.id) == Opcode.COMMAND]
+    layout = load_layouts()[Opcode.COMMAND]
+    sent = [layout.decode(frame.data)["action"] for frame in frames if parse_opcode(frame.id) == Opcode.COMMAND]
     return sent.count(action)
 
 
 def setpoints(frames: list[Frame]) -> int:
     """How many setpoints the driver sent."""
-    return sum(opcode_of(frame.id) == Opcode.SET_POINT for frame in frames)
+    return sum(parse_opcode(frame.id) == Opcode.SET_POINT for frame in frames)

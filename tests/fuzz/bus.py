@@ -22,8 +22,8 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
     checksum,
     frame_id,
-    node_of,
-    opcode_of,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
@@ -62,7 +62,7 @@ class FrameMaker:
                 identifier = rng.choice((0x7FF, 0x800, 0x1FFFFFFF, 0xFC0))
             case _:
                 pass
-        if data and rng.random() < 0.5 and opcode_of(identifier) in WITH_CHECKSUM:
+        if data and rng.random() < 0.5 and parse_opcode(identifier) in WITH_CHECKSUM:
             data = data[:-1] + bytes([checksum(identifier, data[:-1])])
         return kind, Frame(identifier, data)
 
@@ -91,7 +91,7 @@ class Stranger:
 
 def is_from_module(identifier: int) -> bool:
     """Whether a module of the robot could have sent it."""
-    return opcode_of(identifier) not in FROM_HOST and 1 <= node_of(identifier) <= JOINTS
+    return parse_opcode(identifier) not in FROM_HOST and 1 <= parse_node(identifier) <= JOINTS
 
 
 def run(frames: int, seed: int) -> Counter[str]:

@@ -187,12 +187,15 @@ def texts() -> list[Input]:
     return [
         Input("--set", FLAGS, typed(lambda text: scenario.load("triplet", [scenario.parse_set(text)])), LARGEST // 8),
         Input(
-            "a fault", FAULTS, typed(lambda text: (injection.parse(text), twin_faults.parse(text, 13))), LARGEST // 8
+            "a fault",
+            FAULTS,
+            typed(lambda text: (injection.parse(text), twin_faults.parse_fault(text, 13))),
+            LARGEST // 8,
         ),
         Input(
             "a typed fault",
             [b"mute joint_3 off", b"leak joint_1"],
-            typed(lambda t: twin_faults.parse_typed(t, 13, 1.0)),
+            typed(lambda t: twin_faults.parse_typed_fault(t, 13, 1.0)),
         ),
     ]
 

@@ -67,7 +67,7 @@ class SharedBus(Loop):
 
     def watch_seen(self, kind: str) -> int:
         """How often a error that is no fault was counted."""
-        return self.backend.modules.watch.seen.get(kind, 0)
+        return self.backend.modules.monitor.minor_error_counts.get(kind, 0)
 
     @property
     def wire(self) -> SharedWire:

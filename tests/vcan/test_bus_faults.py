@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from snakesim_can_backend.driver.module_monitor import IN_A_ROW
-from snakesim_can_backend.protocol.definitions import ModuleState, Opcode, frame_id, opcode_of
+from snakesim_can_backend.protocol.definitions import ModuleState, Opcode, frame_id, parse_opcode
 from tests.unit.can_backend.loop import cleared_and_armed_again
 from tests.vcan.link import frame, ip, must, tc
 from tests.vcan.shared_bus import SharedBus, shared_bus
@@ -26,7 +26,7 @@ def moves_again(run: SharedBus) -> None:
 
 
 def set_points_out(run: SharedBus) -> int:
-    return sum(opcode_of(sent.id) == Opcode.SET_POINT for sent in run.wire.sent)
+    return sum(parse_opcode(sent.id) == Opcode.SET_POINT for sent in run.wire.sent)
 
 
 # --- the interface -----------------------------------------------------------------------------------------

@@ -19,8 +19,16 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.can_command import COLUMNS
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Action, Frame, LastStop, ModuleState, Opcode, node_of, opcode_of
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import (
+    CommandAction,
+    Frame,
+    LastStop,
+    ModuleState,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_hal.model.scenario import Override, RunConfig, load, write
 from tests.e2e.command import Ended, environment
 from tests.harness.endpoint import free_endpoint
@@ -70,10 +78,10 @@ class Heard:
 
     @property
     def opcode(self) -> int:
-        return opcode_of(self.frame.id)
+        return parse_opcode(self.frame.id)
 
     def says(self) -> Mapping[str, float]:
-        return codec()[Opcode(self.opcode)].values(self.frame.data)
+        return load_layouts()[Opcode(self.opcode)].decode(self.frame.data)
 
 
 class Listener:
@@ -110,7 +118,7 @@ class Listener:
         reported = dict.fromkeys(NODES, ModuleState.BOOT)
         for heard in self.listen():
             if heard.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE):
-                reported[node_of(heard.frame.id)] = ModuleState(int(heard.says()["state"]))
+                reported[parse_node(heard.frame.id)] = ModuleState(int(heard.says()["state"]))
         return list(reported.values())
 
     def close(self) -> None:
@@ -215,7 +223,7 @@ def killed(process: subprocess.Popen[bytes]) -> int:
 
 
 def stop_commands(heard: Sequence[Heard]) -> list[Heard]:
-    return [h for h in heard if h.opcode == Opcode.COMMAND and h.says()["action"] == Action.STOP]
+    return [h for h in heard if h.opcode == Opcode.COMMAND and h.says()["action"] == CommandAction.STOP]
 
 
 def first_in(heard: Sequence[Heard], states: set[ModuleState], since_ns: int) -> dict[int, Heard]:
@@ -223,13 +231,13 @@ def first_in(heard: Sequence[Heard], states: set[ModuleState], since_ns: int) ->
     found: dict[int, Heard] = {}
     for h in heard:
         if h.at_ns >= since_ns and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE) and h.says()["state"] in states:
-            found.setdefault(node_of(h.frame.id), h)
+            found.setdefault(parse_node(h.frame.id), h)
     return found
 
 
 def uptimes_ms(heard: Sequence[Heard], node: int) -> list[tuple[int, float]]:
     """(kernel's time, module's uptime) of its heartbeats."""
-    beats = [h for h in heard if h.opcode == Opcode.HEARTBEAT and node_of(h.frame.id) == node]
+    beats = [h for h in heard if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node]
     return [(h.at_ns, 1e3 * h.says()["uptime"]) for h in beats]
 
 
@@ -280,7 +288,7 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, cha
     assert {h.says()["last_stop"] for h in stopped.values()} == {LastStop.WATCHDOG}
     assert all(h.says()["fault_watchdog"] and h.says()["mode"] == 0 for h in stopped.values())
     last = {
-        node: max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and node_of(h.frame.id) == node)
+        node: max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node)
         for node in NODES
     }
     from_host = [h.at_ns for h in heard if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)]

@@ -93,13 +93,13 @@ def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
 
 def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatch) -> None:
     """Joint modules say it themselves, each in its Identity."""
-    found_by = modules.find
+    found_by = modules.find_modules
 
     def find(*arguments: Any) -> Any:
         first, *others = found_by(*arguments)
         return [dataclasses.replace(first, emulated=False), *others]
 
-    monkeypatch.setattr(modules, "find", find)
+    monkeypatch.setattr(modules, "find_modules", find)
     robot = opened(configured("can"))
     try:
         assert describe_what_moves(robot.describe()) == "REAL: motors move (backend can)"

@@ -15,14 +15,14 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, node_of
+from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, parse_node
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.programs import host_program as host_process
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, robot
 from tests.faults.row import Request, Trial
-from tests.unit.can_backend.emulator.rig import BOOTED, MS, QUIET, Module, armed, setpoint
+from tests.unit.can_backend.emulator.rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
 from tests.unit.hal.rig import write_files
 from tests.vcan.test_killed import (
     JOINTS,
@@ -100,7 +100,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
         failures.append(f"stopped by {causes}")
     own_ms: list[float] = []
     for node in NODES:
-        points = [h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and node_of(h.frame.id) == node]
+        points = [h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node]
         own_ms.append(passed_for_module_ms(heard, node, max(points), stopped[node].at_ns))
     return Trial(value=max(own_ms), failure="; ".join(failures), recovered=True)
 
@@ -108,7 +108,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
 def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
     """Whether every module had a setpoint within the last three periods, and nobody had been told to stop."""
     recent_ns = now_ns - round(3e9 / RATE_HZ)
-    driven = {node_of(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
+    driven = {parse_node(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
     return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
 
 
@@ -156,7 +156,7 @@ def watchdog(request: Request) -> Iterator[Trial]:
     """A module whose host is silent from some instant on. The value: until it is passive, in its own exact time."""
     rng = random.Random(8)
     for _ in range(request.trials):
-        module: Module = armed()
+        module: ModuleFirmware = armed()
         now_us = BOOTED
         for count in range(rng.randrange(5, 40)):
             now_us += 10 * MS

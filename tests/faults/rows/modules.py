@@ -9,7 +9,7 @@ import re
 import time
 from collections.abc import Iterator, Sequence
 
-from snakesim_can_backend.protocol.definitions import Action
+from snakesim_can_backend.protocol.definitions import CommandAction
 from snakesim_hal.model.fault_kinds import Injection, checked
 from snakesim_hal.wire.messages import Answer, Status
 from tests.faults import bus_log
@@ -40,7 +40,7 @@ def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
             number = rng.randrange(len(observer.description().joints)) + 1
             injection = Injection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}")
             yield injected(observer, injection, [what], PERIOD_MS)
-    stops = bus_log.commands(bus_log.read(log), Action.STOP)
+    stops = bus_log.commands(bus_log.read(log), CommandAction.STOP)
     if kind not in CUT_OFF and stops < request.trials:
         raise TrialError(f"{stops} Stops on the bus in {request.trials} trials")
     request.note("the real host process, in real time; counted in its periods")
@@ -107,7 +107,9 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
             words = "\n".join(host.words.last())
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
-        yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.setpoints(frames)), failure=failure)
+        yield Trial(
+            value=float(bus_log.commands(frames, CommandAction.ARM) + bus_log.setpoints(frames)), failure=failure
+        )
     request.note("the real host process, which says why it refuses; enabled is what its bus log shows")
 
 

@@ -3,40 +3,40 @@
 from collections.abc import Iterable
 from typing import Any
 
-from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import Frame, ModuleState, Opcode, opcode_of
+from snakesim_can_backend.driver.reports import ModuleReports
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import Frame, ModuleState, Opcode, parse_opcode
 
 
 def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> Frame:
     values: dict[str, float] = {"state": ModuleState.DISARMED, **other}
-    return codec()[Opcode.JOINT_STATE].frame(node, angle=angle, count=count % 16, **values)
+    return load_layouts()[Opcode.JOINT_STATE].encode(node, angle=angle, count=count % 16, **values)
 
 
 def heartbeat(node: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> Frame:
-    return codec()[Opcode.HEARTBEAT].frame(node, uptime=uptime_s, state=state, **other)
+    return load_layouts()[Opcode.HEARTBEAT].encode(node, uptime=uptime_s, state=state, **other)
 
 
 def contact(node: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> Frame:
-    layout = codec()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
-    return layout.frame(node, count=count % 16, touched=touched, **other)
+    layout = load_layouts()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
+    return layout.encode(node, count=count % 16, touched=touched, **other)
 
 
 def gyro(node: int, count: int, rate_x: float) -> Frame:
-    return codec()[Opcode.GYRO].frame(node, rate_x=rate_x, count=count % 256)
+    return load_layouts()[Opcode.GYRO].encode(node, rate_x=rate_x, count=count % 256)
 
 
 def accelerometer(node: int, count: int, acceleration_z: float) -> Frame:
-    return codec()[Opcode.ACCELEROMETER].frame(node, acceleration_z=acceleration_z, count=count % 256)
+    return load_layouts()[Opcode.ACCELEROMETER].encode(node, acceleration_z=acceleration_z, count=count % 256)
 
 
 def health(node: int, **values: float) -> Frame:
-    return codec()[Opcode.HEALTH].frame(node, **values)
+    return load_layouts()[Opcode.HEALTH].encode(node, **values)
 
 
 def read(frame: Frame) -> dict[str, float]:
     """The values of its signals."""
-    return dict(codec()[Opcode(opcode_of(frame.id))].values(frame.data))
+    return dict(load_layouts()[Opcode(parse_opcode(frame.id))].decode(frame.data))
 
 
 def corrupted(frame: Frame) -> Frame:
@@ -44,19 +44,19 @@ def corrupted(frame: Frame) -> Frame:
     return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 0x5A,)))
 
 
-def begin(reading: Reading, *, contacts: bool = False, tail: bool = False) -> int:
+def begin(reading: ModuleReports, *, contacts: bool = False, tail: bool = False) -> int:
     """The next Sync goes out; its number."""
-    reading.begin(reading.sync + 1, contacts=contacts, tail=tail)
+    reading.begin_sync(reading.sync + 1, contacts=contacts, tail=tail)
     return reading.sync
 
 
-def answer(reading: Reading, nodes: Iterable[int] | None = None, **values: Any) -> None:
+def answer(reading: ModuleReports, nodes: Iterable[int] | None = None, **values: Any) -> None:
     """Modules answer the newest Sync; all of them unless configured otherwise."""
     for node in range(1, len(reading.modules) + 1) if nodes is None else nodes:
-        reading.take(joint_state(node, reading.sync, **values))
+        reading.process_frame(joint_state(node, reading.sync, **values))
 
 
-def syncs(reading: Reading, count: int, nodes: Iterable[int] | None = None, **values: Any) -> None:
+def syncs(reading: ModuleReports, count: int, nodes: Iterable[int] | None = None, **values: Any) -> None:
     """So many Syncs, answered by these nodes."""
     nodes = None if nodes is None else list(nodes)
     for _ in range(count):

@@ -7,12 +7,12 @@ from pathlib import Path
 import can
 import pytest
 
-from snakesim_can_backend.bus.bus import VirtualWire, message_of
-from snakesim_can_backend.bus.load import check_load, load, reports_at
+from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
+from snakesim_can_backend.bus.load import bus_load, check_load, plan_reports_at
 from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, main, scan, settings_of
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.commands import command
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.commands import make_command
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import aligned
@@ -52,7 +52,9 @@ def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     heading, *rows, about = capsys.readouterr().out.splitlines()
     assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
     for row, joints in zip(rows, (13, 18, 30), strict=True):
-        cells = [f"{100 * load(joints, reports_at(rate, TRIPLET, CanSettings())):.1f}" for rate in (50, 100, 200)]
+        cells = [
+            f"{100 * bus_load(joints, plan_reports_at(rate, TRIPLET, CanSettings())):.1f}" for rate in (50, 100, 200)
+        ]
         assert [word for word in row.split() if "." in word] == cells
         assert row.count("refused") == sum(float(cell) > 80 for cell in cells)
     assert "80%" in about
@@ -87,7 +89,7 @@ def test_expand_needs_a_folder(tmp_path: Path) -> None:
 
 
 def identity(node: int, serial: int) -> Frame:
-    return codec()[Opcode.IDENTITY].frame(node, serial=serial, firmware_major=1, protocol=1, emulated=1)
+    return load_layouts()[Opcode.IDENTITY].encode(node, serial=serial, firmware_major=1, protocol=1, emulated=1)
 
 
 def scanned(*said: Frame) -> tuple[list[dict[str, str]], list[Frame]]:
@@ -108,7 +110,7 @@ def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
         *(identity(node, serial) for node, serial in ((62, 0xBEEF), (3, 0xCAFE), (3, 0xF00D))),
         heartbeat(3, 12.34, ModuleState.FAULT, fault_leak=1, fault_voltage=1),
         health(3, voltage=23.9, motor_temperature=41, board_temperature=33),
-        codec()[Opcode.SHAFT_LOAD].frame(3, torque=-1.25),
+        load_layouts()[Opcode.SHAFT_LOAD].encode(3, torque=-1.25),
         heartbeat(62, 1.0),
     )
     assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
@@ -117,7 +119,7 @@ def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
     assert rows[0]["shaft"] == "-1.250 N·m" and rows[0]["emulated"] == "yes" and rows[0]["firmware"] == "1.0"
     assert rows[2]["state"] == "disarmed" and rows[2]["faults"] == "none"
     assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
-    assert heard and set(heard) == {command(Action.IDENTIFY)}
+    assert heard and set(heard) == {make_command(CommandAction.IDENTIFY)}
     heading, *lines = aligned(COLUMNS, rows)
     assert heading.split() == list(COLUMNS) and len(lines) == 3
 
@@ -146,7 +148,7 @@ def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.
         can.Message(arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False),
         can.Message(arbitration_id=0x1234567, data=bytes(8)),
         can.Message(arbitration_id=0x7FF, data=bytes(3), is_extended_id=False),
-        message_of(heartbeat(4, 1.0)),
+        to_python_can(heartbeat(4, 1.0)),
     ]
     with can.Bus(interface="virtual", channel=channel) as bus:
         chatter = [bus.send_periodic(message, 0.01) for message in theirs]

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.protocol.definitions import PARAMETERS, Parameter
+from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParameter
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
@@ -45,6 +45,6 @@ def test_a_bad_value_is_named_with_its_file_and_what_is_wanted(key: str, value: 
 
 
 def test_the_watchdog_goes_as_far_as_modules_let_it() -> None:
-    allowed = PARAMETERS[Parameter.WATCHDOG]
+    allowed = PARAMETERS[ModuleParameter.WATCHDOG]
     for value in (allowed.low, allowed.high):
         assert read({"watchdog_s": value}).watchdog_s == value

@@ -15,7 +15,7 @@ from snakesim_can_backend.bus.adapter import (
     open_bus,
     open_wire,
 )
-from snakesim_can_backend.bus.load import Reports, busiest_s, load
+from snakesim_can_backend.bus.load import ReportSchedule, bus_load, busiest_period_s
 from snakesim_can_backend.emulator.bus_time import BusTime
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id
 from snakesim_hal.base.errors import BackendError, ConfigError, SnakesimError
@@ -104,10 +104,10 @@ def test_modules_are_emulated_where_no_real_ones_can_be() -> None:
 
 
 def test_half_the_bit_rate_takes_twice_as_long() -> None:
-    slow = Reports(100.0, bit_rate=500_000)
-    assert load(5, slow) == pytest.approx(2 * load(5, Reports(100.0)))
-    assert busiest_s(5, slow) == pytest.approx(2 * busiest_s(5, Reports(100.0)))
+    slow = ReportSchedule(100.0, bit_rate=500_000)
+    assert bus_load(5, slow) == pytest.approx(2 * bus_load(5, ReportSchedule(100.0)))
+    assert busiest_period_s(5, slow) == pytest.approx(2 * busiest_period_s(5, ReportSchedule(100.0)))
     bus, slow_bus = BusTime(), BusTime(500_000)
     for one in (bus, slow_bus):
-        one.offer(1, STATE, 0.0)
+        one.enqueue(1, STATE, 0.0)
     assert slow_bus.next_us() == 2 * bus.next_us()

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from snakesim_can_backend.bus.load import (
     MAX_EVERY,
     MAX_LOAD,
-    Reports,
-    busiest_s,
+    ReportSchedule,
+    bus_load,
+    busiest_period_s,
     check_load,
-    every,
-    load,
+    joints_per_bus,
+    list_streams,
     max_rate_hz,
-    reports_of,
-    shares,
-    streams,
-    worst_bits,
+    plan_reports,
+    syncs_per_report,
+    worst_frame_bits,
 )
 from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode
 from snakesim_can_backend.settings import CanSettings
@@ -81,7 +81,7 @@ def frame_bits(identifier: int, data: bytes) -> int:
 @example(0x078, b"\x87\x87\x87\x87\x87\x87\x87\x87")
 @example(0x787, b"\x0f\x0f\x0f\x0f\x0f\x0f\x0f\x0f")
 def test_no_frame_is_ever_longer_than_the_worst_case(identifier: int, data: bytes) -> None:
-    assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= worst_bits(len(data))
+    assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= worst_frame_bits(len(data))
 
 
 def test_the_worst_case_is_nearly_met() -> None:
@@ -93,35 +93,37 @@ def test_the_worst_case_is_nearly_met() -> None:
 
 
 def test_what_is_not_reported_costs_nothing() -> None:
-    kinds = {s.opcode for s in streams(13, Reports(100.0, 0, 0)) if s.frames_per_s}
+    kinds = {s.opcode for s in list_streams(13, ReportSchedule(100.0, 0, 0)) if s.frames_per_s}
     assert kinds == {Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.HEARTBEAT, Opcode.HEALTH}
-    without_tail = load(13, Reports(100.0, tail=False))
-    assert load(13, Reports(100.0)) - without_tail == pytest.approx(100 * 135 / 1e6)
+    without_tail = bus_load(13, ReportSchedule(100.0, tail=False))
+    assert bus_load(13, ReportSchedule(100.0)) - without_tail == pytest.approx(100 * 135 / 1e6)
 
 
 def test_the_busiest_period_is_one_with_forces() -> None:
     expected_us = 105 + 13 * (115 + 135 + 135) + 135
     for contact_every in (1, 2, 7):
-        assert busiest_s(13, Reports(100.0, contact_every)) == pytest.approx(expected_us * 1e-6)
-    assert busiest_s(13, Reports(100.0, 0)) == pytest.approx((105 + 13 * (115 + 135)) * 1e-6)
+        assert busiest_period_s(13, ReportSchedule(100.0, contact_every)) == pytest.approx(expected_us * 1e-6)
+    assert busiest_period_s(13, ReportSchedule(100.0, 0)) == pytest.approx((105 + 13 * (115 + 135)) * 1e-6)
 
 
 @given(st.floats(20, 5000), st.floats(0.001, 1e4))
 def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, wanted_hz: float) -> None:
-    apart = every(rate_hz, wanted_hz)
+    apart = syncs_per_report(rate_hz, wanted_hz)
     assert 1 <= apart <= MAX_EVERY
     if 1 < apart < MAX_EVERY:
         assert abs(rate_hz / wanted_hz - apart) <= 0.5
-    assert every(rate_hz, 0.0) == 0
+    assert syncs_per_report(rate_hz, 0.0) == 0
 
 
 def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
-    assert reports_of(run_of(13), CanSettings()) == Reports(100.0, 1, 20)
-    assert reports_of(run_of(13, 200.0), CanSettings(contact_rate_hz=50.0, imu_rate_hz=0.0)) == Reports(200.0, 4, 0)
+    assert plan_reports(run_of(13), CanSettings()) == ReportSchedule(100.0, 1, 20)
+    assert plan_reports(run_of(13, 200.0), CanSettings(contact_rate_hz=50.0, imu_rate_hz=0.0)) == ReportSchedule(
+        200.0, 4, 0
+    )
     blind = msgspec.structs.replace(
         TRIPLET.robot, sensors=msgspec.structs.replace(TRIPLET.robot.sensors, contacts=None, imu=None)
     )
-    assert reports_of(msgspec.structs.replace(TRIPLET, robot=blind), CanSettings()) == Reports(100.0, 0, 0)
+    assert plan_reports(msgspec.structs.replace(TRIPLET, robot=blind), CanSettings()) == ReportSchedule(100.0, 0, 0)
 
 
 # --- shares ------------------------------------------------------------------------------------------------
@@ -131,13 +133,13 @@ def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
 def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> None:
     if buses > joints:
         return
-    found = shares(run_of(joints), CanSettings(channels=channels(buses)))
+    found = joints_per_bus(run_of(joints), CanSettings(channels=channels(buses)))
     assert sum(found) == joints and len(found) == max(buses, 1)
     assert max(found) - min(found) <= 1 and found == sorted(found, reverse=True)
 
 
 def test_given_shares_are_kept() -> None:
-    assert shares(run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
+    assert joints_per_bus(run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
 
 
 @pytest.mark.parametrize(
@@ -152,7 +154,7 @@ def test_given_shares_are_kept() -> None:
 )
 def test_shares_that_cannot_be_are_refused(joints: int, settings: CanSettings, words: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(words)):
-        shares(run_of(joints), settings)
+        joints_per_bus(run_of(joints), settings)
 
 
 # --- refusal -----------------------------------------------------------------------------------------------
@@ -180,7 +182,7 @@ def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[
             continue
         if more := re.fullmatch(r"(\d+) channels with up to (\d+) joints each", way):
             changes = {"channels": channels(int(more[1])), "joints_per_channel": []}
-            assert max(shares(config, CanSettings(channels=channels(int(more[1]))))) == int(more[2])
+            assert max(joints_per_bus(config, CanSettings(channels=channels(int(more[1]))))) == int(more[2])
         elif fewer := re.fullmatch(r"backends\.can\.contact_rate_hz = (\S+)", way):
             changes = {"contact_rate_hz": float(fewer[1])}
         assert changes, way

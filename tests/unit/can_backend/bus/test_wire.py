@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.bus import bus as wire_module
-from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, check_interface, drain, is_up
-from snakesim_can_backend.bus.bus_errors import BusError, Kind, bus_errors_of
+from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, check_interface, drain_socket, is_up
+from snakesim_can_backend.bus.bus_errors import BusError, Kind, decode_error_frame
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
 
@@ -57,12 +57,12 @@ def can_frame(identifier: int, data: bytes) -> bytes:
 def test_an_error_frame_in_words(classes: int, controller: int, kinds: list[Kind]) -> None:
     data = bytes((0, controller, 0, 0, 0, 0, 130, 7))
     expected = [BusError(kind, "can0", "transmit errors 130, receive errors 7") for kind in kinds]
-    assert bus_errors_of(CAN_ERR_FLAG | classes, data, "can0") == expected
+    assert decode_error_frame(CAN_ERR_FLAG | classes, data, "can0") == expected
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(min_size=8, max_size=8))
 def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
-    found = bus_errors_of(CAN_ERR_FLAG | classes, data, "can0")
+    found = decode_error_frame(CAN_ERR_FLAG | classes, data, "can0")
     assert found and len({error.kind for error in found}) == len(found)
 
 
@@ -137,10 +137,10 @@ def test_drain_takes_everything_in_its_order(frames: list[tuple[int, bytes]]) ->
         for identifier, data in frames:
             far.send(can_frame(identifier, data))
         far.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
-        drain(near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data)))
+        drain_socket(near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data)))
         assert taken == [Frame(*frame) for frame in frames] and all(type(frame) is Frame for frame in taken)
         assert errors == [(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8)))]
-        drain(near, bytearray(16), taken, lambda *_: None)
+        drain_socket(near, bytearray(16), taken, lambda *_: None)
         assert len(taken) == len(frames)
 
 
@@ -151,7 +151,7 @@ def test_a_bus_that_babbles_does_not_keep_its_reader() -> None:
             return 16
 
     taken: list[Frame] = []
-    drain(Babbling(), bytearray(16), taken, lambda *_: None)  # pyright: ignore[reportArgumentType]
+    drain_socket(Babbling(), bytearray(16), taken, lambda *_: None)  # pyright: ignore[reportArgumentType]
     assert len(taken) == MAX_AT_ONCE
 
 

@@ -10,29 +10,29 @@ from itertools import count
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire
-from snakesim_can_backend.bus.load import reports_of
+from snakesim_can_backend.bus.load import plan_reports
 from snakesim_can_backend.driver.bring_up import (
     ASK_EVERY_S,
     LISTEN_ON_S,
-    Bus,
-    Identity,
-    configure,
+    ModuleBus,
+    ModuleIdentity,
+    configure_modules,
     discovery_errors,
-    find,
+    find_modules,
 )
-from snakesim_can_backend.driver.parameters import parameters_of
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.driver.parameters import plan_parameters
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
-    Action,
+    CommandAction,
     Frame,
+    ModuleParameter,
     Opcode,
-    Operation,
-    Parameter,
-    Result,
-    node_of,
-    opcode_of,
+    ParameterOperation,
+    ParameterResult,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError
@@ -61,14 +61,14 @@ class Modules:
         self.to_host: Spoil = as_it_is
         self.beside: Callable[[], None] = lambda: None
         self.heard: list[Frame] = []
-        self.bus = Bus(self.near, range(1, 5))
+        self.bus = ModuleBus(self.near, range(1, 5))
 
     def __call__(self) -> float | None:
         for frame in self.far.receive():
             self.heard.append(frame)
             for passed in self.to_modules(frame):
                 self.chain.receive(0, passed)
-        for frame in self.chain.take(0):
+        for frame in self.chain.take_frames(0):
             for passed in self.to_host(frame):
                 self.far.send(passed)
         self.beside()
@@ -95,19 +95,19 @@ def losing(number: int, which: Callable[[Frame], bool] = lambda _frame: True) ->
 
 
 def actions(frames: list[Frame]) -> list[float]:
-    return [read(f)["action"] for f in frames if opcode_of(f.id) == Opcode.COMMAND]
+    return [read(f)["action"] for f in frames if parse_opcode(f.id) == Opcode.COMMAND]
 
 
 # --- who is there ------------------------------------------------------------------------------------------
 
 
 def test_everybody_is_found_and_only_asked_who_they_are(modules: Modules) -> None:
-    found = find([modules.bus], 5.0)
+    found = find_modules([modules.bus], 5.0)
     assert [i.node for i in found] == [1, 2, 3, 4] and {i.channel for i in found} == {modules.channel}
     assert [i.serial for i in found] == [slot.module.serial for slot in modules.chain.slots]
     assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {("1.0", 1, True, True)}
-    assert set(actions(modules.heard)) == {Action.IDENTIFY}
-    assert {opcode_of(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
+    assert set(actions(modules.heard)) == {CommandAction.IDENTIFY}
+    assert {parse_opcode(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
     assert discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
 
 
@@ -115,49 +115,49 @@ def test_it_listens_on_for_a_second_module_with_the_same_id(modules: Modules) ->
     answered_at: list[float] = []
 
     def watch_the_last(frame: Frame) -> list[Frame]:
-        if opcode_of(frame.id) == Opcode.IDENTITY and node_of(frame.id) == 4:
+        if parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 4:
             answered_at.append(time.monotonic())
         return [frame]
 
     def later() -> None:
         if answered_at and time.monotonic() > answered_at[0] + LISTEN_ON_S / 2:
-            modules.far.send(codec()[Opcode.IDENTITY].frame(2, serial=0xBAD, protocol=1))
+            modules.far.send(load_layouts()[Opcode.IDENTITY].encode(2, serial=0xBAD, protocol=1))
 
     modules.to_host, modules.beside = watch_the_last, later
-    found = find([modules.bus], 5.0)
+    found = find_modules([modules.bus], 5.0)
     assert 0xBAD in [i.serial for i in found if i.node == 2] and len(found) == 5
 
 
 def test_it_ends_soon_when_all_are_found_and_at_the_limit_when_not(modules: Modules) -> None:
     began = time.monotonic()
-    find([modules.bus], 5.0)
+    find_modules([modules.bus], 5.0)
     assert time.monotonic() - began < 2.0
     began = time.monotonic()
-    found = find([Bus(modules.near, range(1, 6))], 0.25)
+    found = find_modules([ModuleBus(modules.near, range(1, 6))], 0.25)
     assert 0.2 < time.monotonic() - began < 2.0 and len(found) == 4
     assert 2 <= len(actions(modules.heard)) <= 6, "asks again, but not all the time"
 
 
 def test_an_answer_that_is_lost_is_asked_for_again(modules: Modules) -> None:
-    modules.to_host = losing(1, lambda frame: opcode_of(frame.id) == Opcode.IDENTITY and node_of(frame.id) == 3)
-    assert [i.node for i in find([modules.bus], 5.0)] == [1, 2, 3, 4]
+    modules.to_host = losing(1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3)
+    assert [i.node for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
     assert len(actions(modules.heard)) > 1, "asked again"
 
 
 def test_other_frames_are_handed_on_and_cut_ones_do_no_harm(modules: Modules) -> None:
     beat = heartbeat(3, 1.0)
-    cut = Frame(codec()[Opcode.IDENTITY].frame(9).id, b"\x01\x02")
+    cut = Frame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
     for frame in (beat, cut):
         modules.far.send(frame)
     handed_on: list[Frame] = []
-    assert [i.node for i in find([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
-    assert [frame for frame in handed_on if opcode_of(frame.id) != Opcode.HEARTBEAT] == [cut] and beat in handed_on
+    assert [i.node for i in find_modules([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
+    assert [frame for frame in handed_on if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [cut] and beat in handed_on
 
 
 # --- what is wrong with them -------------------------------------------------------------------------------
 
 A, B = "can_a", "can_b"
-GOOD = [Identity(n, A if n < 3 else B, 0x1000 + n, "1.0", 1, False, False) for n in (1, 2, 3, 4)]
+GOOD = [ModuleIdentity(n, A if n < 3 else B, 0x1000 + n, "1.0", 1, False, False) for n in (1, 2, 3, 4)]
 
 
 class Named(VirtualWire):
@@ -167,12 +167,12 @@ class Named(VirtualWire):
         self.channel = channel
 
 
-def two_buses() -> list[Bus]:
+def two_buses() -> list[ModuleBus]:
     wires = {name: Named(name) for name in (A, B)}
-    return [Bus(wires[A], range(1, 3)), Bus(wires[B], range(3, 5))]
+    return [ModuleBus(wires[A], range(1, 3)), ModuleBus(wires[B], range(3, 5))]
 
 
-def wrong_with(found: list[Identity], *, lockstep: bool = False) -> list[str]:
+def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[str]:
     return discovery_errors(two_buses(), found, NAMES, lockstep=lockstep)
 
 
@@ -200,7 +200,7 @@ def wrong_with(found: list[Identity], *, lockstep: bool = False) -> list[str]:
         ),
     ],
 )
-def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[Identity], words: str) -> None:
+def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[ModuleIdentity], words: str) -> None:
     (reported,) = wrong_with(found)
     assert reported.startswith(words)
 
@@ -227,85 +227,89 @@ def test_everything_is_told_at_once() -> None:
 # --- parameters --------------------------------------------------------------------------------------------
 
 
-def wanted(**changed: float) -> dict[int, dict[Parameter, float]]:
+def wanted(**changed: float) -> dict[int, dict[ModuleParameter, float]]:
     run = config()
-    given = parameters_of(run.robot, CanSettings(), reports_of(run, CanSettings()))
-    given[2] |= {Parameter[name.upper()]: value for name, value in changed.items()}
+    given = plan_parameters(run.robot, CanSettings(), plan_reports(run, CanSettings()))
+    given[2] |= {ModuleParameter[name.upper()]: value for name, value in changed.items()}
     return given
 
 
 def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) -> None:
-    in_force = configure([modules.bus], wanted(stiffness=12.5), 5.0)
+    in_force = configure_modules([modules.bus], wanted(stiffness=12.5), 5.0)
     assert set(in_force) == {1, 2, 3, 4}
     for node, values in in_force.items():
-        assert set(values) == set(Parameter)
+        assert set(values) == set(ModuleParameter)
         assert values == pytest.approx(modules.chain.slots[node - 1].module.parameters.values)
-    assert in_force[2][Parameter.STIFFNESS] == 12.5 and in_force[1][Parameter.STIFFNESS] == 40.0
-    assert [in_force[node][Parameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
-    assert in_force[1][Parameter.RATED_TORQUE] == pytest.approx(4.0)
+    assert in_force[2][ModuleParameter.STIFFNESS] == 12.5 and in_force[1][ModuleParameter.STIFFNESS] == 40.0
+    assert [in_force[node][ModuleParameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
+    assert in_force[1][ModuleParameter.RATED_TORQUE] == pytest.approx(4.0)
     requests = [read(f) for f in modules.heard]
-    assert {opcode_of(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
-    read_only = [r["index"] for r in requests if r["operation"] == Operation.READ]
-    assert set(read_only) == {Parameter.RATED_TORQUE, Parameter.RATED_SPEED} and len(requests) == 4 * len(Parameter)
+    assert {parse_opcode(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
+    read_only = [r["index"] for r in requests if r["operation"] == ParameterOperation.READ]
+    assert set(read_only) == {ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED} and len(requests) == 4 * len(
+        ModuleParameter
+    )
 
 
 @pytest.mark.parametrize("way", ["to_modules", "to_host"])
 def test_what_is_lost_is_asked_again(modules: Modules, way: str) -> None:
     setattr(modules, way, losing(5))
     began = time.monotonic()
-    in_force = configure([modules.bus], wanted(), 5.0)
-    assert all(set(values) == set(Parameter) for values in in_force.values())
-    assert len(modules.heard) == 4 * len(Parameter) + 1
+    in_force = configure_modules([modules.bus], wanted(), 5.0)
+    assert all(set(values) == set(ModuleParameter) for values in in_force.values())
+    assert len(modules.heard) == 4 * len(ModuleParameter) + 1
     assert time.monotonic() - began > ASK_EVERY_S
 
 
 def test_answers_that_come_twice_or_cut_or_for_another_index_are_no_answers(modules: Modules) -> None:
     def noisily(frame: Frame) -> list[Frame]:
-        other = codec()[Opcode.PARAMETER_ANSWER].frame(node_of(frame.id), index=200, result=Result.UNKNOWN_INDEX)
+        other = load_layouts()[Opcode.PARAMETER_ANSWER].encode(
+            parse_node(frame.id), index=200, result=ParameterResult.UNKNOWN_INDEX
+        )
         return [Frame(frame.id, frame.data[:3]), other, frame, frame]
 
     modules.to_host = noisily
-    in_force = configure([modules.bus], wanted(damping=0.5), 5.0)
-    assert in_force[2][Parameter.DAMPING] == 0.5 and in_force[2][Parameter.STIFFNESS] == 40.0
-    assert in_force[1][Parameter.DAMPING] == 1.0
+    in_force = configure_modules([modules.bus], wanted(damping=0.5), 5.0)
+    assert in_force[2][ModuleParameter.DAMPING] == 0.5 and in_force[2][ModuleParameter.STIFFNESS] == 40.0
+    assert in_force[1][ModuleParameter.DAMPING] == 1.0
 
 
 def test_other_frames_are_not_lost_while_it_waits(modules: Modules) -> None:
     beat = heartbeat(3, 9.0)
     modules.far.send(beat)
     handed_on: list[Frame] = []
-    configure([modules.bus], wanted(), 5.0, handed_on.append)
+    configure_modules([modules.bus], wanted(), 5.0, handed_on.append)
     assert beat in handed_on
 
 
 def test_a_value_out_of_range_is_told_with_node_name_value_and_range(modules: Modules) -> None:
-    high = PARAMETERS[Parameter.STIFFNESS].high
+    high = PARAMETERS[ModuleParameter.STIFFNESS].high
     words = f"node 2 refuses parameter stiffness = 200000.0 N·m/rad: out of range (allowed: 0 to {high:g})"
     with pytest.raises(BackendError, match=re.escape(words)):
-        configure([modules.bus], wanted(stiffness=2e5), 5.0)
+        configure_modules([modules.bus], wanted(stiffness=2e5), 5.0)
 
 
 def test_an_armed_module_refuses(modules: Modules) -> None:
-    modules.chain.receive(0, command(Action.ARM))
-    modules.chain.take(0)
+    modules.chain.receive(0, make_command(CommandAction.ARM))
+    modules.chain.take_frames(0)
     with pytest.raises(BackendError, match="not while armed"):
-        configure([modules.bus], wanted(), 5.0)
+        configure_modules([modules.bus], wanted(), 5.0)
 
 
 def test_a_result_that_this_version_does_not_know_is_a_refusal(modules: Modules) -> None:
     def oddly(frame: Frame) -> list[Frame]:
-        if opcode_of(frame.id) != Opcode.PARAMETER_ANSWER:
+        if parse_opcode(frame.id) != Opcode.PARAMETER_ANSWER:
             return [frame]
         return [Frame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])]
 
     modules.to_host = oddly
     with pytest.raises(BackendError, match=r"refuses parameter stiffness .*: result 15 "):
-        configure([modules.bus], wanted(), 5.0)
+        configure_modules([modules.bus], wanted(), 5.0)
 
 
 def test_who_does_not_answer_is_told_in_the_end(modules: Modules) -> None:
-    modules.to_host = lambda frame: [] if node_of(frame.id) in (2, 4) else [frame]
+    modules.to_host = lambda frame: [] if parse_node(frame.id) in (2, 4) else [frame]
     with pytest.raises(BackendError, match=r"no answer about parameters from node 2, 4 within 0\.3 s"):
-        configure([modules.bus], wanted(), 0.3)
-    asked = sum(node_of(frame.id) == 2 for frame in modules.heard)
+        configure_modules([modules.bus], wanted(), 0.3)
+    asked = sum(parse_node(frame.id) == 2 for frame in modules.heard)
     assert 2 <= asked <= 5

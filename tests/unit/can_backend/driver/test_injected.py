@@ -11,7 +11,7 @@ from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.bus_faults import inject_into_interface
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.emulator.faults import ABOUT
+from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
 from snakesim_can_backend.protocol.definitions import Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
@@ -55,7 +55,7 @@ def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSe
 
 
 def test_everything_that_own_twins_and_a_virtual_bus_can_do_is_allowed() -> None:
-    texts = [f"{kind}:joint_1@1" for kind in (*ABOUT, "wrong", "nan")]
+    texts = [f"{kind}:joint_1@1" for kind in (*FAULT_DESCRIPTIONS, "wrong", "nan")]
     texts += [f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")]
     assert CanBackend.check(config(faults=texts), CanSettings()) == ("lockstep", "realtime")
 
@@ -87,7 +87,9 @@ def test_a_bus_that_fails_stops_the_joints_and_comes_back(
         assert run.lifecycle == "fault"
         inject(run, f"{kind}:bus_1", begins=False)
         run.run(10)
-        assert [fault.what for fault in run.faults] == what + then and run.backend.modules.watch.seen.keys() == counted
+        assert [
+            fault.what for fault in run.faults
+        ] == what + then and run.backend.modules.monitor.minor_error_counts.keys() == counted
         assert run.states() == [ModuleState.FAULT if then else ModuleState.DISARMED] * 4
         cleared_and_armed_again(run)
 

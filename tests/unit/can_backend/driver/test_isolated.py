@@ -13,8 +13,8 @@ from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.module_monitor import CONCERNS_ALL
 from snakesim_can_backend.emulator.firmware import PASSIVE
-from snakesim_can_backend.protocol.commands import command, emergency
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault, ModuleState
+from snakesim_can_backend.protocol.commands import make_command, make_emergency
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
@@ -191,8 +191,8 @@ def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch
             robot.estop()
         monkeypatch.setattr(VirtualWire, "send", overheard)
         robot.idle()
-    stops = [command(Action.DISARM), command(Action.STOP), emergency()]
-    assert sent[0] == (emergency() if then == "estop" else stops[0]) and sent[0] in stops
+    stops = [make_command(CommandAction.DISARM), make_command(CommandAction.STOP), make_emergency()]
+    assert sent[0] == (make_emergency() if then == "estop" else stops[0]) and sent[0] in stops
 
 
 def test_a_lost_module_is_switched_off_at_once() -> None:

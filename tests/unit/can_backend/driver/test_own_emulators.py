@@ -139,10 +139,10 @@ def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixtu
 def test_a_child_that_ends_by_itself_is_noticed_even_when_its_log_is_gone(child: Child) -> None:
     child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
-    assert emulators.how_it_ended() is None
-    emulators._said.unlink()
-    wait_until(emulators.how_it_ended, "the end of the child")
-    assert emulators.how_it_ended() == "the emulated joint modules have ended, with exit code 3"
+    assert emulators.describe_exit() is None
+    emulators._output.unlink()
+    wait_until(emulators.describe_exit, "the end of the child")
+    assert emulators.describe_exit() == "the emulated joint modules have ended, with exit code 3"
     emulators.stop()
 
 

@@ -5,10 +5,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_can_backend.bus.load import Reports
-from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, check_ratings, parameters_of
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
+from snakesim_can_backend.bus.load import ReportSchedule
+from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, check_ratings, plan_parameters
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
 from snakesim_hal.base.errors import BackendError, ConfigError
@@ -18,7 +18,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import load
 
 ROBOT = load("triplet").config.robot
-RATED = (Parameter.RATED_TORQUE, Parameter.RATED_SPEED)
+RATED = (ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED)
 
 
 def changed(section: str, **values: Any) -> RobotFile:
@@ -26,17 +26,17 @@ def changed(section: str, **values: Any) -> RobotFile:
     return msgspec.structs.replace(ROBOT, **{section: part})
 
 
-def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[Parameter, float]]:
-    return {4: {Parameter.RATED_TORQUE: torque_nm, Parameter.RATED_SPEED: speed_rad_s}}
+def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[ModuleParameter, float]]:
+    return {4: {ModuleParameter.RATED_TORQUE: torque_nm, ModuleParameter.RATED_SPEED: speed_rad_s}}
 
 
 @pytest.mark.parametrize("name", shipped("robots"))
 def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(name: str) -> None:
     robot = decode(read_part(name, "robots"), RobotFile)
-    wanted = parameters_of(robot, CanSettings(), Reports(100.0))
+    wanted = plan_parameters(robot, CanSettings(), ReportSchedule(100.0))
     assert list(wanted) == list(range(1, robot.chain.modules + 1))
     for values in wanted.values():
-        assert set(values) == set(Parameter) - set(RATED)
+        assert set(values) == set(ModuleParameter) - set(RATED)
         for parameter, value in values.items():
             allowed = PARAMETERS[parameter]
             assert allowed.writable and allowed.low <= value <= allowed.high, parameter.name
@@ -45,12 +45,12 @@ def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(n
 def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
     own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
-    first, second = (parameters_of(robot, CanSettings(), Reports(100.0))[node] for node in (1, 2))
-    assert first[Parameter.TORQUE_LIMIT] == 7.0 and first[Parameter.ANGLE_LIMIT] == 1.5708
-    assert second[Parameter.STIFFNESS] == first[Parameter.STIFFNESS] / 4
-    assert (second[Parameter.TORQUE_LIMIT], second[Parameter.SPEED_LIMIT]) == (3.0, 15.0)
-    assert second[Parameter.ANGLE_LIMIT] == pytest.approx(1.9), "from 0.5 - 2.4 to 0.5 + 0.8 rad"
-    check_ratings(robot, {2: {Parameter.RATED_TORQUE: 3.0, Parameter.RATED_SPEED: 15.0}})
+    first, second = (plan_parameters(robot, CanSettings(), ReportSchedule(100.0))[node] for node in (1, 2))
+    assert first[ModuleParameter.TORQUE_LIMIT] == 7.0 and first[ModuleParameter.ANGLE_LIMIT] == 1.5708
+    assert second[ModuleParameter.STIFFNESS] == first[ModuleParameter.STIFFNESS] / 4
+    assert (second[ModuleParameter.TORQUE_LIMIT], second[ModuleParameter.SPEED_LIMIT]) == (3.0, 15.0)
+    assert second[ModuleParameter.ANGLE_LIMIT] == pytest.approx(1.9), "from 0.5 - 2.4 to 0.5 + 0.8 rad"
+    check_ratings(robot, {2: {ModuleParameter.RATED_TORQUE: 3.0, ModuleParameter.RATED_SPEED: 15.0}})
 
 
 MISPLACED = {
@@ -80,8 +80,8 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
 
 @pytest.mark.parametrize("tail", [True, False])
 def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
-    wanted = parameters_of(ROBOT, CanSettings(), Reports(100.0, tail=tail))
-    assert [values[Parameter.TAIL] for values in wanted.values()] == [float(tail)] + [0.0] * 12
+    wanted = plan_parameters(ROBOT, CanSettings(), ReportSchedule(100.0, tail=tail))
+    assert [values[ModuleParameter.TAIL] for values in wanted.values()] == [float(tail)] + [0.0] * 12
 
 
 @pytest.mark.parametrize(("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)])
@@ -89,8 +89,13 @@ def test_the_safe_action_is_the_robots_the_watchdog_that_of_the_settings_and_rep
     action: str, motion: SafeMotion
 ) -> None:
     robot = changed("safety", action=action)
-    told = parameters_of(robot, CanSettings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
-    names = (Parameter.STOP_MODE, Parameter.WATCHDOG, Parameter.CONTACT_EVERY, Parameter.IMU_EVERY)
+    told = plan_parameters(robot, CanSettings(watchdog_s=0.05), ReportSchedule(100.0, 3, 17))[1]
+    names = (
+        ModuleParameter.STOP_MODE,
+        ModuleParameter.WATCHDOG,
+        ModuleParameter.CONTACT_EVERY,
+        ModuleParameter.IMU_EVERY,
+    )
     assert [told[name] for name in names] == [motion, 0.05, 3.0, 17.0]
     check_ratings(robot)
 
@@ -110,7 +115,7 @@ def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
     ],
 )
 def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, room: float, unit: str) -> None:
-    most = codec()[opcode].signals[signal].high / room
+    most = load_layouts()[opcode].signals[signal].high / room
     if field != "angle_rad" or most <= 3.1:
         check_ratings(changed("limits", **{field: most * 0.999}))
     with pytest.raises(

@@ -2,22 +2,22 @@
 
 import pytest
 
-from snakesim_can_backend.driver.reports import LATE_SYNCS, Reading
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.driver.reports import MAX_LATE_SYNCS, ModuleReports
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode
 from tests.unit.can_backend.frames import answer, begin, contact, joint_state, syncs
 
 JOINTS = 3
 
 
-def reading(syncs_before: int = 5) -> Reading:
-    made = Reading(JOINTS)
+def reading(syncs_before: int = 5) -> ModuleReports:
+    made = ModuleReports(JOINTS)
     syncs(made, syncs_before)
     return made
 
 
-def angles(made: Reading) -> list[float]:
-    return made.joints()[0].tolist()
+def angles(made: ModuleReports) -> list[float]:
+    return made.shaft_values()[0].tolist()
 
 
 # --- states ------------------------------------------------------------------------------------------------
@@ -27,7 +27,7 @@ def test_states_three_syncs_late_are_taken_and_those_of_four_have_a_wrong_count(
     for late, taken in ((3, True), (4, False)):
         made = reading(2)
         syncs(made, late + 1, [1, 3])
-        made.take(joint_state(2, made.sync - late, 0.9))
+        made.process_frame(joint_state(2, made.sync - late, 0.9))
         assert (angles(made)[1] == pytest.approx(0.9)) is taken
         assert made.modules[1].sync == (made.sync - 3 if taken else 1)
         assert made.modules[1].wrong_counts == (not taken)
@@ -37,10 +37,10 @@ def test_states_three_syncs_late_are_taken_and_those_of_four_have_a_wrong_count(
 def test_an_older_state_never_replaces_a_newer_one() -> None:
     made = reading()
     begin(made)
-    made.take(joint_state(2, made.sync, 0.5))
-    made.take(joint_state(2, made.sync - 1, -0.5))
+    made.process_frame(joint_state(2, made.sync, 0.5))
+    made.process_frame(joint_state(2, made.sync - 1, -0.5))
     assert angles(made)[1] == pytest.approx(0.5) and made.modules[1].sync == made.sync
-    assert made.modules[1].twice == 0, "late is not twice"
+    assert made.modules[1].double_answers == 0, "late is not twice"
 
 
 def test_two_answers_to_one_sync_are_counted_once_a_sync_and_in_a_row() -> None:
@@ -62,11 +62,11 @@ def test_two_answers_to_one_sync_are_counted_once_a_sync_and_in_a_row() -> None:
 def test_an_unknown_state_is_a_fault() -> None:
     made = reading()
     begin(made)
-    write = codec()[Opcode.JOINT_STATE].writer("angle", "velocity", "torque", "count", "state", "derated")
-    made.take(write(2, (0, 0, 0, made.sync, 7, 0)))
+    write = load_layouts()[Opcode.JOINT_STATE].make_writer("angle", "velocity", "torque", "count", "state", "derated")
+    made.process_frame(write(2, (0, 0, 0, made.sync, 7, 0)))
     assert made.modules[1].state == ModuleState.FAULT
-    beat = codec()[Opcode.HEARTBEAT].writer("state", "last_stop", "uptime")
-    made.take(beat(3, (15, 200, 1)))
+    beat = load_layouts()[Opcode.HEARTBEAT].make_writer("state", "last_stop", "uptime")
+    made.process_frame(beat(3, (15, 200, 1)))
     assert made.modules[2].state == ModuleState.FAULT and made.modules[2].last_stop == LastStop.NONE
 
 
@@ -91,41 +91,41 @@ def test_forces_are_waited_for_at_the_syncs_that_ask_for_them() -> None:
     answer(made)
     for node in (1, 2, 3):
         assert not made.complete
-        made.take(contact(node, made.sync))
-    made.take(contact(3, made.sync))
+        made.process_frame(contact(node, made.sync))
+    made.process_frame(contact(3, made.sync))
     assert not made.complete, "the tail's own is missing"
-    made.take(contact(1, made.sync, tail=True))
+    made.process_frame(contact(1, made.sync, tail=True))
     assert made.complete
     begin(made, contacts=True)
     answer(made)
     for node in (1, 2, 3):
-        made.take(contact(node, made.sync))
+        made.process_frame(contact(node, made.sync))
     assert made.complete
 
 
 def test_who_has_not_answered_for_long_is_not_waited_for() -> None:
     made = reading()
-    syncs(made, LATE_SYNCS, [1, 3])
+    syncs(made, MAX_LATE_SYNCS, [1, 3])
     begin(made, contacts=True, tail=True)
     answer(made, [1, 3])
     assert not made.complete and made.states_missing == 1, "three Syncs are not long"
     begin(made, contacts=True, tail=True)
     answer(made, [1, 3])
     for node in (1, 3):
-        made.take(contact(node, made.sync))
-    made.take(contact(1, made.sync, tail=True))
+        made.process_frame(contact(node, made.sync))
+    made.process_frame(contact(1, made.sync, tail=True))
     assert made.complete
 
 
 def test_without_the_tail_nobody_waits_for_its_second_link() -> None:
     made = reading()
-    syncs(made, LATE_SYNCS + 1, [2, 3])
+    syncs(made, MAX_LATE_SYNCS + 1, [2, 3])
     begin(made, contacts=True, tail=True)
     assert (made.states_missing, made.contacts_missing) == (2, 2)
 
 
 def test_who_was_never_heard_is_waited_for() -> None:
-    made = Reading(JOINTS)
+    made = ModuleReports(JOINTS)
     syncs(made, 10, [1, 3])
     begin(made)
     answer(made, [1, 3])
@@ -137,11 +137,11 @@ def test_who_comes_back_does_not_stand_for_another() -> None:
     syncs(made, 10, [1, 3])
     begin(made, contacts=True)
     answer(made, [1, 2])
-    made.take(contact(1, made.sync))
-    made.take(contact(2, made.sync))
+    made.process_frame(contact(1, made.sync))
+    made.process_frame(contact(2, made.sync))
     assert (made.states_missing, made.contacts_missing) == (1, 1)
     answer(made, [3])
-    made.take(contact(3, made.sync))
+    made.process_frame(contact(3, made.sync))
     assert made.complete
     begin(made)
     assert made.states_missing == JOINTS

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     Frame,
@@ -15,9 +15,9 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
     frame_id,
-    intact,
-    node_of,
-    opcode_of,
+    has_valid_checksum,
+    parse_node,
+    parse_opcode,
 )
 from tests.unit.can_backend.driver.test_reading import JOINTS, angles, reading
 from tests.unit.can_backend.frames import accelerometer, begin, contact, gyro, health, heartbeat, joint_state, syncs
@@ -28,26 +28,26 @@ from tests.unit.can_backend.frames import accelerometer, begin, contact, gyro, h
 def test_forces_of_another_sync_do_not_count_and_old_ones_are_forgotten() -> None:
     made = reading()
     begin(made, contacts=True)
-    made.take(contact(2, made.sync - 1, force_x=9.0))
-    assert made.links_touched() == [] and made.contacts_missing == JOINTS
-    made.take(contact(2, made.sync, force_x=1.0))
-    made.take(contact(2, made.sync, force_x=5.0))
-    assert [raw[0] for _, raw in made.links_touched()] == [20], "the first counts"
+    made.process_frame(contact(2, made.sync - 1, force_x=9.0))
+    assert made.list_contacts() == [] and made.contacts_missing == JOINTS
+    made.process_frame(contact(2, made.sync, force_x=1.0))
+    made.process_frame(contact(2, made.sync, force_x=5.0))
+    assert [raw[0] for _, raw in made.list_contacts()] == [20], "the first counts"
     assert made.contacts_missing == JOINTS - 1
     begin(made, contacts=False)
-    assert len(made.links_touched()) == 1
+    assert len(made.list_contacts()) == 1
     begin(made, contacts=True)
-    assert made.links_touched() == []
+    assert made.list_contacts() == []
 
 
 def test_an_imus_halves_are_of_one_sync() -> None:
     made = reading()
-    made.take(gyro(2, 7, 1.0))
-    made.take(accelerometer(2, 27, 9.81))  # between them two frames were lost
-    assert made.imus() == []
-    made.take(gyro(2, 47, 2.0))
-    made.take(accelerometer(2, 47, 9.81))
-    assert [list(rates) for _, rates, _ in made.imus()] == [[2000, 0, 0]]
+    made.process_frame(gyro(2, 7, 1.0))
+    made.process_frame(accelerometer(2, 27, 9.81))  # between them two frames were lost
+    assert made.take_imu_reports() == []
+    made.process_frame(gyro(2, 47, 2.0))
+    made.process_frame(accelerometer(2, 47, 9.81))
+    assert [list(rates) for _, rates, _ in made.take_imu_reports()] == [[2000, 0, 0]]
 
 
 # --- heartbeats --------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ UPTIMES = {  # s, and how many restarts they are by then
 def test_only_an_uptime_that_goes_back_and_on_from_there_is_a_restart(uptimes: list[tuple[float, int]]) -> None:
     made = reading()
     for uptime_s, restarts in uptimes:
-        made.take(heartbeat(2, uptime_s))
+        made.process_frame(heartbeat(2, uptime_s))
         assert made.modules[1].restarts == restarts, uptime_s
         assert made.modules[1].uptime_ms == round(uptime_s * 1000)
     assert made.modules[0].restarts == 0
@@ -78,12 +78,12 @@ def test_only_an_uptime_that_goes_back_and_on_from_there_is_a_restart(uptimes: l
 
 def test_a_heartbeat_tells_state_faults_and_reason() -> None:
     made = reading()
-    made.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1))
+    made.process_frame(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1))
     module = made.modules[1]
     assert (module.state, module.last_stop) == (ModuleState.FAULT, LastStop.LEAK)
     assert module.fault_names() == ["leak", "voltage"] and module.needs_clearing
     assert module.heartbeat_sync == made.sync
-    made.take(heartbeat(2, 1.1))
+    made.process_frame(heartbeat(2, 1.1))
     assert module.fault_names() == [] and not module.needs_clearing
 
 
@@ -105,8 +105,8 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
     before = copy.deepcopy(made.modules)
     good = [joint_state(2, made.sync), heartbeat(2, 0.0), contact(2, 0), gyro(2, 0, 0.0), health(2)]
     for i, frame in enumerate(good):
-        made.take(Frame(frame.id, frame.data[:-1]))
-        made.take(Frame(frame.id, b""))
+        made.process_frame(Frame(frame.id, frame.data[:-1]))
+        made.process_frame(Frame(frame.id, b""))
         assert made.malformed == 2 * (i + 1)
     before[1].frames = made.modules[1].frames
     assert made.modules == before and made.health() == [None] * JOINTS
@@ -115,15 +115,15 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
 def test_strangers_are_counted_by_node() -> None:
     made = reading()
     for node in (4, 4, LAST_NODE, 0):
-        made.take(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
-    assert made.strangers == {4: 2, LAST_NODE: 1, 0: 1} and not made.from_other_host
+        made.process_frame(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
+    assert made.unknown_nodes == {4: 2, LAST_NODE: 1, 0: 1} and not made.from_other_host
 
 
 # --- whatever comes ----------------------------------------------------------------------------------------
 
 any_frame = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8))
 ours = st.builds(
-    lambda opcode, node, data: Frame(frame_id(opcode, node), data[: codec()[opcode].length]),
+    lambda opcode, node, data: Frame(frame_id(opcode, node), data[: load_layouts()[opcode].length]),
     st.sampled_from(list(Opcode)),
     st.integers(1, JOINTS),
     st.binary(min_size=8, max_size=8),
@@ -139,13 +139,13 @@ def test_whatever_comes_nothing_raises_and_only_intact_states_move_a_joint(
     for frame, contacts in zip(frames, sync_before, strict=False):
         if contacts:
             begin(made, contacts=True, tail=True)
-        before = made.joints()
-        made.take(frame)
-        is_state = opcode_of(frame.id) == Opcode.JOINT_STATE and len(frame.data) == 8 and intact(frame)
-        changed = np.flatnonzero((made.joints() != before).any(axis=0)).tolist()
-        assert changed in ([], [node_of(frame.id) - 1] if is_state else [])
+        before = made.shaft_values()
+        made.process_frame(frame)
+        is_state = parse_opcode(frame.id) == Opcode.JOINT_STATE and len(frame.data) == 8 and has_valid_checksum(frame)
+        changed = np.flatnonzero((made.shaft_values() != before).any(axis=0)).tolist()
+        assert changed in ([], [parse_node(frame.id) - 1] if is_state else [])
         assert made.complete in (True, False)
-        assert made.links_touched() is not None and made.imus() is not None and len(made.health()) == JOINTS
+        assert made.list_contacts() is not None and made.take_imu_reports() is not None and len(made.health()) == JOINTS
 
 
 @given(st.integers(1, JOINTS), st.integers(0, 63))
@@ -153,5 +153,5 @@ def test_no_single_wrong_bit_moves_a_joint(node: int, bit: int) -> None:
     made = reading()
     begin(made)
     whole = int.from_bytes(joint_state(node, made.sync, 0.9).data, "little") ^ 1 << bit
-    made.take(Frame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
+    made.process_frame(Frame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
     assert angles(made) == pytest.approx([0.1] * JOINTS) and made.modules[node - 1].corrupt == 1

@@ -8,12 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.bus.load import Reports, reports_of
-from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.driver.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
-from snakesim_can_backend.emulator.frames import write_contact, write_tail_contact
-from snakesim_can_backend.emulator.reports import touch
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.bus.load import ReportSchedule, plan_reports
+from snakesim_can_backend.driver.reports import ModuleReports
+from snakesim_can_backend.driver.sensors import (
+    NO_STATE_AGE_NS,
+    SampleBuilder,
+    contacts_due,
+    describe_sensors,
+    locate_on_capsule,
+)
+from snakesim_can_backend.emulator.frames import encode_contact, write_contact, write_tail_contact
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.backend import Samples
@@ -34,9 +39,9 @@ EVERYTHING: dict[str, Any] = {
 }
 
 
-def sensors_of(run: RunConfig, reports: Reports | None = None) -> tuple[Reading, Sensors]:
-    reading = Reading(run.robot.chain.modules)
-    return reading, Sensors(run, reports or reports_of(run, CanSettings()), reading, None)
+def sensors_of(run: RunConfig, reports: ReportSchedule | None = None) -> tuple[ModuleReports, SampleBuilder]:
+    reading = ModuleReports(run.robot.chain.modules)
+    return reading, SampleBuilder(run, reports or plan_reports(run, CanSettings()), reading, None)
 
 
 def contacts_of(samples: Samples) -> Contacts:
@@ -51,7 +56,7 @@ def contacts_of(samples: Samples) -> Contacts:
 def test_every_state_has_its_age_and_is_valid_for_the_lease() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
-    fresh = sensors.sample(7, 70 * 10**6).joints
+    fresh = sensors.make_samples(7, 70 * 10**6).joints
     assert (fresh.tick, fresh.timestamp_ns) == (7, 70 * 10**6)
     assert fresh.angle_rad == pytest.approx([0.5] * JOINTS)
     assert fresh.velocity_rad_s == pytest.approx([-1.0] * JOINTS)
@@ -59,7 +64,7 @@ def test_every_state_has_its_age_and_is_valid_for_the_lease() -> None:
     assert fresh.age_ns == [0] * JOINTS and fresh.valid == [True] * JOINTS
     for missed in range(1, 9):
         syncs(reading, 1, [1, 2, 4], angle=0.6)
-        joints = sensors.sample(7 + missed, 0).joints
+        joints = sensors.make_samples(7 + missed, 0).joints
         assert joints.age_ns == [0, 0, missed * PERIOD_NS, 0]
         assert joints.valid == [True, True, missed <= 5, True], "the lease is five periods"
         assert joints.angle_rad == pytest.approx([0.6, 0.6, 0.5, 0.6])
@@ -68,8 +73,8 @@ def test_every_state_has_its_age_and_is_valid_for_the_lease() -> None:
 def test_what_was_never_heard_is_not_valid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, [1, 2, 4])
-    joints = sensors.sample(0, 0).joints
-    assert joints.valid == [True, True, False, True] and joints.age_ns[2] == LONG_AGO_NS
+    joints = sensors.make_samples(0, 0).joints
+    assert joints.valid == [True, True, False, True] and joints.age_ns[2] == NO_STATE_AGE_NS
     assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), "a zero that nobody may believe"
 
 
@@ -78,29 +83,31 @@ def test_what_was_never_heard_is_not_valid() -> None:
 
 def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
     run = config(**EVERYTHING)
-    reports = Reports(100.0, contact_every=3)
+    reports = ReportSchedule(100.0, contact_every=3)
     reading, sensors = sensors_of(run, reports)
     for tick in range(300):
         sync = begin(reading, contacts=contacts_due(reports, reading.sync + 1))
         answer(reading)
         assert contacts_due(reports, sync) is (sync % 256 % 3 == 0)
-        assert (keys.CONTACTS in sensors.sample(tick, 0).others) is contacts_due(reports, sync)
-    assert not any(contacts_due(Reports(100.0, contact_every=0), sync) for sync in range(300))
+        assert (keys.CONTACTS in sensors.make_samples(tick, 0).others) is contacts_due(reports, sync)
+    assert not any(contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300))
 
 
 def test_nothing_touched_is_an_empty_list() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     begin(reading, contacts=True)
-    reading.take(contact(2, reading.sync, touched=False, force_x=9.0))
-    assert contacts_of(sensors.sample(3, 30)) == Contacts(tick=3, timestamp_ns=30, contacts=[], measured_force_n=0.0)
+    reading.process_frame(contact(2, reading.sync, touched=False, force_x=9.0))
+    assert contacts_of(sensors.make_samples(3, 30)) == Contacts(
+        tick=3, timestamp_ns=30, contacts=[], measured_force_n=0.0
+    )
 
 
 def test_a_touch_is_told_in_the_frame_of_its_link() -> None:
     run = config(**EVERYTHING)
     reading, sensors = sensors_of(run)
     begin(reading, contacts=True)
-    reading.take(contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2))
-    (found,) = contacts_of(sensors.sample(3, 30)).contacts
+    reading.process_frame(contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2))
+    (found,) = contacts_of(sensors.make_samples(3, 30)).contacts
     radius_m = run.robot.module.radius_m
     assert found.link == 2 and found.obstacle is None and found.torque_l == (0.0, 0.0, 0.0)
     assert found.position_l == pytest.approx((0.04, 0.0, radius_m))
@@ -114,8 +121,8 @@ def test_what_is_weaker_than_the_robots_threshold_is_left_out() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0))
     begin(reading, contacts=True)
     for node, force in ((1, 0.9), (2, 1.0), (3, -1.05)):
-        reading.take(contact(node, reading.sync, force_z=force))
-    assert [found.link for found in contacts_of(sensors.sample(0, 0)).contacts] == [2, 3]
+        reading.process_frame(contact(node, reading.sync, force_z=force))
+    assert [found.link for found in contacts_of(sensors.make_samples(0, 0)).contacts] == [2, 3]
 
 
 # The place of a touch, from the physics model through emulator and bus to the HAL.
@@ -142,16 +149,16 @@ def test_a_touch_anywhere_on_a_capsule_comes_back_within_the_steps_of_the_bus(
     point = capsule_point(share * length_m, polar, bearing, length_m, radius_m)
     reading, sensors = sensors_of(run)
     sync = begin(reading, contacts=True)
-    numbers = (*touch(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
-    reading.take(write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers))
-    (found,) = contacts_of(sensors.sample(0, 0)).contacts
+    numbers = (*encode_contact(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
+    reading.process_frame(write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers))
+    (found,) = contacts_of(sensors.make_samples(0, 0)).contacts
     assert found.link == link
     base = (min(max(point[0], 0.0), length_m), 0.0, 0.0)
     outward = [(p - b) / radius_m for p, b in zip(point, base, strict=True)]
     cosine = -float(np.dot(outward, found.normal_l))
     # a step along the link turns the normal most where the ball ends: by step / (radius x cos(polar))
-    turned = codec()[Opcode.CONTACT].signals["bearing"].scale / 2
-    leaned = codec()[Opcode.CONTACT].signals["along"].scale / 2 / (radius_m * math.cos(polar))
+    turned = load_layouts()[Opcode.CONTACT].signals["bearing"].scale / 2
+    leaned = load_layouts()[Opcode.CONTACT].signals["along"].scale / 2 / (radius_m * math.cos(polar))
     allowed = 1.5 * (turned * math.cos(polar) + leaned) + 1e-9
     assert math.acos(min(cosine, 1.0)) <= allowed
     assert math.dist(point, found.position_l) <= radius_m * allowed + 0.00025
@@ -161,7 +168,7 @@ def test_a_touch_anywhere_on_a_capsule_comes_back_within_the_steps_of_the_bus(
 def test_whatever_is_told_is_a_place_on_the_capsule(
     along_m: float, bearing: float, length_m: float, radius_m: float
 ) -> None:
-    outward, point = on_surface(along_m, bearing, length_m, radius_m)
+    outward, point = locate_on_capsule(along_m, bearing, length_m, radius_m)
     assert math.hypot(*outward) == pytest.approx(1.0)
     axis_m = min(max(point[0], 0.0), length_m)
     assert math.dist(point, (axis_m, 0.0, 0.0)) == pytest.approx(radius_m)
@@ -175,25 +182,25 @@ def test_whatever_is_told_is_a_place_on_the_capsule(
 def test_an_imu_message_holds_only_what_is_new() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     syncs(reading, 1)
-    assert keys.IMU not in sensors.sample(0, 0).others
-    reading.take(gyro(3, 0, 0.5))
-    reading.take(accelerometer(3, 0, 9.81))
-    reading.take(gyro(1, 0, 0.5))
-    found = sensors.sample(1, 10).others[keys.IMU]
+    assert keys.IMU not in sensors.make_samples(0, 0).others
+    reading.process_frame(gyro(3, 0, 0.5))
+    reading.process_frame(accelerometer(3, 0, 9.81))
+    reading.process_frame(gyro(1, 0, 0.5))
+    found = sensors.make_samples(1, 10).others[keys.IMU]
     assert isinstance(found, Imu) and (found.tick, found.timestamp_ns, found.link) == (1, 10, [3])
     assert found.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
     assert found.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
-    assert keys.IMU not in sensors.sample(2, 0).others
+    assert keys.IMU not in sensors.make_samples(2, 0).others
 
 
 def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
-    reading.take(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
-    reading.take(health(4, voltage=24.0))
-    due = [tick for tick in range(101) if keys.POWER in sensors.sample(tick, 0).others]
+    reading.process_frame(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
+    reading.process_frame(health(4, voltage=24.0))
+    due = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).others]
     assert due == [0, 50, 100]
-    found = sensors.sample(50, 7).others[keys.POWER]
+    found = sensors.make_samples(50, 7).others[keys.POWER]
     assert isinstance(found, Power) and (found.tick, found.timestamp_ns) == (50, 7)
     assert found.valid == [False, True, False, True] and found.leak == [False, True, False, False]
     assert found.voltage_v[1] == pytest.approx(23.5) and found.current_a[1] == pytest.approx(-1.5)
@@ -204,10 +211,10 @@ def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
 def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
-    reading.take(health(2, voltage=23.5))
+    reading.process_frame(health(2, voltage=23.5))
 
     def valid(tick: int) -> list[bool]:
-        power = sensors.sample(tick, 0).others[keys.POWER]
+        power = sensors.make_samples(tick, 0).others[keys.POWER]
         assert isinstance(power, Power)
         return power.valid
 
@@ -215,7 +222,7 @@ def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
     assert valid(50) == [False, True, False, False]
     syncs(reading, 1)
     assert valid(100) == [False] * JOINTS
-    reading.take(health(2, voltage=23.5))
+    reading.process_frame(health(2, voltage=23.5))
     assert valid(150) == [False, True, False, False]
 
 
@@ -224,9 +231,9 @@ def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
 
 def test_sensors_are_described_with_their_rates() -> None:
     run = config(**EVERYTHING)
-    sensors = described(run, Reports(100.0, 4, 20), pose_delay_s=0.02)
+    sensors = describe_sensors(run, ReportSchedule(100.0, 4, 20), pose_delay_s=0.02)
     found = {s.key: s.rate_hz for s in sensors}
     assert found == {keys.JOINTS: 100.0, keys.CONTACTS: 25.0, keys.IMU: 5.0, keys.POWER: 2.0, keys.POSE: 100.0}
     assert {s.key: s.delay_s for s in sensors if s.delay_s} == {keys.POSE: 0.02}
-    bare = {s.key for s in described(run, Reports(100.0, 0, 0), pose_delay_s=None)}
+    bare = {s.key for s in describe_sensors(run, ReportSchedule(100.0, 0, 0), pose_delay_s=None)}
     assert bare == {keys.JOINTS, keys.POWER}

@@ -2,8 +2,15 @@
 
 import pytest
 
-from snakesim_can_backend.driver.module_monitor import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MAX_FRAMES, Finding, Watch
-from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.driver.module_monitor import (
+    ARM_GRACE,
+    CLEAR_GRACE,
+    CONCERNS_ALL,
+    MAX_FRAMES,
+    Finding,
+    ModuleMonitor,
+)
+from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.driver.watch_rig import (
@@ -23,27 +30,27 @@ from tests.unit.can_backend.frames import begin, corrupted, heartbeat, joint_sta
 # --- what one module can do wrong --------------------------------------------------------------------------
 
 
-def frozen(reading: Reading) -> None:
-    reading.take(joint_state(2, 2))
+def frozen(reading: ModuleReports) -> None:
+    reading.process_frame(joint_state(2, 2))
 
 
-def miscounting(reading: Reading) -> None:
-    reading.take(joint_state(2, reading.sync + 7))
+def miscounting(reading: ModuleReports) -> None:
+    reading.process_frame(joint_state(2, reading.sync + 7))
 
 
-def corrupt(reading: Reading) -> None:
-    reading.take(corrupted(joint_state(2, reading.sync)))
+def corrupt(reading: ModuleReports) -> None:
+    reading.process_frame(corrupted(joint_state(2, reading.sync)))
 
 
-def doubled(reading: Reading) -> None:
-    reading.take(joint_state(2, reading.sync))
-    reading.take(joint_state(2, reading.sync))
+def doubled(reading: ModuleReports) -> None:
+    reading.process_frame(joint_state(2, reading.sync))
+    reading.process_frame(joint_state(2, reading.sync))
 
 
-def babbling(reading: Reading) -> None:
-    reading.take(joint_state(2, reading.sync))
+def babbling(reading: ModuleReports) -> None:
+    reading.process_frame(joint_state(2, reading.sync))
     for _ in range(MAX_FRAMES):
-        reading.take(heartbeat(2, 1.0))
+        reading.process_frame(heartbeat(2, 1.0))
 
 
 WRONGS = [
@@ -86,14 +93,14 @@ def test_a_module_that_talks_nonsense_is_not_silent(bad: Speak) -> None:
 
 
 def test_a_module_that_was_never_heard_is_silent_and_no_more_is_claimed() -> None:
-    reading, watch = Reading(1), Watch(["joint_1"], ["can0"], PERIOD_S)
-    found = [f for _ in range(4) for f in (begin(reading), watch.look(reading, "disarmed"))[1]]
+    reading, watch = ModuleReports(1), ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
+    found = [f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]]
     assert said(found) == [("module_silent", 0)] and found[0].cause.endswith("ms")
 
 
 def test_a_silent_module_whose_heart_beats_is_told_from_a_dead_one() -> None:
     bench = Bench()
-    bench.tick(lambda reading: reading.take(heartbeat(2, 1.0)))
+    bench.tick(lambda reading: reading.process_frame(heartbeat(2, 1.0)))
     (found,) = bench.ticks(2, quiet)
     assert "it still sends heartbeats" in found.cause
     bench = Bench()
@@ -125,18 +132,18 @@ def test_a_restart_is_told_once_with_its_joint_and_what_it_lost() -> None:
 
 def test_who_has_not_its_parameters_is_told_once_when_the_robot_is_armed_with_its_joint() -> None:
     bench = Bench()
-    assert bench.watch.look(bench.reading, "disarmed", unconfigured={1}) == []
-    assert bench.watch.look(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
-    (found,) = bench.watch.look(bench.reading, "armed", unconfigured={1})
+    assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
+    assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
+    (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
     assert said([found]) == [("module_not_configured", 1)] and not found.alone
-    assert bench.watch.look(bench.reading, "armed", unconfigured={1}) == []
+    assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}) == []
 
 
 def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
-    def two_hearts(reading: Reading) -> None:
+    def two_hearts(reading: ModuleReports) -> None:
         doubled(reading)
-        reading.take(heartbeat(2, 50.0 + 0.01 * reading.sync))
-        reading.take(heartbeat(2, 0.01 * reading.sync))
+        reading.process_frame(heartbeat(2, 50.0 + 0.01 * reading.sync))
+        reading.process_frame(heartbeat(2, 0.01 * reading.sync))
 
     bench = Bench()
     assert said(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]

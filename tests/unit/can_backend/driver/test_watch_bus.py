@@ -4,10 +4,10 @@ import pytest
 
 from snakesim_can_backend.bus.bus_errors import BusError, Kind
 from snakesim_can_backend.driver.module_monitor import Finding
-from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.commands import command
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, frame_id
+from snakesim_can_backend.driver.reports import ModuleReports
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.commands import make_command
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode, frame_id
 from tests.unit.can_backend.driver.watch_rig import Bench, answering, quiet, said
 from tests.unit.can_backend.frames import answer, joint_state
 
@@ -41,7 +41,7 @@ def test_lesser_errors_are_only_counted(kind: Kind) -> None:
     bench = Bench()
     for _ in range(2):
         assert bench.tick(errors=[BusError(kind, "can0", "")]) == []
-    assert bench.watch.seen == {kind: 2}
+    assert bench.watch.minor_error_counts == {kind: 2}
 
 
 def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
@@ -58,9 +58,9 @@ def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
 # --- who should not be there -------------------------------------------------------------------------------
 
 
-def stranger(reading: Reading) -> None:
+def stranger(reading: ModuleReports) -> None:
     answer(reading, [2])
-    reading.take(joint_state(9, reading.sync))
+    reading.process_frame(joint_state(9, reading.sync))
 
 
 def test_a_stranger_that_answers_every_sync_is_found() -> None:
@@ -74,10 +74,10 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
 @pytest.mark.parametrize(
     ("frame", "what", "words"),
     [
-        (codec()[Opcode.SYNC].frame(0), "second_host", "another program commands the modules"),
-        (codec()[Opcode.SET_POINT].frame(2), "second_host", "end one of the two"),
-        (codec()[Opcode.SET_POINT].frame(40), "second_host", "end one of the two"),
-        (codec()[Opcode.COMMAND].frame(2, action=Action.STOP), "second_host", "another program"),
+        (load_layouts()[Opcode.SYNC].encode(0), "second_host", "another program commands the modules"),
+        (load_layouts()[Opcode.SET_POINT].encode(2), "second_host", "end one of the two"),
+        (load_layouts()[Opcode.SET_POINT].encode(40), "second_host", "end one of the two"),
+        (load_layouts()[Opcode.COMMAND].encode(2, action=CommandAction.STOP), "second_host", "another program"),
         (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
     ],
 )
@@ -93,14 +93,14 @@ def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
 
 def test_what_another_host_may_have_changed_is_written_anew() -> None:
     bench = Bench()
-    bench.reading.take(codec()[Opcode.PARAMETER_REQUEST].frame(2, index=1, operation=1))
+    bench.reading.process_frame(load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1))
     assert said(bench.tick()) == [("second_host", None)]
     assert bench.watch.take_changed() == {0, 1, 2}
 
 
 def test_who_asks_who_is_there_is_no_second_host() -> None:
     bench = Bench()
-    bench.reading.take(command(Action.IDENTIFY))
+    bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
     assert bench.tick() == [] and bench.watch.take_changed() == set()
 
 

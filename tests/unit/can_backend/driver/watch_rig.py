@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from snakesim_can_backend.bus.bus_errors import BusError
-from snakesim_can_backend.driver.module_monitor import Finding, Watch
-from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.driver.module_monitor import Finding, ModuleMonitor
+from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.definitions import Frame, LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.frames import answer, begin, heartbeat
@@ -13,10 +13,10 @@ JOINTS = 3
 EVERYBODY = (1, 2, 3)
 PERIOD_S = 0.01
 WHO = "joint_2 (node 2 on can0) "
-Speak = Callable[[Reading], None]
+Speak = Callable[[ModuleReports], None]
 
 
-def quiet(_reading: Reading) -> None:
+def quiet(_reading: ModuleReports) -> None:
     """Nothing comes of node 2."""
 
 
@@ -24,8 +24,8 @@ class Bench:
     """Ticks of a robot whose joint_2 does what a test wants; the others are well."""
 
     def __init__(self) -> None:
-        self.reading = Reading(JOINTS)
-        self.watch = Watch(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S)
+        self.reading = ModuleReports(JOINTS)
+        self.watch = ModuleMonitor(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S)
         self.lifecycle: LifecycleState = "disarmed"
         self.state = ModuleState.DISARMED
         self.isolated: set[int] = set()
@@ -38,22 +38,22 @@ class Bench:
         if speak is not None:
             speak(self.reading)
         unsent_on = [unsent] if unsent else []
-        return self.watch.look(self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated)
+        return self.watch.find_faults(self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated)
 
     def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
         return [found for _ in range(count) for found in self.tick(speak)]
 
     def clear(self) -> None:
-        self.watch.forget(self.reading.sync)
+        self.watch.reset(self.reading.sync)
 
 
 def answering(state: ModuleState = ModuleState.DISARMED, *frames: Frame) -> Speak:
     """Node 2 answers in this state, and these frames come, too."""
 
-    def speak(reading: Reading) -> None:
+    def speak(reading: ModuleReports) -> None:
         answer(reading, [2], state=state)
         for frame in frames:
-            reading.take(frame)
+            reading.process_frame(frame)
 
     return speak
 

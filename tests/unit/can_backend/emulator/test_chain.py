@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.emulator.chain import MAX_AT_ONCE_US
-from snakesim_can_backend.emulator.reports import ALONG, ANGLE, FORCE
-from snakesim_can_backend.protocol.commands import command, sync
-from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
+from snakesim_can_backend.emulator.frames import ALONG, ANGLE, FORCE
+from snakesim_can_backend.protocol.commands import make_command, make_sync
+from snakesim_can_backend.protocol.definitions import CommandAction, ModuleParameter, ModuleState, Opcode
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
@@ -89,8 +89,8 @@ def test_time_passes_only_from_sync_to_later_sync(syncs: list[tuple[int, int]]):
     physics_model = Pushed(4)
     made = chain(physics_model=physics_model)
     for time_us, steps in syncs:
-        made.receive(0, sync(0, time_us))
-        made.receive(0, command(Action.IDENTIFY))
+        made.receive(0, make_sync(0, time_us))
+        made.receive(0, make_command(CommandAction.IDENTIFY))
         assert physics_model.steps == steps
 
 
@@ -99,10 +99,10 @@ def test_two_buses_with_one_sync_time_share_one_step_of_time():
     made = chain(config(5), physics_model=physics_model, channels=["vcan0", "vcan1"])
     for tick in range(3):
         for channel in (0, 1):
-            made.receive(channel, sync(tick, tick * 10_000))
-    assert physics_model.steps == 20 and made.counts == [3, 2]
-    assert [s["count"] for s in only(made.take(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
-    made.receive(1, command(Action.ARM))
+            made.receive(channel, make_sync(tick, tick * 10_000))
+    assert physics_model.steps == 20 and made.modules_per_bus == [3, 2]
+    assert [s["count"] for s in only(made.take_frames(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
+    made.receive(1, make_command(CommandAction.ARM))
     assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
     made.receive(0, setpoint(0, node=4))
     assert made.slots[3].module._pending is None, "node 4 is on the other bus"
@@ -110,9 +110,9 @@ def test_two_buses_with_one_sync_time_share_one_step_of_time():
 
 def test_forces_are_felt_by_the_link_in_front_and_the_tail():
     made = chain(config(**SENSORS), physics_model=Pushed(4))
-    made.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
-    made.receive(0, sync(0, 0))
-    frames = made.take(0)
+    made.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
+    made.receive(0, make_sync(0, 0))
+    frames = made.take_frames(0)
     contacts = only(frames, Opcode.CONTACT)
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
     assert contacts[1]["force_y"] == pytest.approx(12.0) and contacts[1]["force_z"] == pytest.approx(204.75)
@@ -126,13 +126,13 @@ def test_forces_are_felt_by_the_link_in_front_and_the_tail():
 def test_neighbours_take_turns_with_their_imus():
     made = chain(config(**SENSORS), physics_model=Pushed(4))
     for slot in made.slots:
-        slot.module.parameters.values[Parameter.IMU_EVERY] = 4.0
+        slot.module.parameters.values[ModuleParameter.IMU_EVERY] = 4.0
     for tick in range(4):
-        made.receive(0, sync(tick, 0))
-        gyros = only(made.take(0), Opcode.GYRO)
+        made.receive(0, make_sync(tick, 0))
+        gyros = only(made.take_frames(0), Opcode.GYRO)
         assert len(gyros) == 1 and gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
-    made.receive(0, sync(4, 0))
-    frames = made.take(0)
+    made.receive(0, make_sync(4, 0))
+    frames = made.take_frames(0)
     assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
     assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
 
@@ -142,7 +142,7 @@ def test_the_pose_is_sent_once_a_sync_before_the_answers():
     made = chain(config(6, **SENSORS), physics_model=Pushed(6), channels=["a", "b"], send_pose=sent.append)
     for tick in range(3):
         for channel in (0, 1):
-            made.receive(channel, sync(tick, tick * 10_000))
+            made.receive(channel, make_sync(tick, tick * 10_000))
     assert len(sent) == 3
     sample = msgspec.json.decode(sent[0], type=MocapSample)
     assert sample.position_w == POSE.position_w and sample.angular_velocity_w == POSE.angular_velocity_w
@@ -196,6 +196,6 @@ def test_overheating_fades_torque_before_it_stops():
 
 
 def test_what_is_out_of_range_ends_at_the_end_of_the_range_and_nothing_raises():
-    assert ANGLE.one(99.0) == 32767 and ANGLE.one(-99.0) == -32768
-    assert ANGLE.many(np.array([np.nan, np.inf, -np.inf, 0.1])) == [0, 32767, -32768, 1000]
-    assert FORCE.one(float("inf")) == 4095 and ALONG.one(float("nan")) == 0
+    assert ANGLE.to_raw(99.0) == 32767 and ANGLE.to_raw(-99.0) == -32768
+    assert ANGLE.to_raw_array(np.array([np.nan, np.inf, -np.inf, 0.1])) == [0, 32767, -32768, 1000]
+    assert FORCE.to_raw(float("inf")) == 4095 and ALONG.to_raw(float("nan")) == 0

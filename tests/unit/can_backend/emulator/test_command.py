@@ -7,12 +7,12 @@ from collections import defaultdict
 import can
 import pytest
 
-from snakesim_can_backend.bus.bus import message_of
+from snakesim_can_backend.bus.bus import to_python_can
 from snakesim_can_backend.emulator import command as program
 from snakesim_can_backend.emulator.command import main
-from snakesim_can_backend.emulator.faults import ABOUT
-from snakesim_can_backend.protocol.commands import command
-from snakesim_can_backend.protocol.definitions import Action, Opcode, node_of, opcode_of
+from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
+from snakesim_can_backend.protocol.commands import make_command
+from snakesim_can_backend.protocol.definitions import CommandAction, Opcode, parse_node, parse_opcode
 
 
 def test_every_module_is_there_and_answers_and_in_the_end_the_traffic_is_told(monkeypatch, capsys):
@@ -20,13 +20,13 @@ def test_every_module_is_there_and_answers_and_in_the_end_the_traffic_is_told(mo
         monkeypatch.setattr(program, of_a_process, lambda *_: None)
     channel = f"modules-{uuid.uuid4().hex[:8]}"
     with can.Bus(interface="virtual", channel=channel) as bus:
-        asking = bus.send_periodic(message_of(command(Action.IDENTIFY)), 0.1)
+        asking = bus.send_periodic(to_python_can(make_command(CommandAction.IDENTIFY)), 0.1)
         where = ("--channel", f"virtual:{channel}", "--physics-model", "inertia", "--pose", "none")
         assert main(["triplet", *where, "--duration", "2", "--stats", "--fault", "leak:joint_3@0"]) == 0
         asking.stop()
         heard = defaultdict(set)
         while (message := bus.recv(0)) is not None:
-            heard[opcode_of(message.arbitration_id), node_of(message.arbitration_id)].add(bytes(message.data[:4]))
+            heard[parse_opcode(message.arbitration_id), parse_node(message.arbitration_id)].add(bytes(message.data[:4]))
     nodes = range(1, 14)
     assert all(heard[Opcode.HEARTBEAT, node] for node in nodes)
     assert len(set.union(*(heard[Opcode.IDENTITY, node] for node in nodes))) == 13, "each has a serial of its own"
@@ -62,4 +62,4 @@ def test_help_explains_every_fault(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
     shown = capsys.readouterr().out
-    assert all(kind in shown for kind in ABOUT)
+    assert all(kind in shown for kind in FAULT_DESCRIPTIONS)

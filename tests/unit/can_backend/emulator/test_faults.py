@@ -2,17 +2,17 @@
 
 import pytest
 
-from snakesim_can_backend.emulator.faults import parse, parse_typed, typed
+from snakesim_can_backend.emulator.faults import format_typed_fault, parse_fault, parse_typed_fault
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
 
 
 def test_what_is_typed_is_a_fault_that_begins_or_ends_now():
     fault = Injection("mute", "joint_2", 7.0)
-    assert parse_typed("mute joint_2\n", 4, 7.0) == (fault, True)
-    assert parse_typed("mute joint_2 off", 4, 7.0) == (fault, False)
+    assert parse_typed_fault("mute joint_2\n", 4, 7.0) == (fault, True)
+    assert parse_typed_fault("mute joint_2 off", 4, 7.0) == (fault, False)
     for begins in (True, False):
-        assert parse_typed(typed(fault, begins=begins), 4, 7.0) == (fault, begins)
+        assert parse_typed_fault(format_typed_fault(fault, begins=begins), 4, 7.0) == (fault, begins)
 
 
 @pytest.mark.parametrize(
@@ -26,4 +26,4 @@ def test_what_is_typed_is_a_fault_that_begins_or_ends_now():
 )
 def test_wrong_texts_are_told_what_is_allowed(text: str, message: str):
     with pytest.raises(ConfigError, match=message):
-        parse(text, 4)
+        parse_fault(text, 4)

@@ -6,17 +6,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_can_backend.emulator.firmware import Module
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.commands import command, emergency, sync
+from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.commands import make_command, make_emergency, make_sync
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
-    Action,
+    CommandAction,
     LastStop,
     ModuleFault,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Parameter,
 )
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.emulator.rig import (
@@ -33,10 +33,10 @@ from tests.unit.can_backend.emulator.rig import (
 )
 from tests.unit.can_backend.frames import corrupted
 
-WITHOUT_KEY = codec()[Opcode.COMMAND].frame(BROADCAST, action=Action.ARM)
+WITHOUT_KEY = load_layouts()[Opcode.COMMAND].encode(BROADCAST, action=CommandAction.ARM)
 
 
-def drive(module: Module, count: int, now_us: float, **how: Any) -> None:
+def drive(module: ModuleFirmware, count: int, now_us: float, **how: Any) -> None:
     """A setpoint, and the Sync that enacts it."""
     module.receive_setpoint(setpoint(count, **how), now_us)
     module.sync(count, QUIET)
@@ -45,8 +45,8 @@ def drive(module: Module, count: int, now_us: float, **how: Any) -> None:
 def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
     module = new_module()
     module.poll(0.0)
-    module.receive(command(Action.IDENTIFY), 50 * MS)
-    module.receive(command(Action.ARM), 50 * MS)
+    module.receive(make_command(CommandAction.IDENTIFY), 50 * MS)
+    module.receive(make_command(CommandAction.ARM), 50 * MS)
     module.sync(1, QUIET)
     module.poll(99 * MS)
     assert module.frames == [] and module.state == ModuleState.BOOT
@@ -73,17 +73,17 @@ def test_position_targets_end_at_the_angle_limit():
 @pytest.mark.parametrize(("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)])
 def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault: ModuleFault):
     module = armed()
-    module.inside.leak, module.inside.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
+    module.health.leak, module.health.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
     module.poll(BOOTED + MS)
     [beat] = only(module.frames, Opcode.HEARTBEAT)
     assert beat[f"fault_{fault.name.lower()}"] == 1 and beat["last_stop"] == LastStop[fault.name]
-    module.inside.winding_c = 80.0 if sensed == "hot" else 20.0
-    module.receive(command(Action.CLEAR), BOOTED + 2 * MS)
+    module.health.winding_c = 80.0 if sensed == "hot" else 20.0
+    module.receive(make_command(CommandAction.CLEAR), BOOTED + 2 * MS)
     assert module.state == ModuleState.FAULT
-    module.inside.leak, module.inside.winding_c = False, 79.0
+    module.health.leak, module.health.winding_c = False, 79.0
     module.poll(BOOTED + 3 * MS)
     assert module.state == ModuleState.FAULT, "latched"
-    module.receive(command(Action.CLEAR), BOOTED + 3 * MS)
+    module.receive(make_command(CommandAction.CLEAR), BOOTED + 3 * MS)
     assert module.state == ModuleState.DISARMED and module.faults == 0
 
 
@@ -129,13 +129,13 @@ def test_a_wrong_checksum_is_as_if_nothing_had_come():
 def test_stopping_damps_until_at_rest():
     module = armed()
     drive(module, 0, BOOTED)
-    module.inside.speed_rad_s = 3.0
-    module.receive(command(Action.STOP), BOOTED)
+    module.health.speed_rad_s = 3.0
+    module.receive(make_command(CommandAction.STOP), BOOTED)
     assert module.state == ModuleState.STOPPING and module.demand[:2] == (Mode.VELOCITY, 0.0)
     assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == Mode.VELOCITY
     module.poll(BOOTED + 50 * MS)
     assert module.state == ModuleState.STOPPING
-    module.inside.speed_rad_s = 0.04
+    module.health.speed_rad_s = 0.04
     module.poll(BOOTED + 51 * MS)
     assert module.state == ModuleState.DISARMED and module.demand.mode == Mode.PASSIVE
     assert module.last_stop == LastStop.STOP
@@ -143,14 +143,14 @@ def test_stopping_damps_until_at_rest():
 
 def test_stopping_ends_after_the_watchdog_s_time_and_may_be_passive():
     module = armed(stop_mode=0, watchdog=0.05)
-    module.inside.speed_rad_s = 3.0
-    module.receive(command(Action.STOP), BOOTED)
+    module.health.speed_rad_s = 3.0
+    module.receive(make_command(CommandAction.STOP), BOOTED)
     assert module.demand.mode == Mode.PASSIVE
     module.poll(BOOTED + 50 * MS)
     assert module.state == ModuleState.DISARMED
 
 
-@pytest.mark.parametrize("frame", [WITHOUT_KEY, corrupted(command(Action.ARM))])
+@pytest.mark.parametrize("frame", [WITHOUT_KEY, corrupted(make_command(CommandAction.ARM))])
 def test_commands_need_key_and_checksum(frame):
     module = booted()
     module.receive(frame, BOOTED)
@@ -159,25 +159,27 @@ def test_commands_need_key_and_checksum(frame):
 
 def test_a_reboot_forgets_what_was_not_saved():
     module = armed()
-    module.receive(command(Action.DISARM), BOOTED)
-    module.receive(parameter(Parameter.STIFFNESS, 12.0), BOOTED)
-    module.receive(parameter(Parameter.DAMPING, 2.0), BOOTED)
-    module.receive(parameter(Parameter.DAMPING, operation=2), BOOTED)
-    module.receive(command(Action.REBOOT, NODE), BOOTED)
+    module.receive(make_command(CommandAction.DISARM), BOOTED)
+    module.receive(parameter(ModuleParameter.STIFFNESS, 12.0), BOOTED)
+    module.receive(parameter(ModuleParameter.DAMPING, 2.0), BOOTED)
+    module.receive(parameter(ModuleParameter.DAMPING, operation=2), BOOTED)
+    module.receive(make_command(CommandAction.REBOOT, NODE), BOOTED)
     assert module.state == ModuleState.BOOT
     module.frames.clear()
     module.poll(BOOTED + 100 * MS)
     [beat] = only(module.frames, Opcode.HEARTBEAT)
     assert beat["uptime"] == pytest.approx(0.1)
     values = module.parameters.values
-    assert values[Parameter.STIFFNESS] == 0.0 and values[Parameter.DAMPING] == 2.0
+    assert values[ModuleParameter.STIFFNESS] == 0.0 and values[ModuleParameter.DAMPING] == 2.0
 
 
 def test_the_uptime_of_a_module_stays_at_the_end_of_its_range() -> None:
     """The protocol forbids a number that wraps around: an uptime of 0 would look like a restart."""
     module = booted()
     module._booted_us = -(2**32 - 50) * MS
-    beats = [codec()[Opcode.HEARTBEAT].values(module.heartbeat(at_us).data) for at_us in (0.0, 100 * MS, 500 * MS)]
+    beats = [
+        load_layouts()[Opcode.HEARTBEAT].decode(module.heartbeat(at_us).data) for at_us in (0.0, 100 * MS, 500 * MS)
+    ]
     assert [beat["uptime"] for beat in beats] == pytest.approx([4294967.246, 4294967.295, 4294967.295], abs=1e-6)
 
 
@@ -211,18 +213,18 @@ def test_a_hanging_module_repeats_its_last_state_and_hardware_opens_the_bridge()
 # --- whatever a host sends ---------------------------------------------------------------------------------
 
 ANYTHING = st.one_of(
-    st.sampled_from(list(Action)).map(command),
-    st.just(emergency()),
+    st.sampled_from(list(CommandAction)).map(make_command),
+    st.just(make_emergency()),
     st.builds(setpoint, st.integers(0, 15), st.sampled_from(list(Mode))),
     st.builds(corrupted, st.builds(setpoint, st.integers(0, 15))),
-    st.builds(corrupted, st.just(command(Action.ARM))),
+    st.builds(corrupted, st.just(make_command(CommandAction.ARM))),
     st.builds(parameter, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)),
-    st.builds(sync, st.integers(0, 255), st.just(0)),
+    st.builds(make_sync, st.integers(0, 255), st.just(0)),
 )
 PAUSES = st.sampled_from([0.0, 1.0 * MS, 20 * MS, 120 * MS])
 
 
-def give(module: Module, frame, now_us: float) -> None:
+def give(module: ModuleFirmware, frame, now_us: float) -> None:
     opcode = frame.id >> 6
     if opcode == Opcode.SYNC:
         module.sync(frame.data[0], QUIET)
@@ -236,10 +238,10 @@ def give(module: Module, frame, now_us: float) -> None:
 @given(st.lists(st.tuples(ANYTHING, PAUSES, st.booleans()), max_size=60))
 def test_only_armed_and_stopping_modules_drive_and_only_valid_set_points_feed(sent):
     module, now_us = booted(), BOOTED
-    module.inside.speed_rad_s = 1.0
+    module.health.speed_rad_s = 1.0
     for frame, pause_us, leak in sent:
         now_us += pause_us
-        module.inside.leak = leak and pause_us > 0
+        module.health.leak = leak and pause_us > 0
         module.poll(now_us)
         before, state, refused = module._fed_us, module.state, module.refused
         give(module, frame, now_us)
@@ -252,6 +254,6 @@ def test_only_armed_and_stopping_modules_drive_and_only_valid_set_points_feed(se
 @pytest.mark.parametrize(("voltage_v", "faults"), [(18.0, 0), (17.99, 1 << ModuleFault.VOLTAGE)])
 def test_it_is_driven_down_to_18_v_and_not_below(voltage_v: float, faults: int) -> None:
     module = armed()
-    module.inside.voltage_v = voltage_v
+    module.health.voltage_v = voltage_v
     module.poll(BOOTED + 10 * MS)
     assert (module.faults, module.state) == (faults, ModuleState.FAULT if faults else ModuleState.ARMED)

@@ -4,7 +4,14 @@ import struct
 
 import pytest
 
-from snakesim_can_backend.protocol.definitions import PARAMETERS, Frame, Opcode, Operation, Parameter, Result
+from snakesim_can_backend.protocol.definitions import (
+    PARAMETERS,
+    Frame,
+    ModuleParameter,
+    Opcode,
+    ParameterOperation,
+    ParameterResult,
+)
 from tests.unit.can_backend.emulator.rig import BOOTED, armed, booted, only, parameter
 
 
@@ -12,7 +19,7 @@ def ask(module, *request, **given):
     module.frames.clear()
     module.receive(parameter(*request, **given), BOOTED)
     [answer] = only(module.frames, Opcode.PARAMETER_ANSWER)
-    return Result(int(answer["result"])), answer["value"]
+    return ParameterResult(int(answer["result"])), answer["value"]
 
 
 @pytest.mark.parametrize("index", [p for p, r in PARAMETERS.items() if r.writable])
@@ -20,18 +27,18 @@ def test_both_ends_of_every_range_can_be_written_in_single_precision(index):
     module = booted()
     for end in (PARAMETERS[index].low, PARAMETERS[index].high):
         result, value = ask(module, index, end)
-        assert result == Result.DONE and value == pytest.approx(end, rel=1e-6)
+        assert result == ParameterResult.DONE and value == pytest.approx(end, rel=1e-6)
 
 
 @pytest.mark.parametrize(
     ("index", "value", "result"),
     [
-        (Parameter.WATCHDOG, 0.101, Result.OUT_OF_RANGE),
-        (Parameter.WATCHDOG, 0.0, Result.OUT_OF_RANGE),
-        (Parameter.IMU_EVERY, 1.5, Result.OUT_OF_RANGE),
-        (Parameter.RATED_TORQUE, 1.0, Result.READ_ONLY),
-        (0, 1.0, Result.UNKNOWN_INDEX),
-        (14, 1.0, Result.UNKNOWN_INDEX),
+        (ModuleParameter.WATCHDOG, 0.101, ParameterResult.OUT_OF_RANGE),
+        (ModuleParameter.WATCHDOG, 0.0, ParameterResult.OUT_OF_RANGE),
+        (ModuleParameter.IMU_EVERY, 1.5, ParameterResult.OUT_OF_RANGE),
+        (ModuleParameter.RATED_TORQUE, 1.0, ParameterResult.READ_ONLY),
+        (0, 1.0, ParameterResult.UNKNOWN_INDEX),
+        (14, 1.0, ParameterResult.UNKNOWN_INDEX),
     ],
 )
 def test_what_is_wrong_is_refused_and_changes_nothing(index, value, result):
@@ -43,14 +50,14 @@ def test_what_is_wrong_is_refused_and_changes_nothing(index, value, result):
 
 def test_nan_is_refused():
     module = booted()
-    good = parameter(Parameter.DAMPING, 1.0)
+    good = parameter(ModuleParameter.DAMPING, 1.0)
     module.receive(Frame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
-    assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == Result.OUT_OF_RANGE
+    assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == ParameterResult.OUT_OF_RANGE
 
 
 def test_an_armed_module_may_be_read_and_not_written():
     module = armed()
-    assert ask(module, Parameter.DAMPING, 1.0)[0] == Result.NOT_WHILE_ARMED
-    assert ask(module, Parameter.DAMPING, operation=Operation.SAVE)[0] == Result.NOT_WHILE_ARMED
-    assert ask(module, Parameter.DAMPING, operation=Operation.READ)[0] == Result.DONE
-    assert ask(module, Parameter.DAMPING, operation=3)[0] == Result.UNKNOWN_OPERATION
+    assert ask(module, ModuleParameter.DAMPING, 1.0)[0] == ParameterResult.NOT_WHILE_ARMED
+    assert ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.SAVE)[0] == ParameterResult.NOT_WHILE_ARMED
+    assert ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.READ)[0] == ParameterResult.DONE
+    assert ask(module, ModuleParameter.DAMPING, operation=3)[0] == ParameterResult.UNKNOWN_OPERATION

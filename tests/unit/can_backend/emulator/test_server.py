@@ -10,8 +10,8 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
-from snakesim_can_backend.protocol.commands import command, sync
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
+from snakesim_can_backend.protocol.commands import make_command, make_sync
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
@@ -47,7 +47,7 @@ def served(made: ModuleChain) -> Iterator[Wall]:
 
 
 def send_tick(near: VirtualWire, tick: int) -> None:
-    near.send(sync(tick, 0))
+    near.send(make_sync(tick, 0))
     for node in range(1, JOINTS + 1):
         near.send(setpoint(tick, Mode.POSITION, 0.2, node=node))
 
@@ -57,7 +57,7 @@ def test_by_the_clock_modules_boot_answer_and_follow_and_are_passive_after_the_w
     with served(made) as (near, _, until):
         assert until(0.09) == []
         assert len(only(until(0.11), Opcode.HEARTBEAT)) == JOINTS
-        near.send(command(Action.ARM))
+        near.send(make_command(CommandAction.ARM))
         answers = []
         for tick in range(50):
             send_tick(near, tick)
@@ -75,7 +75,7 @@ def test_what_slept_here_does_not_look_like_a_host_that_slept():
     made = chain(stepped=False)
     with served(made) as (near, server, until):
         until(0.11)
-        near.send(command(Action.ARM))
+        near.send(make_command(CommandAction.ARM))
         for tick in range(5):
             send_tick(near, tick)
             until(0.11 + 0.01 * (tick + 1))
@@ -95,7 +95,7 @@ def test_stepped_twins_run_when_the_host_has_nothing_to_do():
         assert wait([near], 1.0), "their first heartbeats"
         near.receive()
         assert not wait([near], 1.0), "nothing can come before something is sent"
-        near.send(sync(0, 0))
+        near.send(make_sync(0, 0))
         assert wait([near], 1.0)
         assert len(only(near.receive(), Opcode.JOINT_STATE)) == JOINTS
     finally:

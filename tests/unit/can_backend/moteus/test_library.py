@@ -8,7 +8,7 @@ import moteus
 import pytest
 from moteus.protocol import parse_message, parse_registers
 
-from snakesim_can_backend.bus.bus import VirtualWire, message_of
+from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
 from snakesim_can_backend.moteus import protocol
 from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
 from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION, configured_gains
@@ -88,7 +88,7 @@ def test_a_stop_of_ours_is_theirs_and_ids_are_extended_where_theirs_are() -> Non
     assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
     asked = protocol.make_frame(0, 1, *MOTION, reply=True)
     assert asked.id == as_frame(theirs().make_query()).id == 0x8001
-    assert message_of(asked, fd=True).is_extended_id and not message_of(Frame(0x100, b""), fd=True).is_extended_id
+    assert to_python_can(asked, fd=True).is_extended_id and not to_python_can(Frame(0x100, b""), fd=True).is_extended_id
     assert len(protocol.make_frame(0, 1, *HEALTH).data) == 6 and len(protocol.make_frame(0, 1, *MOTION).data) == 5
     assert parse_registers(protocol.make_frame(0, 1, *IDENTITY).data).query == [
         (0x102, moteus.INT32),
@@ -111,7 +111,7 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
     client, number = theirs(3), 3
 
     def ask(command: Any) -> dict[int, Any]:
-        ours.send(message_of(as_frame(command, number), fd=True))
+        ours.send(to_python_can(as_frame(command, number), fd=True))
         emulator()
         if (message := ours.recv(0)) is None:
             return {}
@@ -139,7 +139,7 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
     ask(client.make_position(position=0.1, velocity=0.0))
     everybody = theirs(127)
-    ours.send(message_of(as_frame(everybody.make_stop(), 127), fd=True))
+    ours.send(to_python_can(as_frame(everybody.make_stop(), 127), fd=True))
     emulator()
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, "127 is the broadcast address"
 

@@ -7,26 +7,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol.codec import CodecError, Layout, Signal, codec, load_database
+from snakesim_can_backend.protocol.codec import CodecError, MessageLayout, Signal, load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     WITH_CHECKSUM,
     Opcode,
     checksum,
-    intact,
-    node_of,
-    opcode_of,
+    has_valid_checksum,
+    parse_node,
+    parse_opcode,
 )
 
 DATABASE = load_database()
 TARGETS = ("position", "velocity", "torque")
 EVERY_SIGNAL = [
-    (layout, signal) for layout in codec().values() for signal in layout.signals.values() if signal.name != "checksum"
+    (layout, signal)
+    for layout in load_layouts().values()
+    for signal in layout.signals.values()
+    if signal.name != "checksum"
 ]
 each_signal = pytest.mark.parametrize(
     ("layout", "signal"), EVERY_SIGNAL, ids=[f"{m.name}.{s.name}" for m, s in EVERY_SIGNAL]
 )
-LAYOUTS = list(codec().values())
+LAYOUTS = list(load_layouts().values())
 each_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
 any_layout, any_signal = st.sampled_from(LAYOUTS), st.sampled_from(EVERY_SIGNAL)
 often = settings(max_examples=400)
@@ -41,14 +44,14 @@ def slack(signal: Signal, value: float) -> float:
 
 def raw_numbers(signal: Signal) -> st.SearchStrategy[int]:
     if signal.is_float:
-        return st.floats(-(2.0**127), 2.0**127, width=32).map(lambda v: Signal.raw(signal, v))
+        return st.floats(-(2.0**127), 2.0**127, width=32).map(lambda v: Signal.encode(signal, v))
     return st.integers(
         round((signal.low - signal.offset) / signal.scale), round((signal.high - signal.offset) / signal.scale)
     )
 
 
 @st.composite
-def contents(draw: st.DrawFn, layout: Layout) -> dict[str, int]:
+def contents(draw: st.DrawFn, layout: MessageLayout) -> dict[str, int]:
     """Raw numbers of the signals that a frame really carries: of the targets of a setpoint one at most."""
     names = [name for name in layout.signals if name != "checksum"]
     numbers = {name: draw(raw_numbers(layout.signals[name])) for name in names}
@@ -63,18 +66,20 @@ def contents(draw: st.DrawFn, layout: Layout) -> dict[str, int]:
 
 @given(any_signal, st.data(), nodes)
 @often
-def test_every_value_comes_back_within_half_a_step(of: tuple[Layout, Signal], data: st.DataObject, node: int) -> None:
+def test_every_value_comes_back_within_half_a_step(
+    of: tuple[MessageLayout, Signal], data: st.DataObject, node: int
+) -> None:
     layout, signal = of
     value = data.draw(st.floats(signal.low, signal.high))
-    frame = layout.frame(node, **{signal.name: value})
-    assert (opcode_of(frame.id), node_of(frame.id), len(frame.data)) == (layout.opcode, node, layout.length)
-    assert abs(layout.values(frame.data)[signal.name] - value) <= slack(signal, value)
+    frame = layout.encode(node, **{signal.name: value})
+    assert (parse_opcode(frame.id), parse_node(frame.id), len(frame.data)) == (layout.opcode, node, layout.length)
+    assert abs(layout.decode(frame.data)[signal.name] - value) <= slack(signal, value)
 
 
 @each_signal
-def test_both_ends_of_a_range_fit_and_come_back(layout: Layout, signal: Signal) -> None:
+def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: Signal) -> None:
     for end in (signal.low, signal.high):
-        back = layout.values(layout.frame(1, **{signal.name: end}).data)[signal.name]
+        back = layout.decode(layout.encode(1, **{signal.name: end}).data)[signal.name]
         assert abs(back - end) <= slack(signal, end)
         if not signal.is_float:
             assert back == pytest.approx(end, abs=1e-9 * max(abs(end), 1.0))
@@ -82,11 +87,11 @@ def test_both_ends_of_a_range_fit_and_come_back(layout: Layout, signal: Signal) 
 
 @each_signal
 @pytest.mark.parametrize("wrong", ["above", "below", math.nan, math.inf, -math.inf])
-def test_what_does_not_fit_is_refused_in_words(layout: Layout, signal: Signal, wrong: float | str) -> None:
+def test_what_does_not_fit_is_refused_in_words(layout: MessageLayout, signal: Signal, wrong: float | str) -> None:
     step = 1e32 if signal.is_float else signal.scale
     value = {"above": signal.high + step, "below": signal.low - step}[wrong] if isinstance(wrong, str) else wrong
     with pytest.raises(CodecError) as caught:
-        layout.frame(1, **{signal.name: value})
+        layout.encode(1, **{signal.name: value})
     assert isinstance(caught.value, ValueError)
     for part in (signal.name, str(value), signal.unit, str(signal.low), str(signal.high)):
         assert part in str(caught.value)
@@ -97,10 +102,10 @@ def test_what_does_not_fit_is_refused_in_words(layout: Layout, signal: Signal, w
 
 @given(any_layout, st.data(), nodes)
 @often
-def test_cantools_writes_the_same_bytes(layout: Layout, data: st.DataObject, node: int) -> None:
+def test_cantools_writes_the_same_bytes(layout: MessageLayout, data: st.DataObject, node: int) -> None:
     numbers = data.draw(contents(layout))
-    values = {n: min(max(s.value(numbers[n]), s.low), s.high) for n, s in layout.signals.items() if n in numbers}
-    frame = layout.frame(node, **values)
+    values = {n: min(max(s.decode(numbers[n]), s.low), s.high) for n, s in layout.signals.items() if n in numbers}
+    frame = layout.encode(node, **values)
     theirs: dict[str, Any] = dict(values)
     if layout.opcode in WITH_CHECKSUM:
         theirs["checksum"] = frame.data[-1]
@@ -109,11 +114,11 @@ def test_cantools_writes_the_same_bytes(layout: Layout, data: st.DataObject, nod
 
 @given(any_layout, st.data())
 @often
-def test_any_bytes_are_read_as_cantools_reads_them(layout: Layout, data: st.DataObject) -> None:
+def test_any_bytes_are_read_as_cantools_reads_them(layout: MessageLayout, data: st.DataObject) -> None:
     content = data.draw(st.binary(min_size=layout.length, max_size=layout.length))
     if layout.opcode == Opcode.SET_POINT:
         content = bytes((content[0] & 0xF0 | content[0] & 0x03,)) + content[1:]  # cantools knows no other mode
-    ours, theirs = layout.values(content), DATABASE.decode_message(layout.name, content, decode_choices=False)
+    ours, theirs = layout.decode(content), DATABASE.decode_message(layout.name, content, decode_choices=False)
     assert isinstance(theirs, dict)
     for name, value in theirs.items():
         assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-15, nan_ok=True), name
@@ -124,24 +129,24 @@ def test_any_bytes_are_read_as_cantools_reads_them(layout: Layout, data: st.Data
 
 @given(any_layout, st.data(), nodes)
 @often
-def test_a_writer_writes_what_a_reader_reads(layout: Layout, data: st.DataObject, node: int) -> None:
+def test_a_writer_writes_what_a_reader_reads(layout: MessageLayout, data: st.DataObject, node: int) -> None:
     numbers = data.draw(contents(layout))
     names = data.draw(st.permutations(list(numbers)))
-    frame = layout.writer(*names)(node, [numbers[name] for name in names])
-    assert layout.reader(*names)(frame.data) == tuple(numbers[name] for name in names)
+    frame = layout.make_writer(*names)(node, [numbers[name] for name in names])
+    assert layout.make_reader(*names)(frame.data) == tuple(numbers[name] for name in names)
     if layout.opcode in WITH_CHECKSUM:
-        assert intact(frame) and frame.data[-1] == checksum(frame.id, frame.data[:-1])
+        assert has_valid_checksum(frame) and frame.data[-1] == checksum(frame.id, frame.data[:-1])
 
 
 @each_layout
-def test_what_is_not_named_is_zero(layout: Layout) -> None:
-    frame = layout.frame(7)
+def test_what_is_not_named_is_zero(layout: MessageLayout) -> None:
+    frame = layout.encode(7)
     payload = frame.data[:-1] if layout.opcode in WITH_CHECKSUM else frame.data
     assert not any(payload)
 
 
 @each_layout
-def test_a_frame_of_another_length_is_refused(layout: Layout) -> None:
+def test_a_frame_of_another_length_is_refused(layout: MessageLayout) -> None:
     for length in set(range(9)) - {layout.length}:
         with pytest.raises(CodecError, match=f"{layout.name} has {layout.length} bytes, this one {length}"):
-            layout.values(bytes(length))
+            layout.decode(bytes(length))

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
-    Action,
+    CommandAction,
     Frame,
     ModuleState,
     Opcode,
@@ -24,7 +24,7 @@ TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "to
 
 
 def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
-    (frame,) = commands.SetpointWriter(1).frames(SafeSetpoints([mode], [target], [limit_nm]))
+    (frame,) = commands.SetpointWriter(1).encode(SafeSetpoints([mode], [target], [limit_nm]))
     return frame
 
 
@@ -34,7 +34,7 @@ def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
 @given(st.sampled_from(list(TARGET)), st.floats(-3.2767, 3.2767), st.floats(0, 65.535))
 def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: Mode, target: float, limit_nm: float) -> None:
     said = read(one(mode, target, limit_nm))
-    step = codec()[Opcode.SET_POINT].signals[TARGET[mode]].scale
+    step = load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert abs(said[TARGET[mode]] - target) <= step / 2 * (1 + 1e-9)
     assert abs(said["torque_limit"] - limit_nm) <= 0.0005 * (1 + 1e-9)
 
@@ -42,7 +42,7 @@ def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: Mode, target: 
 @given(st.sampled_from(list(TARGET)), st.floats(33, 1e9) | st.just(math.inf), st.booleans())
 def test_what_is_beyond_the_range_is_sent_as_its_end(mode: Mode, beyond: float, negative: bool) -> None:
     said = read(one(mode, -beyond if negative else beyond, 65.6 + beyond))
-    most = 32767 * codec()[Opcode.SET_POINT].signals[TARGET[mode]].scale
+    most = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert said[TARGET[mode]] == pytest.approx(-most if negative else most)
     assert said["torque_limit"] == pytest.approx(65.535)
     assert read(one(mode, 0.0, -1.0))["torque_limit"] == 0.0
@@ -56,13 +56,15 @@ def test_a_passive_joint_gets_no_target(target: float) -> None:
 
 def test_joints_and_set_points_must_be_as_many() -> None:
     with pytest.raises(ValueError):
-        commands.SetpointWriter(3).frames(SafeSetpoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
+        commands.SetpointWriter(3).encode(SafeSetpoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
 
 
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------
 
-CLEAR, ARM, STOP, DISARM = (commands.command(a) for a in (Action.CLEAR, Action.ARM, Action.STOP, Action.DISARM))
-EMERGENCY = commands.emergency()
+CLEAR, ARM, STOP, DISARM = (
+    commands.make_command(a) for a in (CommandAction.CLEAR, CommandAction.ARM, CommandAction.STOP, CommandAction.DISARM)
+)
+EMERGENCY = commands.make_emergency()
 TOLD: dict[tuple[LifecycleState, LifecycleState], list[Frame]] = {
     ("disarmed", "armed"): [ARM],
     ("disarmed", "fault"): [],
@@ -82,7 +84,7 @@ TOLD: dict[tuple[LifecycleState, LifecycleState], list[Frame]] = {
 @pytest.mark.parametrize("before", LIFECYCLES)
 @pytest.mark.parametrize("now", LIFECYCLES)
 def test_what_all_modules_are_told_at_a_change(before: LifecycleState, now: LifecycleState) -> None:
-    assert commands.on_change(before, now) == TOLD.get((before, now), [])
+    assert commands.make_transition_frames(before, now) == TOLD.get((before, now), [])
     assert before == now or (before, now) in TOLD
 
 
@@ -91,12 +93,12 @@ def test_what_all_modules_are_told_at_a_change(before: LifecycleState, now: Life
 def test_what_a_module_is_reminded_of(lifecycle: LifecycleState, state: ModuleState) -> None:
     expected: Frame | None = None
     if (lifecycle, state) == ("armed", ModuleState.DISARMED):
-        expected = commands.command(Action.ARM, 3)
+        expected = commands.make_command(CommandAction.ARM, 3)
     elif lifecycle == "estop" and state not in (ModuleState.EMERGENCY, ModuleState.BOOT):
         expected = EMERGENCY
     elif lifecycle in ("disarmed", "fault") and state == ModuleState.ARMED:
-        expected = commands.command(Action.STOP, 3)
-    assert commands.reminder(lifecycle, state, 3) == expected
+        expected = commands.make_command(CommandAction.STOP, 3)
+    assert commands.make_reminder(lifecycle, state, 3) == expected
 
 
 # --- frames ------------------------------------------------------------------------------------------------
@@ -104,6 +106,6 @@ def test_what_a_module_is_reminded_of(lifecycle: LifecycleState, state: ModuleSt
 
 @given(st.integers(0, 2**40), st.integers(0, 2**50))
 def test_a_sync_carries_count_and_time_modulo_their_ranges(count: int, time_us: int) -> None:
-    frame = commands.sync(count, time_us)
+    frame = commands.make_sync(count, time_us)
     assert frame.id == 0x080
     assert read(frame) == {"count": count % 256, "time": time_us % 2**32}

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_can_backend.bus.load import load, reports_at, worst_bits
-from snakesim_can_backend.emulator.firmware import BOOT_US, Module
-from snakesim_can_backend.emulator.parameters import Parameters, from_factory
+from snakesim_can_backend.bus.load import bus_load, plan_reports_at, worst_frame_bits
+from snakesim_can_backend.emulator.firmware import BOOT_US, ModuleFirmware
+from snakesim_can_backend.emulator.parameters import ParameterStore, make_factory_defaults
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.codec import codec, load_database
+from snakesim_can_backend.protocol.codec import load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     FIRST_NODE,
     FROM_HOST,
     LAST_NODE,
+    MAX_WRONG_COUNTS,
     NODE_BITS,
     PARAMETERS,
-    WRONG_COUNTS,
-    Action,
+    CommandAction,
     Frame,
     ModuleState,
     Opcode,
@@ -54,7 +54,7 @@ def number(value: float) -> str:
 
 
 def message_row(opcode: Opcode) -> list[str]:
-    layout = codec()[opcode]
+    layout = load_layouts()[opcode]
     first = opcode << NODE_BITS
     to_all = opcode in (Opcode.EMERGENCY, Opcode.COMMAND, Opcode.SYNC)
     to_one = opcode not in (Opcode.EMERGENCY, Opcode.SYNC)
@@ -65,7 +65,7 @@ def message_row(opcode: Opcode) -> list[str]:
 
 def signal_rows(opcode: Opcode) -> list[list[str]]:
     found = []
-    for signal in sorted(codec()[opcode].signals.values(), key=lambda s: (s.shift, s.name)):
+    for signal in sorted(load_layouts()[opcode].signals.values(), key=lambda s: (s.shift, s.name)):
         last = signal.shift + signal.bits - 1
         bits = str(signal.shift) if signal.bits == 1 else f"{signal.shift}–{last}"
         kind = "float" if signal.is_float else "signed" if signal.signed else "unsigned"
@@ -86,7 +86,7 @@ def test_the_table_of_messages() -> None:
 
 @pytest.mark.parametrize("opcode", list(Opcode))
 def test_the_layout_of_every_message(opcode: Opcode) -> None:
-    assert [row[:6] for row in rows(codec()[opcode].name)] == signal_rows(opcode)
+    assert [row[:6] for row in rows(load_layouts()[opcode].name)] == signal_rows(opcode)
 
 
 def test_every_number_that_has_a_name_is_listed() -> None:
@@ -112,7 +112,7 @@ def test_the_table_of_parameters() -> None:
 
 
 def test_the_worked_example_of_the_checksum() -> None:
-    frame = commands.command(Action.ARM, NODE)
+    frame = commands.make_command(CommandAction.ARM, NODE)
     text = section("Checksum")
     assert f"`{frame.id:03X}`" in text and f"`{frame.data.hex(' ').upper()}`" in text
     crc = frame.id
@@ -122,14 +122,14 @@ def test_the_worked_example_of_the_checksum() -> None:
             crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
         assert f"`{crc:04X}`" in text
     assert crc & 0xFF == frame.data[-1]
-    setpoint = codec()[Opcode.SET_POINT].frame(NODE, mode=1, count=3, position=-0.5, torque_limit=7.0)
+    setpoint = load_layouts()[Opcode.SET_POINT].encode(NODE, mode=1, count=3, position=-0.5, torque_limit=7.0)
     assert f"`{setpoint.data.hex(' ').upper()}`" in section("SetPoint")
 
 
 def test_the_bits_of_a_frame() -> None:
     table = rows("Bus load")
     assert table[0][1:] == [str(47 + 8 * length) for length in (1, 3, 4, 5, 6, 7, 8)]
-    assert table[1][1:] == [str(worst_bits(length)) for length in (1, 3, 4, 5, 6, 7, 8)]
+    assert table[1][1:] == [str(worst_frame_bits(length)) for length in (1, 3, 4, 5, 6, 7, 8)]
 
 
 def test_the_table_of_loads() -> None:
@@ -137,80 +137,80 @@ def test_the_table_of_loads() -> None:
     found = rows("What fits")
     assert [row[0] for row in found] == ["13", "18", "30"]
     for row in found:
-        loads = [100 * load(int(row[0]), reports_at(rate, config, CanSettings())) for rate in (50, 100, 200)]
+        loads = [100 * bus_load(int(row[0]), plan_reports_at(rate, config, CanSettings())) for rate in (50, 100, 200)]
         assert row[1:] == [f"{share:.1f} %" + (" refused" if share > 80 else "") for share in loads]
 
 
 # --- state machine -----------------------------------------------------------------------------------------
 
 
-def module_in(state: ModuleState) -> Module:
+def module_in(state: ModuleState) -> ModuleFirmware:
     """A module that has just come to be in a state, at 1 s."""
-    module = Module(NODE, 1, Parameters(from_factory(7.0, 7.5)), HeatLimits(80.0, 105.0))
+    module = ModuleFirmware(NODE, 1, ParameterStore(make_factory_defaults(7.0, 7.5)), HeatLimits(80.0, 105.0))
     if state == ModuleState.BOOT:
         module.poll(BOOT_US / 2)
         return module
     module.poll(BOOT_US)
     now_us = 1e6
     module.poll(now_us)
-    module.inside.speed_rad_s = 1.0
+    module.health.speed_rad_s = 1.0
     for opened_by in {
         ModuleState.DISARMED: [],
-        ModuleState.ARMED: [Action.ARM],
-        ModuleState.STOPPING: [Action.ARM, Action.STOP],
-        ModuleState.FAULT: [Action.ARM],
+        ModuleState.ARMED: [CommandAction.ARM],
+        ModuleState.STOPPING: [CommandAction.ARM, CommandAction.STOP],
+        ModuleState.FAULT: [CommandAction.ARM],
         ModuleState.EMERGENCY: [],
     }[state]:
-        module.receive(commands.command(opened_by, NODE), now_us)
+        module.receive(commands.make_command(opened_by, NODE), now_us)
     if state == ModuleState.FAULT:
         module.poll(now_us + 1e5)
     if state == ModuleState.EMERGENCY:
-        module.receive(commands.emergency(), now_us)
+        module.receive(commands.make_emergency(), now_us)
     assert module.state == state
     module.frames.clear()
     return module
 
 
-def now_of(module: Module) -> float:
+def now_of(module: ModuleFirmware) -> float:
     return {ModuleState.BOOT: BOOT_US / 2, ModuleState.FAULT: 1.1e6}.get(module.state, 1e6)
 
 
-def command(action: Action) -> Callable[[Module], None]:
-    return lambda module: module.receive(commands.command(action, NODE), now_of(module))
+def command(action: CommandAction) -> Callable[[ModuleFirmware], None]:
+    return lambda module: module.receive(commands.make_command(action, NODE), now_of(module))
 
 
-def emergency(module: Module) -> None:
-    module.receive(commands.emergency(), now_of(module))
+def emergency(module: ModuleFirmware) -> None:
+    module.receive(commands.make_emergency(), now_of(module))
 
 
-def time_passes(module: Module) -> None:
+def time_passes(module: ModuleFirmware) -> None:
     """The watchdog's time, and no more than that."""
     module.poll(now_of(module) + 99_000)
     module.poll(now_of(module) + 100_000)
 
 
-def rest(module: Module) -> None:
-    module.inside.speed_rad_s = 0.0
+def rest(module: ModuleFirmware) -> None:
+    module.health.speed_rad_s = 0.0
     module.poll(now_of(module))
 
 
-def wrong_counts(module: Module) -> None:
-    layout = codec()[Opcode.SET_POINT]
-    for _ in range(WRONG_COUNTS + 1):
-        module.receive_setpoint(layout.frame(NODE, mode=0, count=9), now_of(module))
+def wrong_counts(module: ModuleFirmware) -> None:
+    layout = load_layouts()[Opcode.SET_POINT]
+    for _ in range(MAX_WRONG_COUNTS + 1):
+        module.receive_setpoint(layout.encode(NODE, mode=0, count=9), now_of(module))
 
 
-def leak(module: Module) -> None:
-    module.inside.leak = True
+def leak(module: ModuleFirmware) -> None:
+    module.health.leak = True
     module.poll(now_of(module))
 
 
-EVENTS: dict[str, Callable[[Module], None]] = {
-    "Command arm": command(Action.ARM),
-    "Command disarm": command(Action.DISARM),
-    "Command stop": command(Action.STOP),
-    "Command clear": command(Action.CLEAR),
-    "Command reboot": command(Action.REBOOT),
+EVENTS: dict[str, Callable[[ModuleFirmware], None]] = {
+    "Command arm": command(CommandAction.ARM),
+    "Command disarm": command(CommandAction.DISARM),
+    "Command stop": command(CommandAction.STOP),
+    "Command clear": command(CommandAction.CLEAR),
+    "Command reboot": command(CommandAction.REBOOT),
     "Emergency": emergency,
     "watchdog's time without a setpoint": time_passes,
     "five wrong counters in a row": wrong_counts,
@@ -240,7 +240,7 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
 
 
 def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:
-    lengths = {int(opcode): codec()[opcode].length for opcode in Opcode}
+    lengths = {int(opcode): load_layouts()[opcode].length for opcode in Opcode}
     for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):
         frame = Frame(int(identifier, 16), bytes.fromhex(data))
         assert lengths[frame.id >> NODE_BITS] == len(frame.data)

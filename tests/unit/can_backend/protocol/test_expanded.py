@@ -13,18 +13,18 @@ from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire
 from snakesim_can_backend.can_command import main
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.codec import codec, load_database
+from snakesim_can_backend.protocol.codec import load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     FIRST_NODE,
     LAST_NODE,
     NODE_BITS,
-    Action,
+    CommandAction,
     Frame,
     ModuleState,
     Opcode,
 )
-from snakesim_can_backend.protocol.expanded import nodes_of
+from snakesim_can_backend.protocol.expanded import list_nodes
 from snakesim_hal.wire.messages import Mode
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
@@ -48,8 +48,8 @@ def database(expanded: Path) -> Database:
 def test_every_message_of_every_node_is_there_and_no_other(database: Database) -> None:
     expected = {
         opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
-        for opcode, layout in codec().items()
-        for node in nodes_of(opcode)
+        for opcode, layout in load_layouts().items()
+        for node in list_nodes(opcode)
     }
     assert {message.frame_id: message.name for message in database.messages} == expected
 
@@ -75,16 +75,16 @@ def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
 
 def sent() -> list[tuple[Frame, str]]:
     """Frames of every kind, and what stock cantools is to say of them."""
-    layouts = codec()
-    setpoint = layouts[Opcode.SET_POINT].frame(5, mode=Mode.POSITION, count=3, position=-0.5, torque_limit=7.0)
-    state = layouts[Opcode.JOINT_STATE].frame(
+    layouts = load_layouts()
+    setpoint = layouts[Opcode.SET_POINT].encode(5, mode=Mode.POSITION, count=3, position=-0.5, torque_limit=7.0)
+    state = layouts[Opcode.JOINT_STATE].encode(
         62, angle=1.0, velocity=-2.0, torque=0.5, count=3, state=ModuleState.ARMED, derated=1
     )
     return [
-        (commands.emergency(), "Emergency(reason: host)"),
-        (commands.command(Action.ARM), "Command(action: arm, key: 23214, checksum: 50)"),
-        (commands.command(Action.STOP, 7), "Command_07(action: stop"),
-        (commands.sync(200, 12345678), "Sync(count: 200, time: 12345678 us)"),
+        (commands.make_emergency(), "Emergency(reason: host)"),
+        (commands.make_command(CommandAction.ARM), "Command(action: arm, key: 23214, checksum: 50)"),
+        (commands.make_command(CommandAction.STOP, 7), "Command_07(action: stop"),
+        (commands.make_sync(200, 12345678), "Sync(count: 200, time: 12345678 us)"),
         (setpoint, "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m"),
         (state, "JointState_62(angle: 1.0 rad, velocity: -2.0 rad/s, torque: 0.5 N.m, count: 3, state: armed"),
     ]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol.codec import codec, load_database
+from snakesim_can_backend.protocol.codec import load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     FIRST_NODE,
     FROM_HOST,
@@ -15,19 +15,19 @@ from snakesim_can_backend.protocol.definitions import (
     NODE_BITS,
     NODE_MASK,
     WITH_CHECKSUM,
-    Action,
+    CommandAction,
     EmergencyReason,
     Frame,
     LastStop,
     ModuleFault,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Operation,
-    Parameter,
-    Result,
+    ParameterOperation,
+    ParameterResult,
     checksum,
     frame_id,
-    intact,
+    has_valid_checksum,
 )
 from snakesim_hal.wire.messages import Mode
 
@@ -35,12 +35,12 @@ DATABASE = load_database()
 NAMED: dict[str, type[IntEnum]] = {
     "state": ModuleState,
     "mode": Mode,
-    "action": Action,
+    "action": CommandAction,
     "reason": EmergencyReason,
     "last_stop": LastStop,
-    "operation": Operation,
-    "result": Result,
-    "index": Parameter,
+    "operation": ParameterOperation,
+    "result": ParameterResult,
+    "index": ModuleParameter,
 }
 
 
@@ -68,7 +68,7 @@ def test_every_signal_of_that_name_has_its_table_and_no_narrower_range() -> None
 
 
 def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
-    signals = codec()[Opcode.HEARTBEAT].signals
+    signals = load_layouts()[Opcode.HEARTBEAT].signals
     first = signals["fault_watchdog"].shift
     found = {name: signal.shift - first for name, signal in signals.items() if name.startswith("fault_")}
     assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
@@ -82,7 +82,7 @@ def test_directions() -> None:
 
 
 def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
-    for opcode, layout in codec().items():
+    for opcode, layout in load_layouts().items():
         assert ("checksum" in layout.signals) == (opcode in WITH_CHECKSUM)
         if opcode in WITH_CHECKSUM:
             signal = layout.signals["checksum"]
@@ -90,7 +90,7 @@ def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
 
 
 def test_signals_of_a_message_do_not_overlap_but_for_the_targets_of_a_set_point() -> None:
-    for opcode, layout in codec().items():
+    for opcode, layout in load_layouts().items():
         for a, b in combinations(layout.signals.values(), 2):
             shared = (a.mask << a.shift) & (b.mask << b.shift)
             targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {"position", "velocity", "torque"}
@@ -103,7 +103,7 @@ def test_signals_of_a_message_do_not_overlap_but_for_the_targets_of_a_set_point(
 
 def checked(opcode: Opcode, node: int, payload: bytes) -> Frame:
     identifier = frame_id(opcode, node)
-    data = payload[: codec()[opcode].length - 1]
+    data = payload[: load_layouts()[opcode].length - 1]
     return Frame(identifier, data + bytes((checksum(identifier, data),)))
 
 
@@ -111,16 +111,16 @@ def checked(opcode: Opcode, node: int, payload: bytes) -> Frame:
 @given(node=st.integers(FIRST_NODE, LAST_NODE), payload=st.binary(min_size=7, max_size=7))
 def test_every_single_wrong_bit_is_found_and_so_is_any_other_node(opcode: Opcode, node: int, payload: bytes) -> None:
     frame = checked(opcode, node, payload)
-    assert intact(frame)
+    assert has_valid_checksum(frame)
     number = int.from_bytes(frame.data, "little")
     for bit in range(8 * len(frame.data)):
         wrong = (number ^ 1 << bit).to_bytes(len(frame.data), "little")
-        assert not intact(Frame(frame.id, wrong)), bit
+        assert not has_valid_checksum(Frame(frame.id, wrong)), bit
     for bit in range(11):
-        assert not intact(Frame(frame.id ^ 1 << bit, frame.data)), bit
+        assert not has_valid_checksum(Frame(frame.id ^ 1 << bit, frame.data)), bit
     for other in range(NODE_MASK + 1):
-        assert intact(Frame(frame_id(opcode, other), frame.data)) == (other == node)
+        assert has_valid_checksum(Frame(frame_id(opcode, other), frame.data)) == (other == node)
 
 
 def test_messages_with_a_checksum_differ_in_length_so_that_none_passes_for_another() -> None:
-    assert len({codec()[opcode].length for opcode in WITH_CHECKSUM}) == len(WITH_CHECKSUM)
+    assert len({load_layouts()[opcode].length for opcode in WITH_CHECKSUM}) == len(WITH_CHECKSUM)

@@ -3,8 +3,16 @@
 from collections.abc import Callable
 
 from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire
-from snakesim_can_backend.emulator.firmware import Module
-from snakesim_can_backend.protocol.definitions import BROADCAST, Action, Frame, ModuleState, Opcode, node_of, opcode_of
+from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    CommandAction,
+    Frame,
+    ModuleState,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.frames import read
 from tests.unit.can_backend.loop import Loop, chain_of
@@ -50,28 +58,28 @@ class RecordedWire(VirtualWire):
 WIRES: list[RecordedWire] = []
 
 
-def is_action(frame: Frame, *actions: Action) -> bool:
-    return opcode_of(frame.id) == Opcode.COMMAND and read(frame)["action"] in actions
+def is_action(frame: Frame, *actions: CommandAction) -> bool:
+    return parse_opcode(frame.id) == Opcode.COMMAND and read(frame)["action"] in actions
 
 
 def is_set_point(frame: Frame) -> bool:
-    return opcode_of(frame.id) == Opcode.SET_POINT
+    return parse_opcode(frame.id) == Opcode.SET_POINT
 
 
 def words(frames: list[Frame]) -> list[str]:
     """What the host said beside Syncs and setpoints."""
     found = []
     for frame in frames:
-        opcode = Opcode(opcode_of(frame.id))
+        opcode = Opcode(parse_opcode(frame.id))
         if opcode == Opcode.COMMAND:
-            who = "" if node_of(frame.id) == BROADCAST else f" {node_of(frame.id)}"
-            found.append(Action(int(read(frame)["action"])).name.lower() + who)
+            who = "" if parse_node(frame.id) == BROADCAST else f" {parse_node(frame.id)}"
+            found.append(CommandAction(int(read(frame)["action"])).name.lower() + who)
         elif opcode == Opcode.EMERGENCY:
             found.append("emergency")
     return found
 
 
-def module_of(run: Loop, node: int) -> Module:
+def module_of(run: Loop, node: int) -> ModuleFirmware:
     return chain_of(run.backend).slots[node - 1].module
 
 

@@ -7,7 +7,7 @@ import can
 import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.protocol.definitions import FROM_HOST, Action, Frame, LastStop, Opcode
+from snakesim_can_backend.protocol.definitions import FROM_HOST, CommandAction, Frame, LastStop, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire import keys
@@ -83,11 +83,11 @@ def test_what_is_wrong_is_told_even_when_the_bus_no_longer_takes_the_stop() -> N
     """The cause is not lost to the error of the bus."""
     with loop() as run:
         armed(run)
-        module_of(run, 2).inside.leak = True
+        module_of(run, 2).health.leak = True
         wire = WIRES[0]
 
         def breaks(frame: Frame) -> bool:
-            if is_action(frame, Action.STOP):
+            if is_action(frame, CommandAction.STOP):
                 raise BackendError("the bus is broken")
             return False
 

@@ -10,19 +10,19 @@ from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.modules import answer_limit_s
-from snakesim_can_backend.emulator.firmware import Module
-from snakesim_can_backend.emulator.server import InProcessEmulators, here
-from snakesim_can_backend.protocol.commands import command, emergency
+from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.emulator.server import InProcessEmulators, make_local_emulators
+from snakesim_can_backend.protocol.commands import make_command, make_emergency
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
-    Action,
+    CommandAction,
     LastStop,
     ModuleFault,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Parameter,
-    node_of,
-    opcode_of,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.backend import SafeSetpoints
@@ -49,11 +49,15 @@ from tests.unit.can_backend.loop import JOINTS, config, loop
 def test_bring_up_enables_nothing() -> None:
     with loop() as run:
         sent = WIRES[0].sent
-        assert {opcode_of(frame.id) for frame in sent} == {Opcode.COMMAND, Opcode.PARAMETER_REQUEST, Opcode.SYNC}
-        assert all(is_action(f, Action.IDENTIFY, Action.DISARM) for f in sent if opcode_of(f.id) == Opcode.COMMAND)
-        disarm = next(i for i, frame in enumerate(sent) if is_action(frame, Action.DISARM))
-        written = next(i for i, frame in enumerate(sent) if opcode_of(frame.id) == Opcode.PARAMETER_REQUEST)
-        assert disarm < written and node_of(sent[disarm].id) == BROADCAST
+        assert {parse_opcode(frame.id) for frame in sent} == {Opcode.COMMAND, Opcode.PARAMETER_REQUEST, Opcode.SYNC}
+        assert all(
+            is_action(f, CommandAction.IDENTIFY, CommandAction.DISARM)
+            for f in sent
+            if parse_opcode(f.id) == Opcode.COMMAND
+        )
+        disarm = next(i for i, frame in enumerate(sent) if is_action(frame, CommandAction.DISARM))
+        written = next(i for i, frame in enumerate(sent) if parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST)
+        assert disarm < written and parse_node(sent[disarm].id) == BROADCAST
         assert run.states() == [DISARMED] * JOINTS
         assert not any(is_set_point(frame) for frame in go(run, "disarmed", 30))
         assert run.faults == [] and run.true_speed_rad_s == [0.0] * 30
@@ -63,7 +67,7 @@ def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch:
     class Deaf(RecordedWire):
         def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
             super().__init__(channel, peer)
-            self.deaf_to = lambda frame: opcode_of(frame.id) == Opcode.JOINT_STATE and node_of(frame.id) == 2
+            self.deaf_to = lambda frame: parse_opcode(frame.id) == Opcode.JOINT_STATE and parse_node(frame.id) == 2
 
     monkeypatch.setattr(modules, "VirtualWire", Deaf)
     with pytest.raises(BackendError, match="joint_2 did not answer 20 Syncs; nothing was enabled"), loop():
@@ -72,28 +76,28 @@ def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch:
     assert wire.closed == 1 and words(wire.sent)[-1] == "disarm" and not any(map(is_set_point, wire.sent))
 
 
-def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[Module], None]) -> None:
+def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]) -> None:
     """When a driver opens its bus, one of the emulators is not as new."""
 
     def emulators(*given: Any, **more: Any) -> InProcessEmulators:
-        end = here(*given, **more)
+        end = make_local_emulators(*given, **more)
         change(end.server.chain.slots[node - 1].module)
         return end
 
-    monkeypatch.setattr(modules, "emulators_here", emulators)
+    monkeypatch.setattr(modules, "start_local_emulators", emulators)
 
 
-def left_behind(module: Module, kind: str) -> None:
+def left_behind(module: ModuleFirmware, kind: str) -> None:
     """What a module is like whose driver was killed, or worse."""
     if kind == "emergency":
-        module.receive(emergency(), 0.0)
+        module.receive(make_emergency(), 0.0)
         return
-    module.receive(command(Action.ARM), 0.0)
+    module.receive(make_command(CommandAction.ARM), 0.0)
     module._fail(ModuleFault.STREAM if kind == "stream" else ModuleFault.WATCHDOG, 0.0)
     if kind == "leak":  # after the watchdog had stopped it, water came, and went
-        module.inside.leak = True
+        module.health.leak = True
         module.poll(0.0)
-        module.inside.leak = False
+        module.health.leak = False
         assert module.last_stop == LastStop.WATCHDOG
 
 
@@ -114,7 +118,7 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
 
 
 def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    weak = {Parameter.RATED_TORQUE: 1.0}
+    weak = {ModuleParameter.RATED_TORQUE: 1.0}
     found_as(monkeypatch, 3, lambda module: module.parameters.values.update(weak))
     with pytest.raises(BackendError, match=r"joint_3 is rated for 1 N·m"), loop():
         pass
@@ -176,9 +180,9 @@ def test_a_period_has_one_sync_and_one_set_point_for_each_module() -> None:
         run.arm()
         for _ in range(20):
             sent = go(run, "armed")
-            assert [opcode_of(frame.id) for frame in sent] == [Opcode.SYNC, *[Opcode.SET_POINT] * JOINTS]
-            assert [node_of(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
-        counts = [read(f)["count"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
+            assert [parse_opcode(frame.id) for frame in sent] == [Opcode.SYNC, *[Opcode.SET_POINT] * JOINTS]
+            assert [parse_node(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
+        counts = [read(f)["count"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
         assert counts == [i % 256 for i in range(len(counts))]
-        times = [read(f)["time"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
+        times = [read(f)["time"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
         assert np.diff(times[-20:]).tolist() == [10_000] * 19

@@ -11,8 +11,8 @@ from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
-from snakesim_can_backend.protocol.commands import question
-from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, node_of, opcode_of
+from snakesim_can_backend.protocol.commands import make_query
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Opcode, parse_node, parse_opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.base.errors import BackendError
@@ -33,7 +33,7 @@ class NoProcess:
     def __init__(self, run: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
         self.started.append((settings.channels, pose, stepped))
 
-    def how_it_ended(self) -> str | None:
+    def describe_exit(self) -> str | None:
         return self.ended
 
     def stop(self) -> None:
@@ -73,9 +73,9 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
     assert run.faults == []
     a, b = WIRES
     for wire, nodes in ((a, {1, 2, 3}), (b, {4})):
-        assert {node_of(frame.id) for frame in wire.sent} == {0, *nodes}
-        assert {node_of(frame.id) for frame in wire.sent if is_set_point(frame)} == nodes
-    counts = [[f.data for f in wire.sent if opcode_of(f.id) == Opcode.SYNC] for wire in WIRES]
+        assert {parse_node(frame.id) for frame in wire.sent} == {0, *nodes}
+        assert {parse_node(frame.id) for frame in wire.sent if is_set_point(frame)} == nodes
+    counts = [[f.data for f in wire.sent if parse_opcode(f.id) == Opcode.SYNC] for wire in WIRES]
     assert counts[0] == counts[1], "all are seen at one instant"
     b.refuses = is_set_point
     run.run(7, run.waving)
@@ -95,7 +95,7 @@ def test_in_lockstep_nothing_that_twins_said_is_still_on_its_way_when_a_tick_goe
         wire.sent.clear()
     run.run(20)
     for wire, node in zip(WIRES, (1, 4), strict=True):
-        asked = [opcode_of(f.id) for f in wire.sent if f == question(node) or opcode_of(f.id) == Opcode.SYNC]
+        asked = [parse_opcode(f.id) for f in wire.sent if f == make_query(node) or parse_opcode(f.id) == Opcode.SYNC]
         assert asked == [Opcode.SYNC, Opcode.PARAMETER_REQUEST] * 20
     assert run.backend.modules.reading.answers_missing == 0
     run.backend.close()
@@ -105,7 +105,9 @@ def test_a_module_on_the_wrong_bus_is_found_before_anything_is_enabled(two_buses
     with pytest.raises(BackendError, match=r"joint_3 \(node 3 on bus_b\) does not answer; a node 3 answers on bus_a"):
         two_buses([2, 2], bring_up_limit_s=0.3)
     assert [wire.closed for wire in WIRES] == [1, 1]
-    assert not any(is_action(frame, Action.DISARM) for wire in WIRES for frame in wire.sent), "they are another's"
+    assert not any(is_action(frame, CommandAction.DISARM) for wire in WIRES for frame in wire.sent), (
+        "they are another's"
+    )
 
 
 def test_a_driver_whose_twins_have_died_ends(two_buses: Callable[..., Loop], monkeypatch: pytest.MonkeyPatch) -> None:

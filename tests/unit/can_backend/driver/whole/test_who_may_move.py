@@ -4,16 +4,16 @@ from itertools import pairwise
 
 import pytest
 
-from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
-    Action,
+    CommandAction,
     Frame,
+    ModuleParameter,
     ModuleState,
     Opcode,
-    Parameter,
-    node_of,
-    opcode_of,
+    parse_node,
+    parse_opcode,
 )
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import LifecycleState, Mode
@@ -72,7 +72,9 @@ def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) ->
 
 def test_an_arming_and_a_stop_that_are_lost_are_said_again_to_those_who_need_it() -> None:
     with loop() as run:
-        WIRES[0].loses = lambda frame: is_action(frame, Action.ARM, Action.STOP) and node_of(frame.id) == BROADCAST
+        WIRES[0].loses = lambda frame: (
+            is_action(frame, CommandAction.ARM, CommandAction.STOP) and parse_node(frame.id) == BROADCAST
+        )
         sent = go(run, "armed", 6)
         assert words(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
         assert run.states() == [ARMED] * JOINTS and run.faults == []
@@ -85,7 +87,7 @@ def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
     with loop() as run:
         go(run, "armed", 3)
         assert run.states() == [ARMED] * JOINTS
-        module_of(run, 2).receive(command(Action.DISARM), 0.0)
+        module_of(run, 2).receive(make_command(CommandAction.DISARM), 0.0)
         before = len(WIRES[0].sent)
         run.run(5)
         assert words(WIRES[0].sent[before:]) == ["stop"] and module_of(run, 2).state == DISARMED
@@ -115,13 +117,13 @@ def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
         run.arm()
         start = run.tick
         refused = (start + 4, start + 5, start + 9)
-        WIRES[0].refuses = lambda frame: is_set_point(frame) and node_of(frame.id) == 2 and run.tick in refused
+        WIRES[0].refuses = lambda frame: is_set_point(frame) and parse_node(frame.id) == 2 and run.tick in refused
         by_tick: dict[int, list[dict[str, float]]] = {}
         for _ in range(30):
             tick = run.tick
             before = len(WIRES[0].sent)
             run.run(1, lambda tick: SafeSetpoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
-            mine = [f for f in WIRES[0].sent[before:] if is_set_point(f) and node_of(f.id) == 2]
+            mine = [f for f in WIRES[0].sent[before:] if is_set_point(f) and parse_node(f.id) == 2]
             by_tick[tick] = [read(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
         assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)
@@ -135,7 +137,7 @@ def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
 def test_a_bus_that_takes_no_sync_is_told_even_when_nothing_is_armed() -> None:
     with loop() as run:
         run.run(2)
-        WIRES[0].refuses = lambda frame: opcode_of(frame.id) == Opcode.SYNC
+        WIRES[0].refuses = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
         run.run(8)
         assert [fault.what for fault in run.faults] == ["bus_stuck"], "and no module is blamed for it"
         assert run.samples[-1].joints.valid == [False] * JOINTS
@@ -155,16 +157,16 @@ def test_a_restarted_module_is_not_armed_before_it_has_its_parameters() -> None:
             run.run(1)
             states.append(module.state)
         assert ARMED not in states[states.index(ModuleState.BOOT) :]
-        assert module.parameters.values[Parameter.STIFFNESS] == 0.0
+        assert module.parameters.values[ModuleParameter.STIFFNESS] == 0.0
         assert "module_restarted" in [fault.what for fault in run.faults] and run.lifecycle == "fault"
         go(run, "armed", 8)  # cleared and armed between two ticks
         assert run.states() == [ARMED] * JOINTS
-        assert module.parameters.values[Parameter.STIFFNESS] == 40.0
+        assert module.parameters.values[ModuleParameter.STIFFNESS] == 40.0
 
 
 def test_a_robot_is_not_armed_while_a_module_does_not_take_its_parameters() -> None:
     with loop(faults=["reboot:joint_2@0.3"]) as run:
-        WIRES[0].loses = lambda frame: opcode_of(frame.id) == Opcode.PARAMETER_REQUEST
+        WIRES[0].loses = lambda frame: parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
         run.run(60)
         assert run.lifecycle == "fault"
         before = len(run.faults)
@@ -176,4 +178,4 @@ def test_a_robot_is_not_armed_while_a_module_does_not_take_its_parameters() -> N
         before = len(run.faults)
         go(run, "armed", 8)
         assert run.states() == [ARMED] * JOINTS and run.faults[before:] == []
-        assert module_of(run, 2).parameters.values[Parameter.STIFFNESS] == 40.0
+        assert module_of(run, 2).parameters.values[ModuleParameter.STIFFNESS] == 40.0
