@@ -59,7 +59,7 @@ class LateralUndulation:
     def update(self, view: View) -> Action:
         """The wave goes on while there is a path to go along."""
         reference = self.reference_rad(view, view.period_s if motion_wanted(view) else 0.0)
-        return Action(self._bumpless.to(view, reference), Report(reference_rad=reference.tolist()))
+        return Action(self._bumpless.follow(view, reference), Report(reference_rad=reference.tolist()))
 
     def start_from(self, angles_rad: NDArray[np.float64]) -> None:
         """Choose the phase at which the wave is most like a shape, (n_joints,)."""

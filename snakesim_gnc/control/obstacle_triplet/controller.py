@@ -24,8 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_gnc.control.bumpless import HandOver
-from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.climb import Climb
+from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
@@ -72,7 +72,7 @@ class ObstacleTriplet:
             authority_min=settings.authority_min,
             hold_on_m=settings.hold_on_m,
         )
-        self._felt = FeltContacts()
+        self._felt = MeasuredContacts()
         self._stall_watch = StallWatch(
             stall_m=settings.stall_m, stall_s=settings.stall_s, propulsion_n=settings.propulsion_n
         )
@@ -95,7 +95,7 @@ class ObstacleTriplet:
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
-        self._felt.take(located.world)
+        self._felt.add_world(located.world)
         body_pose, before = self._follow(view, located), self._choice
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
@@ -245,7 +245,7 @@ class ObstacleTriplet:
         stall = explain(
             wanted_n=push.wanted_n,
             force_n=push.force_n,
-            carried=self._felt.along(choice.triplet.contacts[0].tangent_w),
+            carried=self._felt.resolve_along(choice.triplet.contacts[0].tangent_w),
             push_points=choice.triplet.names,
             weight_n=self._body.weight_n,
             saturated=name if push.saturated else None,

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_gnc.control.carried import NetContactForce, what_holds
+from snakesim_gnc.control.contact_forces import NetContactForce, explain_standstill
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def explain(
     strongest_n = None if carried is None else carried.strongest_n
     strained = saturated is not None or swung is not None or wanted_n > drag_ratio * weight_n
     lets_go = strongest_n != 0.0 and (strained or (strongest_n is not None and strongest_n > jam_force_n))
-    jammed, why = what_holds(force_n, carried, push_points)
+    jammed, why = explain_standstill(force_n, carried, push_points)
     if swung is not None:
         why += f"; {swung} has swung out and leaves no more of the {wanted_n:.1f} N wanted"
     elif saturated is not None:

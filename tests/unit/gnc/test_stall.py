@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from snakesim_gnc.control.carried import FeltContacts, NetContactForce
+from snakesim_gnc.control.contact_forces import MeasuredContacts, NetContactForce
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
 from snakesim_hal.wire.messages import World
 from tests.unit.gnc.stage import known, make_contact, make_world
@@ -44,9 +44,9 @@ def world_with(*forces: tuple[str, float, float], timestamp_ns: int = 1) -> Worl
 
 def along(*forces: tuple[str, float, float]) -> NetContactForce:
     """What contacts with these forces along and across the direction do."""
-    felt = FeltContacts()
-    felt.take(world_with(*forces))
-    return known(felt.along((2.0, 0.0)))
+    felt = MeasuredContacts()
+    felt.add_world(world_with(*forces))
+    return known(felt.resolve_along((2.0, 0.0)))
 
 
 PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  # as a triplet of 30 N is
@@ -124,15 +124,15 @@ def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given,
 
 
 def test_forces_are_judged_as_means_over_50_ms():
-    felt = FeltContacts()
+    felt = MeasuredContacts()
     for turn in range(9):
-        felt.take(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
-    carried = known(felt.along((1.0, 0.0)))
+        felt.add_world(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
+    carried = known(felt.resolve_along((1.0, 0.0)))
     assert carried.strongest_n == pytest.approx(10.0) and carried.ahead_n == pytest.approx(10.0)
 
 
 def test_estimated_contacts_are_no_measured_forces():
-    felt, world = FeltContacts(), world_with(*PUSHED)
-    felt.take(world)
-    felt.take(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
-    assert felt.along((1.0, 0.0)) is None and felt.at(["peg_1"]) == []
+    felt, world = MeasuredContacts(), world_with(*PUSHED)
+    felt.add_world(world)
+    felt.add_world(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
+    assert felt.resolve_along((1.0, 0.0)) is None and felt.mean_sizes_n(["peg_1"]) == []
