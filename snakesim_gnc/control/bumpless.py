@@ -1,8 +1,12 @@
-"""Switching joints between position and torque mode without a jump. Pure except for its own state.
+"""Switches joints between position and torque mode, and to new references, without a jump of the motor torque.
 
-A released joint starts from the position target with which its servo gives the present torque
-(`q + (torque + kd speed) / kp`), and the difference to its reference fades out. A joint that takes over starts from its
-present torque, and the propulsion torque fades in. Both fades move by `fade` a tick.
+A servo in position mode gives tau = kp (target - q) - kd q'. So a joint that returns to position mode starts from the
+target that keeps its present torque,
+
+    target = q + (tau + kd q') / kp
+
+and the offset between this target and the reference fades to zero. A joint that enters torque mode starts from its
+present torque, and the wanted torque fades in. Both fades advance by the same fraction in a tick.
 """
 
 from typing import Annotated
@@ -15,69 +19,102 @@ from snakesim_hal.wire.messages import Description, JointState
 from snakesim_hal.wire.quantities import about, above
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
+MIN_STIFFNESS_NM_PER_RAD = 1e-9  # avoids a division by zero for joints without a position loop
+
 Blend = Annotated[float, above(10, "s"), about("over which the command changes smoothly to a new reference")]
 
 
 class HandOver:
-    """The fading differences of all joints. Indices here are those of the robot's joints."""
+    """Fades out the differences between the targets and the references of all joints.
+
+    All arrays are (n_joints,), tail to head. At most one joint is in torque mode.
+    """
 
     def __init__(self, robot: Description) -> None:
-        self._stiffness = np.maximum(np.array([j.stiffness_nm_per_rad for j in robot.joints]), 1e-9)
-        self._damping = np.array([j.damping_nm_s_per_rad for j in robot.joints])
-        self._offset = np.zeros(len(robot.joints))
-        self._turn: int | None = None
-        self._torque_before_nm = 0.0
-        self._share = 1.0  # of the propulsion torque that has faded in
+        stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
+        # Gains of the drives' position loops.
+        self._kp = np.maximum(stiffness, MIN_STIFFNESS_NM_PER_RAD)  # N·m/rad
+        self._kd = np.array([joint.damping_nm_s_per_rad for joint in robot.joints])  # N·m·s/rad
+        # Position mode.
+        self._offset_rad = np.zeros(len(robot.joints))  # target - reference
+        # Torque mode.
+        self._torque_joint: int | None = None
+        self._start_torque_nm = 0.0
+        self._faded_in = 1.0  # fraction of the wanted torque, 0 to 1
 
     def start(self, joints: JointState, reference_rad: Floats) -> None:
-        """Start from the present joint states, all in position mode."""
-        torque, speed = np.array(joints.torque_nm), np.array(joints.velocity_rad_s)
-        held = np.array(joints.angle_rad) + (torque + self._damping * speed) / self._stiffness
-        self._offset = held - reference_rad
-        self._turn = None
+        """Put all joints in position mode, with targets that keep the present torques."""
+        torque_nm = np.array(joints.torque_nm)
+        velocity_rad_s = np.array(joints.velocity_rad_s)
+        target_rad = np.array(joints.angle_rad) + (torque_nm + self._kd * velocity_rad_s) / self._kp
+        self._offset_rad = target_rad - reference_rad
+        self._torque_joint = None
 
     def shift(self, change_rad: Floats) -> None:
-        """The reference has jumped by this much: keep the targets where they are."""
-        self._offset -= change_rad
+        """Keep the targets where they are although the reference has jumped by `change_rad`."""
+        self._offset_rad -= change_rad
 
-    def fade(self, fade: float) -> None:
-        """Reduce differences by a share."""
-        self._offset *= max(0.0, 1.0 - fade)
-        self._share = min(1.0, self._share + fade)
+    def fade(self, fraction: float) -> None:
+        """Reduce the position offsets by a fraction, and fade the wanted torque in by the same fraction."""
+        self._offset_rad *= max(0.0, 1.0 - fraction)
+        self._faded_in = min(1.0, self._faded_in + fraction)
 
-    def pass_to(self, turn: int | None, joints: JointState, reference_rad: Floats, *, anew: bool = False) -> None:
-        """Hand propulsion over to a joint, or to none. anew: the wanted torque may have jumped, even of the same."""
-        if turn == self._turn and not anew:
+    def pass_to(
+        self, torque_joint: int | None, joints: JointState, reference_rad: Floats, *, anew: bool = False
+    ) -> None:
+        """Hand the propulsion over to another joint.
+
+        Args:
+            torque_joint: index of the joint that is in torque mode from now on; None for no joint.
+            joints: measured joint states.
+            reference_rad: reference angles of all joints.
+            anew: fade in again even if the joint is the same, because the wanted torque may have jumped.
+        """
+        if torque_joint == self._torque_joint and not anew:
             return
-        if self._turn is not None and turn != self._turn:
-            i = self._turn
-            push = joints.torque_nm[i] + self._damping[i] * joints.velocity_rad_s[i]
-            self._offset[i] = joints.angle_rad[i] + push / self._stiffness[i] - reference_rad[i]
-        if turn is not None:
-            self._torque_before_nm, self._share, self._offset[turn] = joints.torque_nm[turn], 0.0, 0.0
-        self._turn = turn
+        released = self._torque_joint
+        if released is not None and torque_joint != released:
+            load_nm = joints.torque_nm[released] + self._kd[released] * joints.velocity_rad_s[released]
+            target_rad = joints.angle_rad[released] + load_nm / self._kp[released]
+            self._offset_rad[released] = target_rad - reference_rad[released]
+        if torque_joint is not None:
+            self._start_torque_nm = joints.torque_nm[torque_joint]
+            self._faded_in = 0.0
+            self._offset_rad[torque_joint] = 0.0
+        self._torque_joint = torque_joint
 
     def positions_rad(self, reference_rad: Floats) -> Floats:
-        """Targets of the joints in position mode."""
-        return reference_rad + self._offset
+        """Return the targets of the joints in position mode."""
+        return reference_rad + self._offset_rad
 
     def torque_nm(self, wanted_nm: float) -> float:
-        """Target of the joint in torque mode."""
-        return (1.0 - self._share) * self._torque_before_nm + self._share * wanted_nm
+        """Return the target of the joint in torque mode."""
+        return (1.0 - self._faded_in) * self._start_torque_nm + self._faded_in * wanted_nm
 
 
 class BumplessReference:
-    """The reference of joints that are all in position mode, and setpoints that follow it without a jump."""
+    """Makes setpoints that follow a reference in position mode without a jump."""
 
     def __init__(self, robot: Description, blend_s: float) -> None:
-        """blend_s: in which a jump of the reference fades out."""
+        """Start without a reference.
+
+        Args:
+            robot: description of the robot.
+            blend_s: time in which a jump of the reference fades out.
+        """
         self._robot = robot
         self._blend_s = blend_s
         self._hand_over = HandOver(robot)
-        self.reference_rad: Floats | None = None  # of the tick before; None before the first
+        self.reference_rad: Floats | None = None  # of the tick before; None: joints have not been in position mode
 
-    def to(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> RequestedSetpoints:
-        """Follow a reference. restarted: it may have jumped."""
+    def follow(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> RequestedSetpoints:
+        """Return setpoints that follow a reference.
+
+        Args:
+            view: inputs of this tick.
+            reference_rad: (n_joints,) reference angles, tail to head.
+            restarted: the reference may have jumped since the last tick, so that the jump has to fade out.
+        """
         if self.reference_rad is None:
             self._hand_over.start(view.joints, reference_rad)
         elif restarted:
@@ -86,11 +123,14 @@ class BumplessReference:
         self._hand_over.fade(view.period_s / self._blend_s)
         return positions(self._robot, self._hand_over.positions_rad(reference_rad).tolist())
 
-    def let_go(self) -> None:
-        """Joints leave position mode; when they are back in it, they start from the torques that are there then."""
+    def forget_reference(self) -> None:
+        """Note that the joints leave position mode; on return they start from the torques that they have then."""
         self.reference_rad = None
 
     def hold(self, view: View, why: str) -> Action:
-        """Every joint keeps its reference, or its pose before there was one."""
-        reference = np.array(view.joints.angle_rad) if self.reference_rad is None else self.reference_rad
-        return Action(self.to(view, reference), Report(why=why, reference_rad=reference.tolist()))
+        """Keep every joint at its last reference, or at its pose if there was none. `why` is reported."""
+        reference_rad = self.reference_rad
+        if reference_rad is None:
+            reference_rad = np.array(view.joints.angle_rad)
+        setpoints = self.follow(view, reference_rad)
+        return Action(setpoints, Report(why=why, reference_rad=reference_rad.tolist()))

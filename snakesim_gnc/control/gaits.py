@@ -44,7 +44,7 @@ class _Gait:
         self._phase_rad += math.tau * view.period_s / self._set.period_s
         reference = np.zeros(len(self._from_head))
         self._shape(reference, self._phase_rad)
-        setpoints = self._bumpless.to(view, reference)
+        setpoints = self._bumpless.follow(view, reference)
         return Action(setpoints, Report(why=self.stays, reference_rad=reference.tolist()))
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:

@@ -1,17 +1,25 @@
 """Obstacle-aided propulsion with all joints: forces on the obstacles, and the shape slightly further along the path.
 
-A body that obstacles hold on its path has one freedom, its arc length s. It is pushed along it by forces on the
-obstacles that are near (`push.py`), under a bounded PI law of the speed.
+A body that obstacles hold on its path has one degree of freedom, its arc length s on the path. A bounded PI law of the
+speed error e = v_wanted - v gives the force F along the path:
 
-Where these can balance a push, joints are in torque mode: they get the torques of those forces, and a shape so soft
-that obstacles decide it, with no stiffness along the path. So the forces come true.
+    F = lag_kp integral e dt + speed_kp e,    0 <= F <= what contacts and torque limits allow
 
-Elsewhere, and where drives have no torque mode, joints hold the shape in position mode. The torques then only close
-gaps, and the shape itself pushes, at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by
-virtual work a force F = l k sum theta_i'^2.
+`push.py` distributes F to the obstacles near the body, and finds the joint torques tau_push that produce these forces.
 
-A negative speed backs the body out along its own path. A body that does not come on moves by a wave until it lies where
-it can push (`contact_search.py`). See `docs/poal.md`.
+If the obstacles can balance the push and the drives have a torque mode, the joints are in torque mode:
+
+    tau = tau_push + tau_shape,    tau_shape = k (theta(s) - q) + d (theta' v - q')
+
+with gains k and d so low that obstacles decide the shape. The component of tau_shape along theta' is removed, so that
+the shape does not push along the path and the wanted forces come true.
+
+Otherwise the joints are in position mode, with the target theta(s + l) + tau_push / kp. The torques then only close
+gaps, and the shape itself pushes, by its look-ahead l: tau_i = kp_i (theta_i(s + l) - theta_i(s)), hence by virtual
+work with the force l sum_i kp_i theta_i'^2. The look-ahead follows a PI law of e, too.
+
+A negative speed moves the body backward along its own path. A body that does not advance moves by a wave until it lies
+where it can push (`contact_search.py`). See `docs/poal.md`.
 """
 
 from dataclasses import dataclass
@@ -21,47 +29,56 @@ import numpy as np
 from msgspec import Meta
 
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
-from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.climb import Climb
+from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.progress import Located, Progress, SpeedFilter
-from snakesim_gnc.control.push import Push, PushFilter, Touches, find_touches, push_forward
-from snakesim_gnc.control.push_report import push_points, why_it_stands
+from snakesim_gnc.control.push import PushFilter, Touches, UnitPush, find_touches, push_forward
+from snakesim_gnc.control.push_report import explain_push_standstill, push_points
 from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Description, Mode, World
+from snakesim_hal.wire.messages import Description, Mode, World, WorldContact
 from snakesim_hal.wire.quantities import about, above, from_zero
 
-ANOTHER_SHAPE_RAD = 0.1
-SLOPE_M = 0.02  # over which theta' is taken
-SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
-LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
-STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where on its path it is
-FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
-ACTS_AFTER_S = 0.03  # command and motor are on their way for so long
-SOFT_REST, SOFT_AFTER_S = 0.03, 0.1  # what may be out of balance of a push with a soft shape, and for how long before
-CREEPS_M_S, SETS_OFF = 0.05, 2.0  # slower than this, the push on obstacles grows so many times as fast
-STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
+OTHER_SHAPE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
+SLOPE_STEP_M = 0.02  # step of the finite difference for theta'
+RANDOM_SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)  # the same in every run
+
+# Which contacts push, and how hard.
+MAX_UNBALANCED = 0.3  # fraction of a push; the rest turns the body a little, until it touches other obstacles
+CONTACT_FORCE_SCALE_N = 0.5  # at this measured force, the extra cost of a contact without force has fallen to 1/e
+ACTUATION_DELAY_S = 0.03  # from a measurement until the motors act on it
+CREEP_SPEED_M_S = 0.05  # below it, the integral of the push grows CREEP_GAIN times as fast
+CREEP_GAIN = 2.0
+
+# Torque mode.
+MAX_UNBALANCED_SOFT = 0.03  # fraction of a push that may be unbalanced in torque mode
+SOFT_AFTER_S = 0.1  # how long contacts must have been able to balance a push before
+MIN_SLOPE_SQUARED_PER_M2 = 20.0  # sum of theta'^2 below which a shape says little about where on its path it is
+
+# Reports.
+STANDSTILL_SPEED_M_S = 0.01  # a body that was slower than this for STANDSTILL_S is reported to stand still
+STANDSTILL_S = 0.5
 
 
 @dataclass(frozen=True)
 class PushSnapshot:
-    """What the body could push off when it was last looked at."""
+    """The contacts of a world model, and the push that they allow."""
 
     world: World
     touches: Touches
-    push: Push
+    push: UnitPush
 
 
 class ObstacleAided:
-    """Speed along the path, with every joint."""
+    """Controls the speed along the path with all joints."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
-        """Look-ahead l = speed_kp_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
+        """Parameters; the bound of the look-ahead limits how hard the shape pushes."""
 
         speed_kp_s: Annotated[
             float, from_zero(5, "s"), about("look-ahead of the shape for each m/s that the speed is too low")
@@ -133,184 +150,273 @@ class ObstacleAided:
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
         self._set = settings
-        self._body, self._climb = PlanarBody(robot), Climb(robot)
+        # Models and estimators.
+        self._body = PlanarBody(robot)
+        self._climb = Climb(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._felt, self._filter = FeltContacts(), PushFilter(settings.push_filter_s)
-        self._bumpless = BumplessReference(robot, settings.blend_s)
+        self._contacts = MeasuredContacts()
+        # Joints.
+        self._bends = self._body.bends  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._integral_m = 0.0
-        self._push_n = 0.0
-        self._bends = self._body.bends
-        self._soft = settings.shape_nm_per_rad > 0.0 and all(robot.joints[i].has(Mode.TORQUE) for i in self._bends)
-        self._unbalanced_s = 0.0  # when contacts could last not balance a push
-        self._torques_nm = np.zeros(len(robot.joints))
-        self._unit_nm = np.zeros(len(robot.joints))
-        self._last_push: PushSnapshot | None = None
-        self._max_force_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
-        self._moved_at_s = 0.0
-        self._waits = False
+        self._has_torque_mode = all(robot.joints[i].has(Mode.TORQUE) for i in self._bends)
+        self._bumpless = BumplessReference(robot, settings.blend_s)
+        self._holding = False  # the joints hold a pose; the next reference may jump
+        # Look-ahead.
+        self._look_ahead_integral_m = 0.0
+        # Push along the path.
+        self._push_filter = PushFilter(settings.push_filter_s)
+        self._snapshot: PushSnapshot | None = None
+        self._unit_torques_nm = np.zeros(len(robot.joints))  # joint torques for 1 N along the path
+        self._torques_nm = np.zeros(len(robot.joints))  # filtered joint torques of the commanded push
+        self._push_integral_n = 0.0
+        self._max_force_n = 0.0  # what contacts and torque limits allow
+        self._force_n = 0.0  # commanded push
+        self._unbalanced_at_s = 0.0  # when the contacts could last not balance a push
+        # Supervision.
+        self._moved_at_s = 0.0  # when the body was last faster than STANDSTILL_SPEED_M_S
         self._search = ContactSearch(robot, after_s=settings.search_after_s, for_s=settings.search_s)
 
     def update(self, view: View) -> Action:
-        """Torques, or angles of the body further along the path, as far as the wanted speed needs it."""
+        """Return torques, or angles of the body further along the path, as far as the wanted speed needs it."""
         located = self._progress.update(view)
         if isinstance(located, str):
-            self._waits = True
+            self._holding = True
             return self._bumpless.hold(view, located)
-        self._felt.take(located.world)
-        if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
+        self._contacts.add_world(located.world)
+        wanted_m_s = located.trajectory.speed_m_s
+        if wanted_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
-        lifted = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
-        middle_w, wanted_m_s = located.nodes_w.mean(axis=1), located.trajectory.speed_m_s
-        near = self._last_push is not None and len(self._last_push.touches) > 0
-        if (wave := self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near)) is not None:
-            return self._undulate(view, wave, lifted)
-        scale = self._set.push_scale * self._sign(view.time_s)
-        ahead_m = self._look_ahead_m(located, view.period_s)
-        ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
-        at = located.on_path.pose_at
-        here = self._body.all_angles(at(located.tail_s_m))
-        turns_per_m = (self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here) / SLOPE_M
-        torques = scale * self._push_nm(view, located, turns_per_m)
-        if self._soft and self._balanced(view.time_s) and not lifted.any():
-            return self._press(view, located, here, turns_per_m, torques)
-        reference = self._body.all_angles(at(located.tail_s_m + ahead_m)) + torques / self._stiffness + lifted
-        restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
-        if restarted and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
-            self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
-        setpoints, self._waits = self._bumpless.to(view, reference, restarted=restarted), False
-        force_n = ahead_m * float(self._stiffness @ turns_per_m**2)
-        return Action(setpoints, self._report(view, located, force_n, reference))
+        lift_rad = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
+        center_w = located.nodes_w.mean(axis=1)
+        wave = self._search.decide(view, center_w, wanted_m_s=wanted_m_s, near=self._has_near_obstacles())
+        if wave is not None:
+            return self._undulate(view, wave, lift_rad)
 
-    def _balanced(self, time_s: float) -> bool:
-        """Whether the obstacles beside the body have been able to hold a push for a while."""
-        if self._last_push is None or self._last_push.push.rest > SOFT_REST:
-            self._unbalanced_s = time_s
-        return time_s - self._unbalanced_s > SOFT_AFTER_S
+        scale = self._set.push_scale * self._push_sign(view.time_s)
+        look_ahead_m = self._update_look_ahead(located, view.period_s)
+        if scale < 0:
+            look_ahead_m = abs(look_ahead_m)  # a negative scale always pushes backward
+        look_ahead_m = scale * look_ahead_m
+        theta = self._angles_on_path(located, located.tail_s_m)
+        theta_prime = (self._angles_on_path(located, located.tail_s_m + SLOPE_STEP_M) - theta) / SLOPE_STEP_M
+        push_torques_nm = scale * self._update_push_torques(view, located, theta_prime)
+        if self._can_be_soft(view.time_s) and not lift_rad.any():
+            return self._command_torques(view, located, theta, theta_prime, push_torques_nm)
+        reference = self._angles_on_path(located, located.tail_s_m + look_ahead_m)
+        reference = reference + push_torques_nm / self._stiffness + lift_rad
+        look_ahead_n = look_ahead_m * float(self._stiffness @ theta_prime**2)
+        return self._command_positions(view, located, reference, look_ahead_n)
 
-    def _press(
-        self, view: View, located: Located, reference: Floats, turns_per_m: Floats, torques_nm: Floats
+    def _angles_on_path(self, located: Located, tail_s_m: float) -> Floats:
+        """Return theta(s): the angles of all joints, (n_joints,), with the tail at an arc length of the path."""
+        return self._body.all_angles(located.on_path.at(tail_s_m))
+
+    def _has_near_obstacles(self) -> bool:
+        return self._snapshot is not None and len(self._snapshot.touches) > 0
+
+    def _push_sign(self, time_s: float) -> float:
+        """Return the sign of the push at a time; random signs are the same in every run."""
+        interval_s = self._set.push_sign_s
+        if interval_s == 0.0:
+            return 1.0
+        return float(RANDOM_SIGNS[int(time_s / interval_s) % len(RANDOM_SIGNS)])
+
+    # --- commands ------------------------------------------------------------------------------------------------
+
+    def _can_be_soft(self, time_s: float) -> bool:
+        """Whether the joints can be in torque mode: obstacles have been able to balance a push for a while."""
+        if not self._has_torque_mode or self._set.shape_nm_per_rad <= 0.0:
+            return False
+        if self._snapshot is None or self._snapshot.push.rest > MAX_UNBALANCED_SOFT:
+            self._unbalanced_at_s = time_s
+        return time_s - self._unbalanced_at_s > SOFT_AFTER_S
+
+    def _command_torques(
+        self, view: View, located: Located, theta: Floats, theta_prime: Floats, push_torques_nm: Floats
     ) -> Action:
-        """Torques of the wanted forces, and a soft shape, less all that it would do along the path."""
-        joints, bends, config = view.joints, self._bends, self._set
-        off_rad = reference - np.array(joints.angle_rad)
-        slower_rad_s = turns_per_m * located.speed_m_s - np.array(joints.velocity_rad_s)
-        holding_nm = config.shape_nm_per_rad * off_rad + config.shape_nm_s_per_rad * slower_rad_s
-        along = turns_per_m[bends]
-        holding_nm = holding_nm - turns_per_m * float(along @ holding_nm[bends]) / (along @ along + STRAIGHT_PER_M2)
-        setpoints = self._bumpless.to(view, reference)
-        self._bumpless.let_go()
-        self._integral_m, self._waits = min(self._integral_m, config.fresh_look_ahead_m), False
-        for i in bends:
+        """Command tau_push + tau_shape in torque mode.
+
+        tau_shape = k (theta - q) + d (theta' v - q'), less its component along theta'. All arrays are (n_joints,).
+        """
+        k = self._set.shape_nm_per_rad
+        d = self._set.shape_nm_s_per_rad
+        angle_error_rad = theta - np.array(view.joints.angle_rad)
+        velocity_error_rad_s = theta_prime * located.speed_m_s - np.array(view.joints.velocity_rad_s)
+        shape_nm = k * angle_error_rad + d * velocity_error_rad_s
+        slope = theta_prime[self._bends]
+        along_n = float(slope @ shape_nm[self._bends])  # force of tau_shape along the path, by virtual work
+        shape_nm = shape_nm - theta_prime * along_n / (slope @ slope + MIN_SLOPE_SQUARED_PER_M2)
+
+        setpoints = self._bumpless.follow(view, theta)
+        self._bumpless.forget_reference()
+        self._limit_look_ahead_integral()
+        self._holding = False
+        for i in self._bends:
             limit_nm = setpoints.torque_limit_nm[i]
             setpoints.mode[i] = Mode.TORQUE
-            setpoints.target[i] = min(max(float(holding_nm[i] + torques_nm[i]), -limit_nm), limit_nm)
-        return Action(setpoints, self._report(view, located, 0.0, reference))
+            setpoints.target[i] = min(max(float(shape_nm[i] + push_torques_nm[i]), -limit_nm), limit_nm)
+        return Action(setpoints, self._make_report(view, located, 0.0, theta))
 
-    def _undulate(self, view: View, wave: LateralUndulation, lifted: Floats) -> Action:
-        """In search of something to push off."""
-        self._torques_nm[:] = self._push_n = self._force_n = 0.0
-        reference = wave.reference_rad(view, view.period_s) + lifted
-        setpoints = self._bumpless.to(view, reference, restarted=self._search.changed)
+    def _command_positions(self, view: View, located: Located, reference: Floats, look_ahead_n: float) -> Action:
+        """Command a reference in position mode; look_ahead_n: the force of its look-ahead."""
+        restarted = located.restarted or self._holding or self._search.changed
+        last_reference = self._bumpless.reference_rad
+        if restarted and last_reference is not None and np.abs(reference - last_reference).max() > OTHER_SHAPE_RAD:
+            self._limit_look_ahead_integral()
+        setpoints = self._bumpless.follow(view, reference, restarted=restarted)
+        self._holding = False
+        return Action(setpoints, self._make_report(view, located, look_ahead_n, reference))
+
+    def _undulate(self, view: View, wave: LateralUndulation, lift_rad: Floats) -> Action:
+        """Move by a wave, in search of obstacles to push off."""
+        self._stop_pushing()
+        reference = wave.reference_rad(view, view.period_s) + lift_rad
+        setpoints = self._bumpless.follow(view, reference, restarted=self._search.changed)
         why = "it does not come on: it moves by a wave, in search of contacts"
         return Action(setpoints, Report(why=why, reference_rad=reference.tolist()))
 
-    def _sign(self, time_s: float) -> float:
-        """The same for every run, so that runs can be repeated."""
-        if self._set.push_sign_s == 0.0:
-            return 1.0
-        return float(SIGNS[int(time_s / self._set.push_sign_s) % len(SIGNS)])
+    def _rest(self, view: View) -> Action:
+        """Keep every joint where it is, without a push: the wanted speed is 0."""
+        self._stop_pushing()
+        self._look_ahead_integral_m = 0.0
+        self._moved_at_s = view.time_s
+        self._search.stop()
+        if self._holding or self._bumpless.reference_rad is None:
+            action = self._bumpless.hold(view, "")
+        else:
+            reference = np.array(view.joints.angle_rad)
+            setpoints = self._bumpless.follow(view, reference, restarted=True)
+            action = Action(setpoints, Report(reference_rad=reference.tolist()))
+        self._holding = True
+        return action
 
-    def _report(self, view: View, located: Located, look_ahead_n: float, reference: Floats) -> Report:
-        if abs(located.speed_m_s) > STANDS_M_S:
+    def _stop_pushing(self) -> None:
+        self._torques_nm[:] = 0.0
+        self._push_integral_n = 0.0
+        self._force_n = 0.0
+
+    # --- look-ahead and push -------------------------------------------------------------------------------------
+
+    def _update_look_ahead(self, located: Located, period_s: float) -> float:
+        """Return the look-ahead l = speed_kp e + integral_per_s integral e dt in m; both are bounded."""
+        max_m = self._set.max_look_ahead_m
+        error_m_s = located.trajectory.speed_m_s - located.speed_m_s
+        self._look_ahead_integral_m += self._set.integral_per_s * error_m_s * period_s
+        self._look_ahead_integral_m = min(max(self._look_ahead_integral_m, -max_m), max_m)
+        return min(max(self._look_ahead_integral_m + self._set.speed_kp_s * error_m_s, -max_m), max_m)
+
+    def _limit_look_ahead_integral(self) -> None:
+        self._look_ahead_integral_m = min(self._look_ahead_integral_m, self._set.fresh_look_ahead_m)
+
+    def _update_push_torques(self, view: View, located: Located, theta_prime: Floats) -> Floats:
+        """Return tau_push: the joint torques, (n_joints,), of the force F = lag_kp integral e dt + speed_kp e."""
+        config = self._set
+        wanted_m_s = located.trajectory.speed_m_s
+        if wanted_m_s <= 0.0 or config.max_push_n == 0.0:
+            self._push_integral_n = 0.0
+            self._force_n = 0.0
+            self._snapshot = None
+            return np.zeros(len(self._robot.joints))
+        error_m_s = wanted_m_s - located.speed_m_s
+        gain = 1.0
+        if abs(located.speed_m_s) < CREEP_SPEED_M_S:
+            gain = CREEP_GAIN
+        self._push_integral_n += gain * config.lag_kp_n_per_m * error_m_s * view.period_s
+        self._push_integral_n = min(max(self._push_integral_n, 0.0), config.max_push_n)
+        force_n = self._push_integral_n + config.speed_kp_n_s_per_m * error_m_s
+        force_n = min(max(force_n, 0.0), config.max_push_n)
+        if located.fresh:
+            self._update_contacts(view.time_s, located, theta_prime)
+        # Anti-windup: a body that cannot push does not store force for later.
+        self._push_integral_n = min(self._push_integral_n, self._max_force_n)
+        self._force_n = min(force_n, self._max_force_n)
+        keep = np.exp(-view.period_s / config.torque_filter_s)
+        self._torques_nm = keep * self._torques_nm + (1 - keep) * self._force_n * self._unit_torques_nm
+        return np.clip(self._torques_nm, -config.max_torque_nm, config.max_torque_nm)
+
+    def _update_contacts(self, time_s: float, located: Located, theta_prime: Floats) -> None:
+        """Find the contacts of a new world model, the push that they allow, and its largest force."""
+        config = self._set
+        obstacles = located.world.obstacles
+        nodes_w = self._predict_nodes(located)
+        touches = find_touches(
+            nodes_w,
+            self._body.radius_m,
+            Outlines.of(obstacles),
+            reach_m=config.reach_m,
+            friction=located.trajectory.peg_friction,
+        )
+        names = [obstacles[k].name for k in touches.obstacle.tolist()]
+        push = push_forward(
+            nodes_w,
+            touches,
+            theta_prime[self._bends],
+            contact_gap_scale_m=config.contact_gap_scale_m,
+            extra_cost=self._no_contact_costs(names),
+        )
+        push = self._push_filter.update(time_s, push, names)
+        self._snapshot = PushSnapshot(located.world, touches, push)
+        self._unit_torques_nm = np.zeros(len(self._robot.joints))
+        self._max_force_n = 0.0
+        max_lambda = float(push.lambdas.max(initial=0.0))
+        # Without any lambda there is no push: a body bent into a U has hardly any drag, and needs none.
+        if push.rest < MAX_UNBALANCED and max_lambda > 0.0:
+            self._unit_torques_nm[self._bends] = push.torques_nm
+            max_unit_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
+            self._max_force_n = min(config.max_torque_nm / max_unit_nm, config.max_contact_n / max_lambda)
+
+    def _predict_nodes(self, located: Located) -> Floats:
+        """Return the nodes of the body, (2, n_nodes), when the motors will act: moved on along the path."""
+        acting_s_m = located.tail_s_m + ACTUATION_DELAY_S * located.speed_m_s
+        on_path = located.on_path
+        return located.nodes_w + on_path.at(acting_s_m).nodes_w - on_path.at(located.measured_s_m).nodes_w
+
+    def _no_contact_costs(self, obstacles: list[str]) -> Floats | float:
+        """Return the extra cost of each contact, (k,): no_contact_cost exp(-force / CONTACT_FORCE_SCALE_N).
+
+        Without a sensor of contact forces there is no extra cost.
+        """
+        forces_w = self._contacts.mean_forces_w(obstacles)
+        if not forces_w:
+            return 0.0
+        forces_n = np.hypot(*np.array(forces_w).reshape(-1, 2).T)
+        return self._set.no_contact_cost * np.exp(-forces_n / CONTACT_FORCE_SCALE_N)
+
+    # --- reports -------------------------------------------------------------------------------------------------
+
+    def _make_report(self, view: View, located: Located, look_ahead_n: float, reference: Floats) -> Report:
+        """Report the push, and why the body stands still, if it does; look_ahead_n: force of the look-ahead."""
+        if abs(located.speed_m_s) > STANDSTILL_SPEED_M_S:
             self._moved_at_s = view.time_s
-        stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._last_push, self._force_n
-        points, jammed, standing = [], False, "standing still: backing out along its own path"
-        if found is not None:
-            points = push_points(self._body, found.world, found.touches, found.push, force_n)
-            names = [point.obstacle for point in points if point.obstacle is not None]
-            carried = self._felt.along((located.nodes_w[:, -1] - located.nodes_w[:, 0]).tolist())
-            jammed, standing = why_it_stands(found.touches, found.push, force_n, self._max_force_n, carried, names)
-        why = standing if stands and found is not None else ""
+        stands_still = view.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
+        points = self._report_push_points()
+        jammed, reason = self._explain_standstill(located, points)
         return Report(
-            why=why,
-            why_if_still=standing if view.time_s > STANDS_S else "",
+            why=reason if stands_still else "",
+            why_if_still=reason if view.time_s > STANDSTILL_S else "",
             path_s_m=located.tail_s_m,
-            propulsion_n=look_ahead_n + force_n,
+            propulsion_n=look_ahead_n + self._force_n,
             push_points=points,
             desired_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
             bending_torque_nm=self._torques_nm.tolist(),
             reference_rad=reference.tolist(),
             torque_headroom_nm=self._set.max_torque_nm - float(np.abs(self._torques_nm).max()),
-            saturated=0.0 < self._max_force_n <= force_n,
-            jammed=bool(why) and jammed,
+            saturated=0.0 < self._max_force_n <= self._force_n,
+            jammed=stands_still and jammed,
         )
 
-    def _look_ahead_m(self, located: Located, period_s: float) -> float:
-        max_m = self._set.max_look_ahead_m
-        wanted_m_s = located.trajectory.speed_m_s
-        error_m_s = wanted_m_s - located.speed_m_s
-        self._integral_m += self._set.integral_per_s * error_m_s * period_s
-        self._integral_m = min(max(self._integral_m, -max_m), max_m)
-        return min(max(self._integral_m + self._set.speed_kp_s * error_m_s, -max_m), max_m)
+    def _report_push_points(self) -> list[WorldContact]:
+        found = self._snapshot
+        if found is None:
+            return []
+        return push_points(self._body, found.world, found.touches, found.push, self._force_n)
 
-    def _push_nm(self, view: View, located: Located, turns_per_m: Floats) -> Floats:
-        """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
-        config, wanted_m_s, period_s = self._set, located.trajectory.speed_m_s, view.period_s
-        if wanted_m_s <= 0.0 or config.max_push_n == 0.0:
-            self._push_n = self._force_n = 0.0
-            self._last_push = None
-            return np.zeros(len(self._robot.joints))
-        error = wanted_m_s - located.speed_m_s
-        sooner = SETS_OFF if abs(located.speed_m_s) < CREEPS_M_S else 1.0
-        self._push_n += sooner * config.lag_kp_n_per_m * error * period_s
-        self._push_n = min(max(self._push_n, 0.0), config.max_push_n)
-        force_n = min(max(self._push_n + config.speed_kp_n_s_per_m * error, 0.0), config.max_push_n)
-        self._look(view.time_s, located, turns_per_m)
-        self._push_n = min(self._push_n, self._max_force_n)  # who cannot push stores no force up for later
-        self._force_n = force_n = min(force_n, self._max_force_n)
-        keep = np.exp(-period_s / config.torque_filter_s)
-        self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
-        bound = config.max_torque_nm
-        return np.clip(self._torques_nm, -bound, bound)
-
-    def _look(self, time_s: float, located: Located, turns_per_m: Floats) -> None:
-        """What the body could push off by the newest world model, and how hard."""
-        if not located.fresh:
-            return
-        config = self._set
-        outlines, friction = Outlines.of(located.world.obstacles), located.trajectory.peg_friction
-        at, then_s_m = located.on_path.pose_at, located.tail_s_m + ACTS_AFTER_S * located.speed_m_s
-        nodes_w = located.nodes_w + at(then_s_m).nodes_w - at(located.measured_s_m).nodes_w
-        touches = find_touches(nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction)
-        names = [located.world.obstacles[k].name for k in touches.obstacle.tolist()]
-        felt = self._felt.forces_w(names)
-        measured_w = np.array(felt).reshape(-1, 2)  # none without a sensor
-        dearer = config.no_contact_cost * np.exp(-np.hypot(*measured_w.T) / FELT_N) if felt else 0.0
-        turns_per_m = turns_per_m[self._bends]
-        push = push_forward(
-            nodes_w, touches, turns_per_m, contact_gap_scale_m=config.contact_gap_scale_m, dearer=dearer
-        )
-        push = self._filter.take(time_s, push, names)
-        self._last_push = PushSnapshot(located.world, touches, push)
-        self._unit_nm, self._max_force_n = np.zeros(len(self._robot.joints)), 0.0
-        largest = float(push.lambdas.max(initial=0.0))
-        if push.rest < LARGEST_REST and largest > 0.0:  # a body bent into a U has hardly any drag, and needs no push
-            self._unit_nm[self._bends] = push.torques_nm
-            max_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-            self._max_force_n = min(config.max_torque_nm / max_nm, config.max_contact_n / largest)
-
-    def _rest(self, view: View) -> Action:
-        """At speed 0 every joint stays where it is, and nothing pushes."""
-        self._integral_m = self._push_n = self._force_n = 0.0
-        self._torques_nm[:] = 0.0
-        self._moved_at_s = view.time_s
-        self._search.stop()
-        if self._waits or self._bumpless.reference_rad is None:
-            action = self._bumpless.hold(view, "")
-        else:
-            reference = np.array(view.joints.angle_rad)
-            setpoints = self._bumpless.to(view, reference, restarted=True)
-            action = Action(setpoints, Report(reference_rad=reference.tolist()))
-        self._waits = True
-        return action
+    def _explain_standstill(self, located: Located, points: list[WorldContact]) -> tuple[bool, str]:
+        """Return whether the body is jammed if it should stand still, and why it would stand still."""
+        found = self._snapshot
+        if found is None:
+            return False, "standing still: backing out along its own path"
+        names = [point.obstacle for point in points if point.obstacle is not None]
+        towards_head_w = (located.nodes_w[:, -1] - located.nodes_w[:, 0]).tolist()
+        net_force = self._contacts.resolve_along(towards_head_w)
+        return explain_push_standstill(found.touches, found.push, self._force_n, self._max_force_n, net_force, names)

@@ -49,5 +49,5 @@ class PathFollowing:
         self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
         reference = self._body.all_angles(located.on_path.pose_at(self._ahead_s_m))
         reference = reference + self._climb.angles_rad(located.trajectory.rises, self._ahead_s_m)
-        setpoints = self._bumpless.to(view, reference, restarted=located.restarted)
+        setpoints = self._bumpless.follow(view, reference, restarted=located.restarted)
         return Action(setpoints, Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))

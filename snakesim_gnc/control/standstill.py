@@ -1,6 +1,7 @@
-"""Whether a body stands: told from the way that its middle has come, not from a speed.
+"""Detects that a body stands still, from the displacement of its center.
 
-With 5 mm of noise in a pose, a speed along the path is hardly ever below 1 cm/s for a whole second.
+The speed along the path cannot show it: with 5 mm of noise in a pose, that is hardly ever below 1 cm/s for a whole
+second.
 """
 
 from collections import deque
@@ -9,30 +10,40 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 
-MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
+CENTER_FILTER_S = 0.2  # time constant of the low-pass filter that removes pose noise from the body's center
 
 
 class Standstill:
-    """Watches the middle of a body for some time."""
+    """Watches the displacement of a body's center over a sliding window."""
 
-    def __init__(self, after_s: float) -> None:
-        """after_s: in which it has to stand; 0: it is never seen to."""
-        self._after_s = after_s
-        self.forget()
+    def __init__(self, window_s: float) -> None:
+        """Start with an empty window; window_s: its length, 0 never detects a standstill."""
+        self._window_s = window_s
+        self._centers = deque[tuple[float, Floats]]()  # time in s, filtered center (2,)
 
-    def forget(self) -> None:
-        """Begin anew."""
-        self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was, less noise
+    def reset(self) -> None:
+        """Start a new window."""
+        self._centers = deque[tuple[float, Floats]]()
 
-    def seen(self, time_s: float, period_s: float, middle_w: Floats, within_m: float) -> bool:
-        """Whether the middle, (2,), has moved less than this for as long. To be asked at every tick."""
-        if self._after_s == 0.0:
+    def update(self, time_s: float, period_s: float, center_w: Floats, max_distance_m: float) -> bool:
+        """Add the center of this tick, and return whether the body stands still; call it in every tick.
+
+        Args:
+            time_s: time of the tick.
+            period_s: time since the last tick.
+            center_w: (2,) m, center of the body.
+            max_distance_m: a body whose center moved less than this within the whole window stands still.
+        """
+        if self._window_s == 0.0:
             return False
-        way = self._way
-        before_w = way[-1][1] if way else middle_w
-        now_w = before_w + min(period_s / MIDDLE_S, 1.0) * (middle_w - before_w)
-        way.append((time_s, now_w))
-        while len(way) > 1 and time_s - way[1][0] >= self._after_s:
-            way.popleft()
-        then_s, then_w = way[0]
-        return time_s - then_s >= self._after_s and float(np.hypot(*(now_w - then_w))) < within_m
+        centers = self._centers
+        last_w = center_w
+        if centers:
+            _, last_w = centers[-1]
+        filtered_w = last_w + min(period_s / CENTER_FILTER_S, 1.0) * (center_w - last_w)
+        centers.append((time_s, filtered_w))
+        while len(centers) > 1 and time_s - centers[1][0] >= self._window_s:
+            centers.popleft()
+        first_s, first_w = centers[0]
+        window_is_full = time_s - first_s >= self._window_s
+        return window_is_full and float(np.hypot(*(filtered_w - first_w))) < max_distance_m

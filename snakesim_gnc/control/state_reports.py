@@ -3,7 +3,7 @@
 import msgspec
 
 from snakesim_gnc.control.advance import Advance
-from snakesim_gnc.control.carried import FeltContacts
+from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.controller import Report
 from snakesim_gnc.control.states import locomotion_state
 from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
@@ -21,14 +21,14 @@ class StateReports:
         self._controller = controller[-64:]
         self._joints = [joint.name for joint in robot.joints]
         self._advance = Advance()
-        self._felt = FeltContacts()
+        self._felt = MeasuredContacts()
         self._decoder = msgspec.msgpack.Decoder(ControlState)
         self._last: tuple[object, ...] = ()
         self._next_ns = 0
 
     def follow(self, world: World) -> None:
         """Take where the body is, and what it feels, from a world model that is fresh."""
-        self._felt.take(world)
+        self._felt.add_world(world)
         if world.center_w is not None:
             self._advance.put(world.timestamp_ns * 1e-9, world.center_w)
 
@@ -92,7 +92,7 @@ class StateReports:
             propulsion_n=report.propulsion_n,
             push_points=report.push_points,  # pyright: ignore[reportArgumentType] - any sequence can be sent
             desired_force_n=report.desired_force_n,  # pyright: ignore[reportArgumentType]
-            measured_force_n=self._felt.at([point.obstacle for point in report.push_points]),
+            measured_force_n=self._felt.mean_sizes_n([point.obstacle for point in report.push_points]),
             propulsion_torque_nm=report.propulsion_torque_nm,
             bending_torque_nm=report.bending_torque_nm,  # pyright: ignore[reportArgumentType]
             reference_rad=report.reference_rad,  # pyright: ignore[reportArgumentType]

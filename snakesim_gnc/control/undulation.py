@@ -1,9 +1,9 @@
-"""Baselines that use no map: waves that travel along the body, whatever stands around it.
+"""Baselines that use no map: waves that travel along the body, whatever obstacles are around it.
 
-Lateral undulation is the serpenoid curve: every joint swings by `amplitude_rad`, a phase `lag_rad` behind the one ahead
-of it. Head-steered undulation adds a bend to all joints in proportion to the direction of the path, seen from the head.
-Compliant undulation lets obstacles change the amplitude of the wave: body-shape compliance (Travers et al. 2018). It
-may resolve jams: where the body stands, the wave travels the other way for a while.
+Lateral undulation is the serpenoid curve: every joint swings by `amplitude_rad`, with a phase `lag_rad` behind that of
+the joint ahead of it. Head-steered undulation adds a bend to all joints, in proportion to the direction of the path as
+seen from the head. Compliant undulation lets obstacles change the amplitude of the wave. It can resolve jams: when the
+body stands still, the wave travels the other way for a while.
 """
 
 import math
@@ -20,8 +20,9 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, above, bounded, from_zero
 
-AIM_M = 1.0  # how far ahead on the path the head steers for
-JAMMED_M = 0.02
+AIM_DISTANCE_M = 1.0  # how far ahead on the path the head steers for
+JAMMED_M = 0.02  # a body that moves less than this within `jam_after_s` is jammed
+
 Steering = Annotated[
     float,
     from_zero(2, "1"),
@@ -30,16 +31,27 @@ Steering = Annotated[
 
 
 def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float:
-    """Direction of `aim_w`, (2,), from that of a body, (n, 2) tail to head; whole turns are left in."""
-    along = nodes_w[-1] - nodes_w[0]
-    return math.atan2(aim_w[1], aim_w[0]) - math.atan2(along[1], along[0])
+    """Return the angle from the direction of a body to a direction, left positive, in rad.
+
+    Args:
+        nodes_w: (n, 2) m, nodes of the body, tail to head.
+        aim_w: (2,) the direction, of any length.
+
+    Returns:
+        The angle, between -2 pi and 2 pi.
+    """
+    along_w = nodes_w[-1] - nodes_w[0]
+    return math.atan2(aim_w[1], aim_w[0]) - math.atan2(along_w[1], along_w[0])
 
 
 class LateralUndulation:
-    """A wave of the yaw joints from head to tail."""
+    """A wave of the yaw joints: theta_n = A sin(phi - n lag) + bend, with n = 0 at the head.
+
+    The phase phi grows by 2 pi in each period.
+    """
 
     class Settings(FileStruct, frozen=True, kw_only=True):
-        """The wave, and how much it is bent towards the goal."""
+        """Parameters of the wave, and how much it bends towards the path."""
 
         amplitude_rad: Annotated[float, from_zero(2, "rad"), about("swing of every joint to each side")] = 0.5
         period_s: Annotated[float, above(100, "s"), about("of the wave")] = 2.0
@@ -52,66 +64,85 @@ class LateralUndulation:
         blend_s: Blend = 1.0
 
     def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
+        self._robot = robot
+        self._set = settings
+        self._body = PlanarBody(robot)
         self._bumpless = BumplessReference(robot, settings.blend_s)
         self._phase_rad = 0.0
 
     def update(self, view: View) -> Action:
-        """The wave goes on while there is a path to go along."""
-        reference = self.reference_rad(view, view.period_s if motion_wanted(view) else 0.0)
-        return Action(self._bumpless.to(view, reference), Report(reference_rad=reference.tolist()))
+        """Advance the wave while there is a path to move along, and keep its phase otherwise."""
+        passed_s = 0.0
+        if motion_wanted(view):
+            passed_s = view.period_s
+        reference = self.reference_rad(view, passed_s)
+        setpoints = self._bumpless.follow(view, reference)
+        return Action(setpoints, Report(reference_rad=reference.tolist()))
 
     def start_from(self, angles_rad: NDArray[np.float64]) -> None:
-        """Choose the phase at which the wave is most like a shape, (n_joints,)."""
-        lags = self._set.lag_rad * np.arange(len(self._body.bends))[::-1]
-        self._phase_rad = float(np.angle(1j * (angles_rad[self._body.bends] @ np.exp(1j * lags))))
+        """Choose the phase at which the wave is most similar to a shape, (n_joints,) rad."""
+        lags_rad = self._set.lag_rad * np.arange(len(self._body.bends))[::-1]
+        correlation = angles_rad[self._body.bends] @ np.exp(1j * lags_rad)
+        self._phase_rad = float(np.angle(1j * correlation))
 
     def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
-        """Angles of all joints, a time later than before."""
+        """Return the angles of all joints, (n_joints,), `passed_s` later than in the last call."""
         self._phase_rad += math.tau * passed_s / self._set.period_s
-        turns = np.arange(len(self._body.bends))[::-1]  # 0 at the head
+        n = np.arange(len(self._body.bends))[::-1]  # 0 at the head
+        waves = np.sin(self._phase_rad - self._set.lag_rad * n)
         reference = np.zeros(len(self._robot.joints))
-        waves = np.sin(self._phase_rad - self._set.lag_rad * turns)
         reference[self._body.bends] = self._amplitude_rad(view, waves, passed_s) * waves + self._bend_rad(view)
         return reference
 
     def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> float | NDArray[np.float64]:
+        """Return the amplitude of all joints, or of each joint that bends, (n_bends,)."""
         return self._set.amplitude_rad
 
     def _bend_rad(self, view: View) -> float | NDArray[np.float64]:
-        """Bend of every joint that turns the body towards the path ahead.
+        """Return the bend of every joint that turns the body towards the path ahead.
 
-        A body that moves by a wave to the head turns against its bend.
+        A body that moves by a wave towards the head turns against its bend, so the bend has the sign of the lag.
         """
         if self._set.steering == 0.0 or view.world is None or view.trajectory is None:
             return 0.0
-        nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
-        path = np.array(view.trajectory.path_w)
-        ahead = path[np.argmin(np.hypot(*(path - nodes[-1]).T)) :]
-        aim = ahead[min(np.searchsorted(np.hypot(*(ahead - nodes[-1]).T), AIM_M), len(ahead) - 1)] - nodes[-1]
-        off = math.remainder(aside_rad(nodes, aim), math.tau)
-        return math.copysign(self._set.steering, self._set.lag_rad) * off / len(self._body.bends)
+        nodes_w = self._body.nodes_w(view.world, view.joints.angle_rad).T
+        head_w = nodes_w[-1]
+        aim_w = _find_aim(np.array(view.trajectory.path_w), head_w)
+        angle_rad = math.remainder(aside_rad(nodes_w, aim_w - head_w), math.tau)
+        return math.copysign(self._set.steering, self._set.lag_rad) * angle_rad / len(self._body.bends)
+
+
+def _find_aim(path_w: NDArray[np.float64], head_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the point of a path, (n, 2), that is AIM_DISTANCE_M ahead of the head, or its last point."""
+    nearest = np.argmin(np.hypot(*(path_w - head_w).T))
+    ahead_w = path_w[nearest:]
+    distances_m = np.hypot(*(ahead_w - head_w).T)
+    aim = np.searchsorted(distances_m, AIM_DISTANCE_M)
+    return ahead_w[min(aim, len(ahead_w) - 1)]
 
 
 class HeadSteeredUndulation(LateralUndulation):
-    """A wave that is bent towards where the path leads."""
+    """A wave that bends the body towards the path ahead."""
 
     class Settings(LateralUndulation.Settings, frozen=True, kw_only=True):
-        """As of lateral undulation, with steering."""
+        """Parameters of lateral undulation, with steering."""
 
         steering: Steering = 0.8
 
 
 class CompliantUndulation(HeadSteeredUndulation):
-    """A wave whose amplitude A yields to the torques on it: A follows A0 + softness sum(w_i tau_i), tau_i from outside.
+    """A wave whose amplitude A yields to the torques that obstacles put on the joints.
 
-    w_i = dtheta_i/dA is the wave itself, so the sum is the generalized force on A.
+    A follows A0 + softness sum_i w_i tau_i with the time constant `yield_s`. tau_i is the torque from outside on joint
+    i. The wave w_i = dtheta_i/dA, so the sum is the generalized force on A.
+
+    Source: body-shape compliance, Travers et al. 2018.
     """
 
     MEASURES = ("torque",)
 
     class Settings(HeadSteeredUndulation.Settings, frozen=True, kw_only=True):
-        """As of head-steered undulation, with a softness."""
+        """Parameters of head-steered undulation, with a softness."""
 
         softness_rad_per_nm: Annotated[
             float,
@@ -128,28 +159,40 @@ class CompliantUndulation(HeadSteeredUndulation):
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         super().__init__(robot, settings)
-        self._now_rad = settings.amplitude_rad
-        self._back_s = settings.back_s
-        self._jam = Standstill(settings.jam_after_s) if settings.jam_after_s > 0.0 else None
-        self._back_until_s = -math.inf
+        self._yielded_amplitude_rad = settings.amplitude_rad
+        # Resolving jams; None: never.
+        self._standstill: Standstill | None = None
+        if settings.jam_after_s > 0.0:
+            self._standstill = Standstill(settings.jam_after_s)
+        self._reverse_s = settings.back_s
+        self._reverse_until_s = -math.inf
 
     def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
-        """Angles of all joints, a time later than before, or earlier while a jam is resolved."""
-        if self._jam is not None and view.world is not None and passed_s > 0.0:
-            if view.time_s < self._back_until_s:
-                passed_s = -passed_s
-            else:
-                middle_w = self._body.nodes_w(view.world, view.joints.angle_rad).mean(axis=1)
-                if self._jam.seen(view.time_s, passed_s, middle_w, JAMMED_M):
-                    self._back_until_s = view.time_s + self._back_s
-                    self._jam.forget()
+        """Return the angles of all joints, (n_joints,), later than in the last call, or earlier during a jam."""
+        if passed_s > 0.0 and self._is_reversing(view, passed_s):
+            passed_s = -passed_s
         return super().reference_rad(view, passed_s)
 
+    def _is_reversing(self, view: View, passed_s: float) -> bool:
+        """Whether the wave travels the other way at this tick; a jam that is detected starts it at the next tick."""
+        if self._standstill is None or view.world is None:
+            return False
+        if view.time_s < self._reverse_until_s:
+            return True
+        center_w = self._body.nodes_w(view.world, view.joints.angle_rad).mean(axis=1)
+        if self._standstill.update(view.time_s, passed_s, center_w, JAMMED_M):
+            self._reverse_until_s = view.time_s + self._reverse_s
+            self._standstill.reset()
+        return False
+
     def _amplitude_rad(self, view: View, waves: NDArray[np.float64], passed_s: float) -> float:
+        """Return the amplitude A: a first-order lag of A0 + softness sum_i w_i tau_i, bounded to 0 to 2 A0."""
         config = self._set
         assert isinstance(config, CompliantUndulation.Settings)
-        from_outside_nm = -float(waves @ np.array(view.joints.torque_nm)[self._body.bends])
-        wanted = config.amplitude_rad + config.softness_rad_per_nm * from_outside_nm
-        bounded = min(max(wanted, 0.0), 2.0 * config.amplitude_rad)
-        self._now_rad += (1.0 - math.exp(-abs(passed_s) / config.yield_s)) * (bounded - self._now_rad)
-        return self._now_rad
+        # Drives measure their own torque; the torque from outside is opposite to it.
+        generalized_force_nm = -float(waves @ np.array(view.joints.torque_nm)[self._body.bends])
+        wanted_rad = config.amplitude_rad + config.softness_rad_per_nm * generalized_force_nm
+        bounded_rad = min(max(wanted_rad, 0.0), 2.0 * config.amplitude_rad)
+        gain = 1.0 - math.exp(-abs(passed_s) / config.yield_s)
+        self._yielded_amplitude_rad += gain * (bounded_rad - self._yielded_amplitude_rad)
+        return self._yielded_amplitude_rad

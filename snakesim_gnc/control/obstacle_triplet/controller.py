@@ -1,8 +1,8 @@
 """The obstacle-triplet controller: one joint pushes with a torque, all others keep the body on its path.
 
-For each new world model it finds the push-points of the body, solves every triplet on alternating sides
-among them, and chooses one; its propulsion joint is the first joint ahead of o_2. As the body moves forward, o_2 passes
-joint after joint towards the tail, and with it the propulsion joint, until the triplet's last obstacle is lost.
+For each new world model the controller finds the push-points of the body, solves every triplet on alternating sides
+among them, and chooses one. Its propulsion joint is the first joint ahead of o_2. As the body moves forward, o_2 passes
+joint after joint towards the tail, and so does the propulsion, until the triplet's last obstacle is lost.
 
 The propulsion force is `propulsion_n (1 - speed / mission speed)`, never below zero. A force below the drag moves
 nothing: positions follow the path at the measured arc length, without a look-ahead that would push by itself. They
@@ -24,8 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_gnc.control.bumpless import HandOver
-from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.climb import Climb
+from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
@@ -39,23 +39,28 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
-PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstacle that is near the body
+PLAN_WINDOW_M = 1.0  # the path may pass an obstacle that is near the body so far beyond the body's ends
+MIN_TORQUE_PER_N = 1e-12  # N·m/N; avoids a division by zero
+MAX_REASON = 400  # characters
 
 
 @dataclass(frozen=True)
-class Push:
-    """Demand of the propulsion joint, and its reasons."""
+class PropulsionDemand:
+    """The torque of the propulsion joint in one tick, and the forces that it comes from."""
 
-    turn: int  # index of the joint
+    joint: int  # index among all joints
     wanted_n: float  # propulsion force from the speed alone
-    force_n: float  # after fading, and within the joint's torque
+    force_n: float  # after fading, and within the joint's torque limit
     torque_nm: float
     saturated: bool  # the torque limit has reduced the force
     swung: bool  # the joint is so far from its reference that the force is reduced
 
 
 class ObstacleTriplet:
-    """Obstacle-aided locomotion after the paper's section IV."""
+    """Obstacle-aided locomotion with three contacts and one propulsion joint.
+
+    Source: section IV of the SnakeSIM paper, with the correction that `statics` describes.
+    """
 
     MODES = (Mode.POSITION, Mode.TORQUE)
     MEASURES = ("torque",)
@@ -64,125 +69,178 @@ class ObstacleTriplet:
     def __init__(self, robot: Description, settings: TripletSettings) -> None:
         self._robot = robot
         self._set = settings
-        self._body, self._climb = PlanarBody(robot), Climb(robot)
+        # Models and estimators.
+        self._body = PlanarBody(robot)
+        self._climb = Climb(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._contacts = MeasuredContacts()
+        # Joints in position mode.
         self._hand_over = HandOver(robot)
+        self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
+        self._body_pose: BodyPose | None = None  # the pose on the path that these joints follow
+        self._reference = np.empty(0)  # (n_joints,) rad, angles of that pose; empty before the first tick
+        self._load_nm = np.zeros(len(robot.joints))  # filtered load that their targets compensate
+        # Push-points and triplets.
+        self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}  # by the obstacle's name
+        self._points: list[PushPoint] = []
         self._triplets = Triplets(
             condition_max=settings.condition_max,
             authority_min=settings.authority_min,
             hold_on_m=settings.hold_on_m,
         )
-        self._felt = FeltContacts()
+        self._choice: Choice | None = None
+        self._refused: list[str] = []  # why triplets cannot be used
+        # Propulsion of the tick before.
+        self._asked_n = 0.0  # before the joint's torque limit
+        self._force_n = 0.0
+        # Supervision.
         self._stall_watch = StallWatch(
             stall_m=settings.stall_m, stall_s=settings.stall_s, propulsion_n=settings.propulsion_n
         )
-        self._body_pose: BodyPose | None = None  # of the body that the joints in position mode follow
-        self._reference = np.empty(0)  # the same as angles of all joints
-        self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}
-        self._points: list[PushPoint] = []
-        self._asked_n = self._force_n = 0.0  # propulsion force of the tick before, wanted and as limited
-        self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._held_nm = np.zeros(len(robot.joints))  # of the planned forces, by the joints in position mode
-        self._choice: Choice | None = None
-        self._refused: list[str] = []
-        self._banned: dict[Names, float] = {}  # -> arc length at which it stood still
+        self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
+        self._banned: dict[Names, float] = {}  # triplet -> arc length at which it stood still
         self._barred: tuple[int, float] | None = None  # joint among those that bend, time until which
         self._position_until_s = 0.0
-        self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
 
     def update(self, view: View) -> Action:
-        """RequestedSetpoints for the next period."""
+        """Return the setpoints for the next period."""
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
-        self._felt.take(located.world)
-        body_pose, before = self._follow(view, located), self._choice
+        self._contacts.add_world(located.world)
+        body_pose = self._follow_path(view, located)
+        last_choice = self._choice
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_watch.forget()
         if located.fresh or located.restarted:
-            self._look(located, body_pose)
-            self._choose(view, located, body_pose)
-        self._guard(view, body_pose)
-        choice, set_ = self._choice, self._set
-        turn = None if choice is None else self._body.bends[choice.joint]
-        anew = choice is not None and before is not None and choice.triplet.names != before.triplet.names
-        reference = self._reference + self._held_rad(view, body_pose)
-        self._hand_over.pass_to(turn, view.joints, reference, anew=anew)
-        self._hand_over.fade(view.period_s / set_.blend_s + abs(located.speed_m_s) * view.period_s / set_.blend_m)
-        targets: list[float] = self._hand_over.positions_rad(reference).tolist()
-        mode = [Mode.POSITION] * len(targets)
-        limits_nm = self._body.torque_limit_nm
-        if choice is None or turn is None:
-            self._asked_n = self._force_n = 0.0
-            return Action(RequestedSetpoints(mode, targets, limits_nm), self._report_rest(located))
-        push = self._push(view, located, choice, turn)
-        self._force_n = push.force_n
-        mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
-        self._watch_progress(view, located, choice, push)
-        return Action(RequestedSetpoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
+            self._update_push_points(located, body_pose)
+            self._update_choice(view, located, body_pose)
+        self._release_swung_joint(view, body_pose)
+        reference = self._reference + self._compensate_load(view, body_pose)
+        self._hand_over_propulsion(view, located, reference, last_choice)
+        return self._command(view, located, body_pose, reference)
 
-    def _follow(self, view: View, located: Located) -> BodyPose:
-        """Reference of the joints in position mode; starts, and continues from another place, without a jump."""
-        set_, s, before = self._set, located.tail_s_m, self._body_pose
-        if before is None or located.restarted:
-            body_pose = located.on_path.pose_at(s)
+    def _hand_over_propulsion(
+        self, view: View, located: Located, reference: Floats, last_choice: Choice | None
+    ) -> None:
+        """Pass the propulsion to the joint of the present choice, and fade by time and by travel."""
+        config = self._set
+        choice = self._choice
+        joint = None
+        is_other_triplet = False
+        if choice is not None:
+            joint = self._body.bends[choice.joint]
+            is_other_triplet = last_choice is not None and choice.triplet.names != last_choice.triplet.names
+        self._hand_over.pass_to(joint, view.joints, reference, anew=is_other_triplet)
+        self._hand_over.fade(view.period_s / config.blend_s + abs(located.speed_m_s) * view.period_s / config.blend_m)
+
+    def _command(self, view: View, located: Located, body_pose: BodyPose, reference: Floats) -> Action:
+        """Command all joints to the reference, and the propulsion joint, if there is one, to its torque."""
+        targets: list[float] = self._hand_over.positions_rad(reference).tolist()
+        modes = [Mode.POSITION] * len(targets)
+        setpoints = RequestedSetpoints(modes, targets, self._body.torque_limit_nm)
+        choice = self._choice
+        if choice is None:
+            self._asked_n = 0.0
+            self._force_n = 0.0
+            return Action(setpoints, self._report_rest(located))
+        demand = self._compute_propulsion(view, located, choice)
+        self._force_n = demand.force_n
+        modes[demand.joint] = Mode.TORQUE
+        targets[demand.joint] = demand.torque_nm
+        self._watch_stall(view, located, choice, demand)
+        return Action(setpoints, self._report_push(located, body_pose, choice, demand))
+
+    # --- control law ---------------------------------------------------------------------------------------------
+
+    def _follow_path(self, view: View, located: Located) -> BodyPose:
+        """Update the pose on the path that the joints in position mode follow, without a jump of their targets.
+
+        Its arc length follows the measured one with slack, no faster than `overspeed_ratio` times the mission's speed,
+        and at most `brake_m` behind.
+        """
+        config = self._set
+        s = located.tail_s_m
+        last_pose = self._body_pose
+        if last_pose is None or located.restarted:
+            body_pose = located.on_path.at(s)
         else:
-            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_ratio * view.period_s
-            followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + max_advance_m)
-            body_pose = located.on_path.pose_at(max(followed, s - set_.brake_m))
-        lifted = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
-        reference = self._body.all_angles(body_pose) + lifted
+            last_s = last_pose.tail_s_m
+            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * config.overspeed_ratio * view.period_s
+            followed_s = min(max(last_s, s - config.slack_m), s + config.slack_m, last_s + max_advance_m)
+            body_pose = located.on_path.at(max(followed_s, s - config.brake_m))
+        lift_rad = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
+        reference = self._body.all_angles(body_pose) + lift_rad
         if not len(self._reference):
             self._hand_over.start(view.joints, reference)
         elif located.restarted:
             self._hand_over.shift(reference - self._reference)
-        self._body_pose, self._reference = body_pose, reference
+        self._body_pose = body_pose
+        self._reference = reference
         return body_pose
 
-    def _held_rad(self, view: View, body_pose: BodyPose) -> Floats:
-        """How far targets are beyond the path's angles, so that its joints hold the planned forces on the path."""
-        share, choice = self._set.load_ratio, self._choice
-        if share == 0.0:
-            return np.zeros(len(self._held_nm))
-        wanted = np.zeros(len(self._held_nm))
-        if choice is not None and self._force_n > 0.0:
-            wanted = share * bending_nm(self._body, body_pose, choice, self._force_n)
+    def _compensate_load(self, view: View, body_pose: BodyPose) -> Floats:
+        """Return how far targets lead the path's angles, (n_joints,) rad: filtered load / stiffness.
+
+        The load of a joint is `load_ratio` times its torque for the planned contact forces. A servo gives way under a
+        load; with this lead, its joint stays on the path.
+        """
+        load_ratio = self._set.load_ratio
+        if load_ratio == 0.0:
+            return np.zeros(len(self._load_nm))
+        load_nm = np.zeros(len(self._load_nm))
+        if self._choice is not None and self._force_n > 0.0:
+            load_nm = load_ratio * bending_nm(self._body, body_pose, self._choice, self._force_n)
         keep = np.exp(-view.period_s / self._set.load_filter_s)
-        self._held_nm = keep * self._held_nm + (1.0 - keep) * wanted
-        return self._held_nm / self._stiffness
+        self._load_nm = keep * self._load_nm + (1.0 - keep) * load_nm
+        return self._load_nm / self._stiffness
 
-    def _push(self, view: View, located: Located, choice: Choice, turn: int) -> Push:
-        """The propulsion: reduced with the speed of the body, and with the swing of the joint."""
-        set_, limit_nm = self._set, self._body.torque_limit_nm[turn]
+    def _compute_propulsion(self, view: View, located: Located, choice: Choice) -> PropulsionDemand:
+        """Compute the torque of the propulsion joint.
+
+            f   = propulsion_n (1 - v / v_mission) * fade,   between 0 and propulsion_n, with a limited rate
+            tau = f * torque_per_n - damping q',             within the joint's torque limit
+
+        fade is 1 while the joint has swung out by less than `angle_fade_rad`, and falls to 0 at twice as much.
+        """
+        config = self._set
+        joint = self._body.bends[choice.joint]
+        limit_nm = self._body.torque_limit_nm[joint]
+        torque_per_n = choice.torque_per_n
+
         slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
-        off_rad = view.joints.angle_rad[turn] - float(self._reference[turn])
-        swung_rad = off_rad if choice.torque_per_n > 0 else -off_rad
-        near = 2.0 - swung_rad / set_.angle_fade_rad
-        wanted_n = set_.propulsion_n * min(max(slow, 0.0), 1.0)
-        asked_n = wanted_n * min(max(near, 0.0), 1.0)
-        step_n = set_.propulsion_rate_n_s * view.period_s
-        asked_n = self._asked_n = min(max(asked_n, self._asked_n - step_n), self._asked_n + step_n)
-        force_n = min(asked_n, limit_nm / max(abs(choice.torque_per_n), 1e-12))
-        torque_nm = force_n * choice.torque_per_n - set_.damping_nm_s_per_rad * view.joints.velocity_rad_s[turn]
+        wanted_n = config.propulsion_n * min(max(slow, 0.0), 1.0)
+
+        swing_rad = view.joints.angle_rad[joint] - float(self._reference[joint])
+        if torque_per_n <= 0:
+            swing_rad = -swing_rad  # positive: in the direction of the torque
+        fade = 2.0 - swing_rad / config.angle_fade_rad
+        asked_n = wanted_n * min(max(fade, 0.0), 1.0)
+        max_change_n = config.propulsion_rate_n_s * view.period_s
+        asked_n = min(max(asked_n, self._asked_n - max_change_n), self._asked_n + max_change_n)
+        self._asked_n = asked_n
+
+        force_n = min(asked_n, limit_nm / max(abs(torque_per_n), MIN_TORQUE_PER_N))
+        torque_nm = force_n * torque_per_n - config.damping_nm_s_per_rad * view.joints.velocity_rad_s[joint]
         torque_nm = min(max(self._hand_over.torque_nm(torque_nm), -limit_nm), limit_nm)
-        return Push(turn, wanted_n, force_n, torque_nm, saturated=force_n < asked_n, swung=near < 1.0)
+        return PropulsionDemand(
+            joint=joint,
+            wanted_n=wanted_n,
+            force_n=force_n,
+            torque_nm=torque_nm,
+            saturated=force_n < asked_n,
+            swung=fade < 1.0,
+        )
 
-    # --- push-points -----------------------------------------------------------------------------------------
+    # --- push-points and triplets --------------------------------------------------------------------------------
 
-    def _look(self, located: Located, body_pose: BodyPose) -> None:
+    def _update_push_points(self, located: Located, body_pose: BodyPose) -> None:
         """Plan the contacts with the obstacles near the body, and find those that the body is at."""
-        world = located.world
         if located.restarted:
             self._planned.clear()
-        near = {obstacle.name: obstacle for obstacle in world.obstacles}
-        for name in [name for name in self._planned if name not in near]:
-            del self._planned[name]
-        for name, obstacle in near.items():
-            known = self._planned.get(name)
-            if known is None or known[0] != obstacle:
-                self._planned[name] = (obstacle, self._plan(located, obstacle))
-        kept = [contact.obstacle for contact in world.contacts if contact.obstacle is not None]
+        self._update_planned(located)
+        kept = [contact.obstacle for contact in located.world.contacts if contact.obstacle is not None]
         if self._choice is not None:
             kept += self._choice.triplet.names
         self._points = push_points(
@@ -196,118 +254,158 @@ class ObstacleTriplet:
             end_m=self._set.end_m,
         )
 
-    def _plan(self, located: Located, obstacle: Obstacle) -> PlannedContact:
-        half_m = self._body.length_m / 2
-        near_s_m, window_m = located.tail_s_m + half_m, half_m + PLAN_WINDOW_M
-        return plan_contact(located.on_path.route, obstacle, self._body.radius_m, near_s_m=near_s_m, window_m=window_m)
+    def _update_planned(self, located: Located) -> None:
+        """Plan contacts with obstacles that are new or have changed, and drop those of obstacles that are gone."""
+        obstacles = {obstacle.name: obstacle for obstacle in located.world.obstacles}
+        for name in list(self._planned):
+            if name not in obstacles:
+                del self._planned[name]
+        for name, obstacle in obstacles.items():
+            known = self._planned.get(name)
+            if known is None or known[0] != obstacle:
+                self._planned[name] = (obstacle, self._plan_contact(located, obstacle))
 
-    def _choose(self, view: View, located: Located, body_pose: BodyPose) -> None:
-        """Choose a triplet, or none."""
-        s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_fraction
-        self._banned = {names: at for names, at in self._banned.items() if abs(s - at) < blend_m}
-        if self._stall is not None and abs(s - self._stall[1]) > blend_m:
-            self._stall = None
-        if self._barred is not None and view.time_s >= self._barred[1]:
-            self._barred = None
-        barred = None if self._barred is None else self._barred[0]
+    def _plan_contact(self, located: Located, obstacle: Obstacle) -> PlannedContact:
+        half_length_m = self._body.length_m / 2
+        return plan_contact(
+            located.on_path.route,
+            obstacle,
+            self._body.radius_m,
+            near_s_m=located.tail_s_m + half_length_m,
+            window_m=half_length_m + PLAN_WINDOW_M,
+        )
+
+    def _update_choice(self, view: View, located: Located, body_pose: BodyPose) -> None:
+        """Choose a triplet for the present push-points, or none."""
+        self._expire_restrictions(view.time_s, located.tail_s_m)
+        barred_joint = None
+        if self._barred is not None:
+            barred_joint, _ = self._barred
         choices, self._refused = self._triplets.choices(
-            self._points, body_pose.nodes_w, self._body.node_s_m, self._choice, barred
+            self._points, body_pose.nodes_w, self._body.node_s_m, self._choice, barred_joint
         )
         if located.trajectory.speed_m_s <= 0 or view.time_s < self._position_until_s:
             self._choice = None
             return
-        present = None if self._choice is None else self._choice.triplet
-        self._choice = choose(choices, present, switch_fraction=share, banned=self._banned) or choose(
-            choices, present, switch_fraction=share
-        )
+        present = None
+        if self._choice is not None:
+            present = self._choice.triplet
+        switch_fraction = self._set.switch_fraction
+        choice = choose(choices, present, switch_fraction=switch_fraction, banned=self._banned)
+        if choice is None:  # a banned triplet is better than none
+            choice = choose(choices, present, switch_fraction=switch_fraction)
+        self._choice = choice
 
-    # --- supervision -----------------------------------------------------------------------------------------
+    def _expire_restrictions(self, time_s: float, tail_s_m: float) -> None:
+        """Forget stalls and bans that lie `blend_m` of travel back, and a barred joint whose time is over."""
+        blend_m = self._set.blend_m
+        self._banned = {names: s_m for names, s_m in self._banned.items() if abs(tail_s_m - s_m) < blend_m}
+        if self._stall is not None and abs(tail_s_m - self._stall[1]) > blend_m:
+            self._stall = None
+        if self._barred is not None and time_s >= self._barred[1]:
+            self._barred = None
 
-    def _guard(self, view: View, body_pose: BodyPose) -> None:
-        """End the turn of a propulsion joint that has left its reference too far."""
+    # --- supervision ---------------------------------------------------------------------------------------------
+
+    def _release_swung_joint(self, view: View, body_pose: BodyPose) -> None:
+        """Return a propulsion joint to position mode if it has left its reference too far."""
         if self._choice is None:
             return
-        joint, guard_s = self._choice.joint, self._set.guard_s
-        turn = self._body.bends[joint]
-        off_rad = view.joints.angle_rad[turn] - float(body_pose.angles_rad[joint])
-        if abs(off_rad) > self._set.angle_guard_rad:
+        joint = self._choice.joint
+        guard_s = self._set.guard_s
+        robot_joint = self._body.bends[joint]
+        swing_rad = view.joints.angle_rad[robot_joint] - float(body_pose.angles_rad[joint])
+        if abs(swing_rad) > self._set.angle_guard_rad:
             self._barred = (joint, view.time_s + guard_s)
-            name = self._body.names[turn]
-            self._refused = [f"{name} left its reference by {off_rad:+.2f} rad; in position mode for {guard_s} s"]
+            name = self._body.names[robot_joint]
+            self._refused = [f"{name} left its reference by {swing_rad:+.2f} rad; in position mode for {guard_s} s"]
             self._choice = None
 
-    def _watch_progress(self, view: View, located: Located, choice: Choice, push: Push) -> None:
-        """Detect standing still; let go of a triplet that strains and does not move."""
-        if not self._stall_watch.stands(view.time_s, located.tail_s_m, push.wanted_n):
+    def _watch_stall(self, view: View, located: Located, choice: Choice, demand: PropulsionDemand) -> None:
+        """Detect a standstill while pushing, and release a triplet that is strained but does not move the body."""
+        if not self._stall_watch.stands(view.time_s, located.tail_s_m, demand.wanted_n):
             return
         self._stall_watch.forget()
-        name = self._body.names[push.turn]
+        joint_name = self._body.names[demand.joint]
         stall = explain(
-            wanted_n=push.wanted_n,
-            force_n=push.force_n,
-            carried=self._felt.along(choice.triplet.contacts[0].tangent_w),
+            wanted_n=demand.wanted_n,
+            force_n=demand.force_n,
+            net_force=self._contacts.resolve_along(choice.triplet.contacts[0].tangent_w),
             push_points=choice.triplet.names,
             weight_n=self._body.weight_n,
-            saturated=name if push.saturated else None,
-            swung=name if push.swung else None,
+            saturated=joint_name if demand.saturated else None,
+            swung=joint_name if demand.swung else None,
             jam_force_n=self._set.jam_force_n,
             drag_ratio=self._set.drag_ratio,
         )
         self._stall = (stall, located.tail_s_m)
-        if stall.lets_go:
+        if stall.release_triplet:
             self._banned[choice.triplet.names] = located.tail_s_m
             self._position_until_s = view.time_s + self._set.release_s
 
-    # --- reports ---------------------------------------------------------------------------------------------
-
     def _wait(self, view: View, why: str) -> Action:
-        """Without a known body pose nothing pushes: every joint goes to its reference, and stays there."""
-        self._choice, self._asked_n, self._force_n = None, 0.0, 0.0
+        """Move every joint to its reference without a push, because the pose of the body is unknown."""
+        self._choice = None
+        self._asked_n = 0.0
+        self._force_n = 0.0
         self._stall_watch.forget()
         if not len(self._reference):
             self._reference = np.array(view.joints.angle_rad)
             self._hand_over.start(view.joints, self._reference)
-        self._hand_over.shift(-self._held_nm / self._stiffness)  # the load fades with all else
-        self._held_nm = np.zeros(len(self._held_nm))
+        # The load compensation becomes part of the offset, which fades.
+        self._hand_over.shift(-self._load_nm / self._stiffness)
+        self._load_nm = np.zeros(len(self._load_nm))
         self._hand_over.pass_to(None, view.joints, self._reference)
-        self._hand_over.fade(view.period_s / self._set.blend_s)  # what the joint pushed with, too
+        self._hand_over.fade(view.period_s / self._set.blend_s)
         targets = self._hand_over.positions_rad(self._reference).tolist()
         return Action(positions(self._robot, targets), Report(why=why, reference_rad=self._reference.tolist()))
 
+    # --- reports -------------------------------------------------------------------------------------------------
+
     def _report_rest(self, located: Located) -> Report:
-        """Why nothing pushes."""
-        speed_m_s = located.trajectory.speed_m_s
-        if self._stall is not None:
-            why = self._stall[0].why
-        elif speed_m_s > 0:
-            why = "; ".join(self._refused) or "no three push-points on alternating sides"
-        else:
-            why = "" if speed_m_s == 0 else "cannot go backward"
+        """Report why no joint pushes."""
         return Report(
-            why=why[:400],
+            why=self._explain_rest(located.trajectory.speed_m_s)[:MAX_REASON],
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
             reference_rad=self._reference.tolist(),
-            jammed=self._stall is not None and self._stall[0].jammed,
+            jammed=self._is_jammed(),
         )
 
-    def _report_push(self, located: Located, body_pose: BodyPose, choice: Choice, push: Push) -> Report:
-        """What pushes, and how hard."""
-        forces_n: list[float] = (push.force_n * choice.triplet.unit.forces).tolist()
-        full_nm = abs(self._set.propulsion_n * choice.torque_per_n)
+    def _explain_rest(self, wanted_m_s: float) -> str:
+        if self._stall is not None:
+            stall, _ = self._stall
+            return stall.why
+        if wanted_m_s > 0:
+            return "; ".join(self._refused) or "no three push-points on alternating sides"
+        if wanted_m_s == 0:
+            return ""
+        return "cannot go backward"
+
+    def _is_jammed(self) -> bool:
+        return self._stall is not None and self._stall[0].jammed
+
+    def _report_push(self, located: Located, body_pose: BodyPose, choice: Choice, demand: PropulsionDemand) -> Report:
+        """Report which joint pushes, at which contacts, and with which force."""
+        why = ""
+        if self._stall is not None:
+            stall, _ = self._stall
+            why = stall.why
+        forces_n: list[float] = (demand.force_n * choice.triplet.unit.forces).tolist()
+        full_torque_nm = abs(self._set.propulsion_n * choice.torque_per_n)
         return Report(
-            why="" if self._stall is None else self._stall[0].why,
+            why=why,
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
-            propulsion_joint=push.turn,
-            propulsion_n=push.force_n,
+            propulsion_joint=demand.joint,
+            propulsion_n=demand.force_n,
             push_points=planned_contacts(self._body, located.world, choice, forces_n),
             desired_force_n=forces_n,
-            propulsion_torque_nm=push.torque_nm,
-            bending_torque_nm=bending_nm(self._body, body_pose, choice, push.force_n).tolist(),
+            propulsion_torque_nm=demand.torque_nm,
+            bending_torque_nm=bending_nm(self._body, body_pose, choice, demand.force_n).tolist(),
             reference_rad=self._reference.tolist(),
             condition=choice.triplet.unit.condition,
-            torque_headroom_nm=self._body.torque_limit_nm[push.turn] - full_nm,
-            saturated=push.saturated,
-            jammed=self._stall is not None and self._stall[0].jammed,
+            torque_headroom_nm=self._body.torque_limit_nm[demand.joint] - full_torque_nm,
+            saturated=demand.saturated,
+            jammed=self._is_jammed(),
         )

@@ -1,18 +1,21 @@
-"""Detects standing still although pushing, and its cause. Pure except for its own state."""
+"""Detects that the body stands still although it pushes, and explains why."""
 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_gnc.control.carried import NetContactForce, what_holds
+from snakesim_gnc.control.contact_forces import NetContactForce, explain_standstill
+
+MIN_PUSH_RATIO = 0.5  # of `propulsion_n`; with less as a mean over the window, the body does not really push
+TIME_TOLERANCE_S = 1e-9  # rounding of sums of ticks
 
 
 @dataclass(frozen=True)
 class Stall:
-    """Why the snake stands."""
+    """Why the body stands still."""
 
-    jammed: bool  # obstacles hold it back, by what its contacts measure
-    lets_go: bool  # whatever it is, another triplet may do better
+    jammed: bool  # obstacles hold the body back, by its measured contact forces
+    release_triplet: bool  # another triplet may do better
     why: str
 
 
@@ -22,32 +25,34 @@ class StallWatch:
     def __init__(self, *, stall_m: float, stall_s: float, propulsion_n: float) -> None:
         self._stall_m = stall_m
         self._stall_s = stall_s
-        self._min_n = propulsion_n / 2
-        self._recent: deque[tuple[float, float, float]] = deque()
-        self._pushed_n = 0.0  # sum over the window
+        self._min_n = MIN_PUSH_RATIO * propulsion_n
+        self._recent: deque[tuple[float, float, float]] = deque()  # time in s, arc length in m, force in N
+        self._force_sum_n = 0.0  # over the window
 
     def forget(self) -> None:
         """Start a new window."""
         self._recent.clear()
-        self._pushed_n = 0.0
+        self._force_sum_n = 0.0
 
     def stands(self, time_s: float, tail_s_m: float, force_n: float) -> bool:
-        """Whether the body has stood still through a whole window while pushing; call while propelling."""
+        """Return whether the body has stood still through a whole window while pushing; call it in each such tick."""
         recent = self._recent
         recent.append((time_s, tail_s_m, force_n))
-        self._pushed_n += force_n
-        while recent[-1][0] - recent[0][0] > self._stall_s + 1e-9:
-            self._pushed_n -= recent.popleft()[2]
-        if time_s - recent[0][0] < self._stall_s - 1e-9:
+        self._force_sum_n += force_n
+        while recent[-1][0] - recent[0][0] > self._stall_s + TIME_TOLERANCE_S:
+            _, _, expired_n = recent.popleft()
+            self._force_sum_n -= expired_n
+        first_s, first_s_m, _ = recent[0]
+        if time_s - first_s < self._stall_s - TIME_TOLERANCE_S:
             return False
-        return abs(tail_s_m - recent[0][1]) < self._stall_m and self._pushed_n > self._min_n * len(recent)
+        return abs(tail_s_m - first_s_m) < self._stall_m and self._force_sum_n > self._min_n * len(recent)
 
 
 def explain(
     *,
     wanted_n: float,
     force_n: float,
-    carried: NetContactForce | None,
+    net_force: NetContactForce | None,
     push_points: Sequence[str],
     weight_n: float,
     saturated: str | None,
@@ -55,20 +60,31 @@ def explain(
     jam_force_n: float,
     drag_ratio: float,
 ) -> Stall:
-    """The cause of a stall, as far as what is measured shows it.
+    """Explain a stall, as far as the measurements show its cause.
 
-    wanted_n: propulsion from the speed alone; force_n: what is commanded of it. carried: along the path, by contacts;
-    None when no sensor tells. push_points: obstacles of the triplet. saturated, swung: name of the propulsion joint if
-    it is at its torque limit, or has swung out so far that the propulsion was reduced.
+    Args:
+        wanted_n: propulsion force from the speed alone.
+        force_n: commanded propulsion force.
+        net_force: measured contact forces along the path; None without a sensor.
+        push_points: names of the triplet's obstacles.
+        weight_n: weight of the robot.
+        saturated: name of the propulsion joint if it is at its torque limit.
+        swung: name of the propulsion joint if it has swung out so far that the propulsion was reduced.
+        jam_force_n: a larger contact force strains the contacts.
+        drag_ratio: ratio of propulsion to weight above which the propulsion strains the joint.
     """
-    strongest_n = None if carried is None else carried.strongest_n
-    strained = saturated is not None or swung is not None or wanted_n > drag_ratio * weight_n
-    lets_go = strongest_n != 0.0 and (strained or (strongest_n is not None and strongest_n > jam_force_n))
-    jammed, why = what_holds(force_n, carried, push_points)
+    touches_something = net_force is None or net_force.strongest_n != 0.0
+    joint_is_strained = saturated is not None or swung is not None or wanted_n > drag_ratio * weight_n
+    contacts_are_strained = net_force is not None and net_force.strongest_n > jam_force_n
+    jammed, why = explain_standstill(force_n, net_force, push_points)
     if swung is not None:
         why += f"; {swung} has swung out and leaves no more of the {wanted_n:.1f} N wanted"
     elif saturated is not None:
         why += f"; {saturated} at its limit of torque gives no more of the {wanted_n:.1f} N wanted"
-    elif carried is not None and not jammed and strongest_n != 0.0:
+    elif net_force is not None and not jammed and touches_something:
         why += "; raise propulsion_n"
-    return Stall(jammed, lets_go, why)
+    return Stall(
+        jammed=jammed,
+        release_triplet=touches_something and (joint_is_strained or contacts_are_strained),
+        why=why,
+    )

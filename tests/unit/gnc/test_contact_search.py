@@ -10,7 +10,7 @@ import pytest
 
 from snakesim.training.form import Policy
 from snakesim_gnc.control.controller import Action
-from snakesim_gnc.control.felt_wave import FeltWave
+from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
 from snakesim_gnc.control.policy import POLICIES
 from snakesim_gnc.geometry.planar_body import PlanarBody
@@ -126,7 +126,7 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
         world=msgspec.structs.replace(view.world, contacts=contacts),
         trajectory=msgspec.structs.replace(view.trajectory, goal_w=tuple(goal_w.tolist())),
     )
-    wave = FeltWave(stage.robot).reference_rad(felt, passed_s)
+    wave = ForceFeedbackWave(stage.robot).reference_rad(felt, passed_s)
     assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
 
 
@@ -135,7 +135,7 @@ def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
     joints = stage.view(0, TAIL_S_M, torque_nm=torque_nm).joints
     straight = msgspec.structs.replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
     view = replace(stage.view(0, TAIL_S_M, without="world"), joints=straight)
-    return FeltWave(stage.robot).reference_rad(view, 0.3)
+    return ForceFeedbackWave(stage.robot).reference_rad(view, 0.3)
 
 
 def test_joints_twice_as_far_apart_bend_twice_as_much_and_so_along_the_same_curve() -> None:
@@ -153,7 +153,7 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     stage = make_stage()
     view = stage.view(0, TAIL_S_M)
     knocked = replace(view, joints=msgspec.structs.replace(view.joints, velocity_rad_s=[20.0] * 13))
-    calm, struck = FeltWave(stage.robot), FeltWave(stage.robot)
+    calm, struck = ForceFeedbackWave(stage.robot), ForceFeedbackWave(stage.robot)
     for wave in (calm, struck):
         wave.reference_rad(view, 0.01)
     apart = [np.ptp([calm.reference_rad(view, 0.01), struck.reference_rad(knocked, 0.01)], axis=0) for _ in range(20)]

@@ -109,7 +109,7 @@ def test_dearer_contacts_leave_the_push_to_three_that_can_do_it_alone(tail_s_m: 
     three = np.argsort(touches.body_s_m)[:3]
     dearer = np.full(len(touches), 1000.0)
     dearer[three] = 0.0
-    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005, dearer=dearer)
+    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005, extra_cost=dearer)
     usual = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
     assert push.rest < 0.1 and np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
     assert len(touches) == 3 or np.delete(usual.lambdas, three).sum() > np.delete(push.lambdas, three).sum()

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.carried import NetContactForce
+from snakesim_gnc.control.contact_forces import NetContactForce
 from snakesim_gnc.control.push import find_touches, push_forward
-from snakesim_gnc.control.push_report import push_points, why_it_stands
+from snakesim_gnc.control.push_report import explain_push_standstill, push_points
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
@@ -50,6 +50,6 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
     ],
 )
 def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
-    nothing = NetContactForce(strongest_n=0.0, ahead_n=0.0, back_n=0.0, holder="", touched=frozenset())
-    jammed, why = why_it_stands(*pushing(pegs), force_n, max_force_n, nothing, ["a", "b", "c"])
+    nothing = NetContactForce(strongest_n=0.0, ahead_n=0.0, back_n=0.0, blocking_obstacle="", touched=frozenset())
+    jammed, why = explain_push_standstill(*pushing(pegs), force_n, max_force_n, nothing, ["a", "b", "c"])
     assert not jammed and words in why

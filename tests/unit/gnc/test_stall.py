@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from snakesim_gnc.control.carried import FeltContacts, NetContactForce
+from snakesim_gnc.control.contact_forces import MeasuredContacts, NetContactForce
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
 from snakesim_hal.wire.messages import World
 from tests.unit.gnc.stage import known, make_contact, make_world
@@ -44,9 +44,9 @@ def world_with(*forces: tuple[str, float, float], timestamp_ns: int = 1) -> Worl
 
 def along(*forces: tuple[str, float, float]) -> NetContactForce:
     """What contacts with these forces along and across the direction do."""
-    felt = FeltContacts()
-    felt.take(world_with(*forces))
-    return known(felt.along((2.0, 0.0)))
+    felt = MeasuredContacts()
+    felt.add_world(world_with(*forces))
+    return known(felt.resolve_along((2.0, 0.0)))
 
 
 PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  # as a triplet of 30 N is
@@ -56,7 +56,7 @@ def cause(**more):
     given = {
         "wanted_n": 35.0,
         "force_n": 30.0,
-        "carried": along(*PUSHED),
+        "net_force": along(*PUSHED),
         "push_points": ("peg_0", "peg_1", "peg_2"),
         "weight_n": 400.0,
         "saturated": None,
@@ -69,7 +69,7 @@ def cause(**more):
 
 def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
     stall = cause()
-    assert not stall.jammed and not stall.lets_go
+    assert not stall.jammed and not stall.release_triplet
     assert stall.why == (
         "standing still with 30.0 N of propulsion; contacts push it on with 29.5 N, too little against the friction of "
         "the ground; raise propulsion_n"
@@ -77,7 +77,7 @@ def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
 
 
 def test_a_push_point_that_is_not_felt_is_named():
-    stall = cause(carried=along(PUSHED[0], ("peg_1", 3.2, -4.0)))
+    stall = cause(net_force=along(PUSHED[0], ("peg_1", 3.2, -4.0)))
     assert not stall.jammed
     assert "contacts push it on with 3.2 N (no contact at peg_2), too little" in stall.why
 
@@ -85,18 +85,18 @@ def test_a_push_point_that_is_not_felt_is_named():
 @pytest.mark.parametrize("saturated", [None, "joint_7"])
 @pytest.mark.parametrize("wanted_n", [8.0, 35.0, 300.0])
 def test_a_body_that_touches_nothing_is_not_jammed(wanted_n, saturated):
-    stall = cause(wanted_n=wanted_n, carried=along(), weight_n=40.0, saturated=saturated)
-    assert not stall.jammed and not stall.lets_go and "no obstacle touches the body" in stall.why
+    stall = cause(wanted_n=wanted_n, net_force=along(), weight_n=40.0, saturated=saturated)
+    assert not stall.jammed and not stall.release_triplet and "no obstacle touches the body" in stall.why
 
 
 def test_without_a_sensor_of_contacts_the_cause_is_unknown():
-    stall = cause(carried=None, weight_n=40.0)
-    assert not stall.jammed and stall.lets_go
+    stall = cause(net_force=None, weight_n=40.0)
+    assert not stall.jammed and stall.release_triplet
     assert stall.why.endswith("what holds it is unknown without a sensor of contacts")
 
 
 def test_a_jam_is_what_obstacles_hold_back():
-    stall = cause(carried=along(*PUSHED, ("post", -28.0, 60.0)))
+    stall = cause(net_force=along(*PUSHED, ("post", -28.0, 60.0)))
     assert stall.jammed
     assert stall.why == (
         "jammed: standing still with 30.0 N of propulsion; obstacles push it on with 30 N and hold it back with 28 N, "
@@ -107,7 +107,7 @@ def test_a_jam_is_what_obstacles_hold_back():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"carried": along(*PUSHED, ("post", 0.0, 300.0))}, ""),
+        ({"net_force": along(*PUSHED, ("post", 0.0, 300.0))}, ""),
         (
             {"saturated": "joint_7"},
             "contacts push it on with 29.5 N, too little against the friction of the ground; "
@@ -119,20 +119,20 @@ def test_a_jam_is_what_obstacles_hold_back():
 )
 def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given, words):
     stall = cause(**given)
-    assert stall.lets_go and not stall.jammed
+    assert stall.release_triplet and not stall.jammed
     assert words in stall.why and not stall.why.startswith("jam")
 
 
 def test_forces_are_judged_as_means_over_50_ms():
-    felt = FeltContacts()
+    felt = MeasuredContacts()
     for turn in range(9):
-        felt.take(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
-    carried = known(felt.along((1.0, 0.0)))
-    assert carried.strongest_n == pytest.approx(10.0) and carried.ahead_n == pytest.approx(10.0)
+        felt.add_world(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
+    net_force = known(felt.resolve_along((1.0, 0.0)))
+    assert net_force.strongest_n == pytest.approx(10.0) and net_force.ahead_n == pytest.approx(10.0)
 
 
 def test_estimated_contacts_are_no_measured_forces():
-    felt, world = FeltContacts(), world_with(*PUSHED)
-    felt.take(world)
-    felt.take(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
-    assert felt.along((1.0, 0.0)) is None and felt.at(["peg_1"]) == []
+    felt, world = MeasuredContacts(), world_with(*PUSHED)
+    felt.add_world(world)
+    felt.add_world(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
+    assert felt.resolve_along((1.0, 0.0)) is None and felt.mean_sizes_n(["peg_1"]) == []
