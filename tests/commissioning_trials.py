@@ -29,9 +29,9 @@ from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Imu, JointState, Mode
-from snakesim_operator.features.commissioning.identification import Identified, identified
-from snakesim_operator.features.commissioning.judge import Judged, judged
-from snakesim_operator.features.commissioning.measured import measured
+from snakesim_operator.features.commissioning.identification import JointIdentification, identify_joints
+from snakesim_operator.features.commissioning.judge import JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.measured import collect_measurements
 
 LAID_RAD = 0.03  # how straight a person lays a robot, at each joint
 OFFSET_RAD = 0.15
@@ -58,7 +58,7 @@ class CheckTrial:
 
     fault: str
     joints: Sequence[int]  # that have the fault
-    rows: Sequence[Judged]
+    rows: Sequence[JointVerdict]
 
     @property
     def found(self) -> bool:
@@ -71,13 +71,13 @@ class CheckTrial:
     def blamed(self) -> list[str]:
         """Sound joints of which something is wrong."""
         rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        return [f"{row.joint}: {row.verdict}" for row in rows if row.properties("wrong")]
+        return [f"{row.joint}: {row.summary}" for row in rows if row.properties("wrong")]
 
     @property
     def unsure(self) -> list[str]:
         """Sound joints of which something is unknown."""
         rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        return [f"{row.joint}: {row.verdict}" for row in rows if row.properties("unknown")]
+        return [f"{row.joint}: {row.summary}" for row in rows if row.properties("unknown")]
 
 
 def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: float = 13.0) -> CheckTrial:
@@ -108,7 +108,7 @@ def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: 
     return CheckTrial(fault, with_fault, _checked("backend=can", *sets, *run))
 
 
-def _checked(*sets: str) -> list[Judged]:
+def _checked(*sets: str) -> list[JointVerdict]:
     """Run the joint check in this process, and judge it."""
     config = load("joint_check", [parse_set(text) for text in sets]).config
     imus: list[Imu] = []
@@ -122,7 +122,7 @@ def _checked(*sets: str) -> list[Judged]:
         columns = box.layout.arrays(rows)
         robot = run.host.description
     ticks = columns.pop("tick").tolist()
-    return judged(measured(config, robot, ticks, columns, imus), straight=True)
+    return judge_joints(collect_measurements(config, robot, ticks, columns, imus), straight=True)
 
 
 def check_table(first: int, trials: int, *sets: str) -> list[str]:
@@ -134,7 +134,7 @@ def check_table(first: int, trials: int, *sets: str) -> list[str]:
         trial = check_trial(number, fault, *sets)
         made.append(trial)
         if trial.blamed or trial.unsure or (trial.joints and not trial.found):
-            said = [f"{trial.rows[joint].joint}: {trial.rows[joint].verdict}" for joint in trial.joints]
+            said = [f"{trial.rows[joint].joint}: {trial.rows[joint].summary}" for joint in trial.joints]
             print(f"trial {number}, {fault}: {said}; blamed {trial.blamed}; unsure {trial.unsure}", flush=True)
     lines = ["| hidden fault | robots | found by name | robots with a sound joint blamed | with one unknown |"]
     lines.append("|---|---|---|---|---|")
@@ -168,7 +168,7 @@ class IdentifyTrial:
 
     loose: int | None  # joint with backlash
     truth: Mapping[str, Mounted]
-    found: Sequence[Identified]
+    found: Sequence[JointIdentification]
     written: int = field(init=False, default=0)  # values
     covered: int = field(init=False, default=0)  # values that are written, and whose interval covers the truth
     constants_off: int = field(init=False, default=0)  # torque constants that are written, and off by more than 10 %
@@ -212,7 +212,7 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
         latency_s.append(round(LATENCY_S * pick.uniform(1 - DRAWN, 1 + DRAWN), 3))
     columns, link_rates = _shaken(config, truth, latency_s)
     with_imus, without = (
-        IdentifyTrial(loose if backlash else None, truth, identified(config, columns, rates))
+        IdentifyTrial(loose if backlash else None, truth, identify_joints(config, columns, rates))
         for rates in (link_rates, None)
     )
     return with_imus, without

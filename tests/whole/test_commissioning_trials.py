@@ -9,7 +9,7 @@ from tests.commissioning_trials import NONE, check_trial, identify_trials
 def test_a_hidden_fault_is_named_and_no_sound_joint_is_blamed_or_unknown(fault: str) -> None:
     trial = check_trial(4, fault, modules=4, seconds=6.5)
     assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
-    assert fault == NONE or trial.found, [row.verdict for row in trial.rows]
+    assert fault == NONE or trial.found, [row.summary for row in trial.rows]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from snakesim_hal.programs.arguments import add_network, number
 from snakesim_operator.base.robot_selection import selection_of
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
-TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
+TASK = "scenarios, robots, labs"  # the heading of `snakesim --help` that lists it
 JOG = (
     "Move one joint slowly, while a key is held; the motors of the others stay off. It arms the robot, checked or not."
 )
@@ -20,18 +20,15 @@ def add_commands(commands: Any) -> None:
     """Add `joints` to the parser of `snakesim`."""
     joints = commands.add_parser("joints", help="find zeros, directions and limits of joints, and write them down")
     verbs = joints.add_subparsers(dest="verb", required=True, metavar="VERB")
-    zero = _by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")
+    zero = _add_by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")
     zero.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
-    for verb, about in (
-        ("direction", "turn joints by hand: which count the wrong way round, or have another's id"),
-        ("limits", "move joints by hand from end to end: their limits"),
-    ):
-        command = _by_hand(verbs, verb, _direction_or_limits, about)
-        command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
-    gear = _by_hand(
-        verbs, "gear", _gear, "turn joints by hand by a known angle: whether their gears are as the file says"
-    )
-    gear.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+    direction_help = "turn joints by hand: which count the wrong way round, or have another's id"
+    _add_joint_names(_add_by_hand(verbs, "direction", _direction, direction_help))
+    limits_help = "move joints by hand from end to end: their limits"
+    _add_joint_names(_add_by_hand(verbs, "limits", _limits, limits_help))
+    gear_help = "turn joints by hand by a known angle: whether their gears are as the file says"
+    gear = _add_by_hand(verbs, "gear", _gear, gear_help)
+    _add_joint_names(gear)
     gear.add_argument(
         "--degrees",
         type=number(10.0, 180.0, "degrees"),
@@ -42,40 +39,44 @@ def add_commands(commands: Any) -> None:
     _add_check(verbs)
 
 
+def _add_joint_names(command: argparse.ArgumentParser) -> None:
+    command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+
+
 def _add_check(verbs: Any) -> None:
-    judge = verbs.add_parser(
+    check = verbs.add_parser(
         "check",
         help="judge a run of `snakesim run joint_check`: signs, gears, backlash, ids, zeros, dead joints",
         epilog="Exit code: 0 sign, order, zero and gear of every joint were confirmed, 1 one is wrong or unknown, "
         "2 wrong input.",
     )
-    judge.add_argument("run", type=Path, help="folder of the run")
-    judge.add_argument(
+    check.add_argument("run", type=Path, help="folder of the run")
+    check.add_argument(
         "file",
         type=Path,
         nargs="?",
         metavar="FILE",
         help="your robot file: write into it that it was checked, if all of it was confirmed",
     )
-    judge.add_argument(
+    check.add_argument(
         "--by-hand",
         action="store_true",
         help="you turned the joints whose sign and order it cannot judge with `joints direction`, and they are right",
     )
-    judge.add_argument(
+    check.add_argument(
         "--gear-by-hand",
         action="store_true",
         help="you measured the gears that it cannot judge with `joints gear`, they are right, and have no backlash",
     )
-    judge.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
-    judge.add_argument(
+    check.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
+    check.add_argument(
         "--allow-backlash",
         type=number(0.0, 0.5, "rad"),
         default=ALLOWED_BACKLASH_RAD,
         metavar="RAD",
         help=f"as much may be lost in a gear when its load reverses (default: {ALLOWED_BACKLASH_RAD:g} rad)",
     )
-    judge.set_defaults(act=_check)
+    check.set_defaults(act=_check)
 
 
 def _add_jog(verbs: Any) -> None:
@@ -89,8 +90,11 @@ def _add_jog(verbs: Any) -> None:
     jog.set_defaults(act=_jog)
 
 
-def _by_hand(verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-    command = verbs.add_parser(verb, help=about, description=f"{about.capitalize()}. The motors stay off.")
+def _add_by_hand(
+    verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], help_text: str
+) -> argparse.ArgumentParser:
+    """Add a verb for which a person moves the robot by hand."""
+    command = verbs.add_parser(verb, help=help_text, description=f"{help_text.capitalize()}. The motors stay off.")
     command.add_argument("file", type=Path, metavar="FILE", help=FILE)
     add_network(command)
     command.set_defaults(act=act)
@@ -100,23 +104,28 @@ def _by_hand(verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], ab
 def _zero(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import zero
 
-    return zero(arguments.file, selection_of(arguments), asks=not arguments.now)
+    return zero(arguments.file, selection_of(arguments), wait_for_enter=not arguments.now)
 
 
 def _jog(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.jog import JogRequest, jog
 
-    wanted = JogRequest(
+    request = JogRequest(
         joint=arguments.joint, speed_rad_s=arguments.speed, travel_rad=arguments.travel, torque=arguments.torque
     )
-    return jog(arguments.file, selection_of(arguments), wanted)
+    return jog(arguments.file, selection_of(arguments), request)
 
 
-def _direction_or_limits(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.features.commissioning.by_hand import direction, limits
+def _direction(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.features.commissioning.by_hand import direction
 
-    act = direction if arguments.verb == "direction" else limits
-    return act(arguments.file, selection_of(arguments), arguments.joints)
+    return direction(arguments.file, selection_of(arguments), arguments.joints)
+
+
+def _limits(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.features.commissioning.by_hand import limits
+
+    return limits(arguments.file, selection_of(arguments), arguments.joints)
 
 
 def _gear(arguments: argparse.Namespace) -> int:

@@ -1,5 +1,6 @@
-"""`snakesim identify`: the record of a run of the controller `identify`, judged, printed, drawn, and written down."""
+"""`snakesim identify`: identifies the joints from a run of the controller `identify`, prints, draws and writes them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,20 @@ from snakesim_hal.base.terminal import say
 from snakesim_hal.model.files import find
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.features.commissioning.estimate import Value
-from snakesim_operator.features.commissioning.identification import FITS, Identified, identified
-from snakesim_operator.features.commissioning.identified_page import page
-from snakesim_operator.features.commissioning.measured import by_imus, imus_of, ticks_of
+from snakesim_operator.features.commissioning.identification import (
+    MIN_EXPLAINED,
+    JointIdentification,
+    identify_joints,
+)
+from snakesim_operator.features.commissioning.identified_page import render_page
+from snakesim_operator.features.commissioning.least_squares import Estimate
+from snakesim_operator.features.commissioning.measured import arrange_by_tick, read_imus, tick_numbers
 from snakesim_operator.results.record import RunRecord
 
 PAGE = "identified.html"
 CONTROLLER = "identify"
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
-SHOWN = {
+LABELS = {  # fields of the robot file -> name and unit
     "friction_nm": ("dry friction", "N·m"),
     "viscous_nm_s_per_rad": ("viscous friction", "N·m·s/rad"),
     "armature_kg_m2": ("rotor inertia", "kg·m²"),
@@ -30,39 +35,57 @@ SHOWN = {
 }
 
 
-def identify(run: Path, write: Path | None, out: Path | None) -> int:
-    """Print every joint, and write page and robot file. Return 0 when all of it was found. Raises ConfigError."""
-    if write is not None and find(str(write), "robots") != write:
-        raise ConfigError(f"{write}: give the path of your own robot file, such as ./{write}.toml; shipped ones stay")
+def identify(run: Path, robot_file: Path | None, out: Path | None) -> int:
+    """Identify the joints of a run, print them, and write a page.
+
+    Args:
+        run: folder of the run, or its recording.
+        robot_file: the user's robot file to write the values into; None: no robot file is written.
+        out: the page; None: a file in the folder of the run.
+
+    Returns:
+        0 if every value of every joint was identified, otherwise 1.
+
+    Raises:
+        ConfigError: the run is of another controller, or a file cannot be read or written.
+    """
+    if robot_file is not None and find(str(robot_file), "robots") != robot_file:
+        raise ConfigError(
+            f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay"
+        )
     record = RunRecord.load(run)
-    judged = _judged_ticks(record)
-    columns: dict[str, Any] = {name: getattr(record, name)[judged] for name in COLUMNS}
-    rates, _ = by_imus(imus_of(record), ticks_of(record), len(record.description.links))
-    found = identified(record.config, columns, rates[judged])
-    for one in found:
-        _print(one)
-    if np.isnan(rates).all():
+    judged_ticks = _find_judged_ticks(record)
+    columns: dict[str, Any] = {name: getattr(record, name)[judged_ticks] for name in COLUMNS}
+    link_rates, _ = arrange_by_tick(read_imus(record), tick_numbers(record), len(record.description.links))
+    rows = identify_joints(record.config, columns, link_rates[judged_ticks])
+    for row in rows:
+        _print_joint(row)
+    if np.isnan(link_rates).all():
         say("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
-    path = out or (run if run.is_dir() else run.parent) / PAGE
-    write_text(path, page(record, found))
-    say(f"page: {path}")
-    if write is not None:
-        _write(write, record, found)
-    return 0 if all(one.complete and not one.fails for one in found) else 1
+    run_folder = run if run.is_dir() else run.parent
+    page_path = out or run_folder / PAGE
+    write_text(page_path, render_page(record, rows))
+    say(f"page: {page_path}")
+    if robot_file is not None:
+        _write_robot_file(robot_file, record, rows)
+    everything_identified = all(row.complete and not row.fails for row in rows)
+    return 0 if everything_identified else 1
 
 
-def _judged_ticks(record: RunRecord) -> slice:
-    """Return the part in which every value is known and every joint in position mode. Raises ConfigError."""
+def _find_judged_ticks(record: RunRecord) -> slice:
+    """Return the longest part in which every value is known and all joints are in position mode. Raises ConfigError."""
     if record.config.controller != CONTROLLER:
         raise ConfigError(
             f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
             f"run with `snakesim run identify`"
         )
     columns = [getattr(record, name) for name in COLUMNS]
-    known = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
-    known &= (record.mode == Mode.POSITION).all(axis=1)
-    known[1:] &= np.abs(np.diff(record.time_s) * record.config.rate_hz - 1) < 0.5
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False])).astype(int)))
+    usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
+    usable &= (record.mode == Mode.POSITION).all(axis=1)
+    ticks_since_last_row = np.diff(record.time_s) * record.config.rate_hz
+    usable[1:] &= np.abs(ticks_since_last_row - 1) < 0.5
+    padded = np.concatenate(([False], usable, [False])).astype(int)
+    edges = np.flatnonzero(np.diff(padded))
     parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
     if not parts:
         raise ConfigError(f"{record.folder}: the joints were never moved by position targets; run it again")
@@ -70,37 +93,44 @@ def _judged_ticks(record: RunRecord) -> slice:
     return slice(start, end)
 
 
-def _print(one: Identified) -> None:
-    say(f"{one.joint}{'' if one.fits is None else f'   {100 * one.fits:.1f} % of its torque explained'}")
-    for field, value in one.fields.items():
-        name, unit = SHOWN[field]
-        say(f"  {name:<17} {_interval(value)} {unit}")
-    if one.latency_s is not None:
-        say(f"  {'latency':<17} {_interval(one.latency_s)} s")
-    if one.bandwidth_hz is not None:
-        say(f"  {'servo bandwidth':<17} {one.bandwidth_hz:.3g} Hz, of this joint with what it carries")
-    for why in one.unknown:
-        say(f"  unknown: {why}")
-    if one.fits is not None and one.fits < FITS:
+def _print_joint(row: JointIdentification) -> None:
+    if row.explained is None:
+        say(row.joint)
+    else:
+        say(f"{row.joint}   {100 * row.explained:.1f} % of its torque explained")
+    for field, estimate in row.fields.items():
+        name, unit = LABELS[field]
+        say(f"  {name:<17} {_format_interval(estimate)} {unit}")
+    if row.latency_s is not None:
+        say(f"  {'latency':<17} {_format_interval(row.latency_s)} s")
+    if row.bandwidth_hz is not None:
+        say(f"  {'servo bandwidth':<17} {row.bandwidth_hz:.3g} Hz, of this joint with what it carries")
+    for reason in row.unknown:
+        say(f"  unknown: {reason}")
+    if row.explained is not None and row.explained < MIN_EXPLAINED:
         say("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
 
 
-def _interval(value: Value) -> str:
-    return f"{value.value:.4g}, {value.value - value.within:.4g} to {value.value + value.within:.4g}"
+def _format_interval(estimate: Estimate) -> str:
+    low = estimate.value - estimate.half_width
+    high = estimate.value + estimate.half_width
+    return f"{estimate.value:.4g}, {low:.4g} to {high:.4g}"
 
 
-def _write(path: Path, record: RunRecord, found: list[Identified]) -> None:
+def _write_robot_file(path: Path, record: RunRecord, rows: Sequence[JointIdentification]) -> None:
+    """Write the values of the joints that do not fail into a robot file, and print what was written."""
     from snakesim_operator.features.commissioning.robot_edit import change_joints
 
     values: dict[str, dict[str, Any]] = {}
-    for one in found:
-        if one.fields and not one.fails:
-            values[one.joint] = {field: max(value.value, 0.0) for field, value in one.fields.items()}
-    left = [one.joint for one in found if one.joint not in values]
+    for row in rows:
+        if row.fields and not row.fails:
+            # An estimate of a small friction may be below zero, which no robot file may hold.
+            values[row.joint] = {field: max(estimate.value, 0.0) for field, estimate in row.fields.items()}
+    unchanged = [row.joint for row in rows if row.joint not in values]
     if not values:
         say(f"{path}: nothing was written: the values of no joint are sure")
         return
     change_joints(path, values, f"identified from {record.folder.name}")
     say(f"{path}: {len(values)} joints changed; restart the host with it")
-    if left:
-        say(f"{path}: left as they were: {', '.join(left)}")
+    if unchanged:
+        say(f"{path}: left as they were: {', '.join(unchanged)}")

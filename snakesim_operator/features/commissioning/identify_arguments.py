@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
+TASK = "scenarios, robots, labs"  # the heading of `snakesim --help` that lists it
 
 
 def add_commands(commands: Any) -> None:
-    """Add it to the parser of `snakesim`."""
+    """Add `identify` to the parser of `snakesim`."""
     command = commands.add_parser(
         "identify",
         help="friction, rotor inertia, torque constant and response of every joint, from `snakesim run identify`",

@@ -8,7 +8,7 @@ Five properties of a joint are judged, each from its own evidence, and each is c
     gear    they turn as far as its encoder counts, and lose nothing when the load reverses
     zero    its angle is what gravity says, or 0 on a robot that was laid straight
 
-What no evidence was found for is unknown, with a sentence on how it could be confirmed. It never counts as confirmed.
+A property without evidence is unknown, with a sentence on how it could be confirmed. It never counts as confirmed.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,36 +20,38 @@ import numpy as np
 from snakesim_hal.model.checked import PROPERTIES, JointProperty
 from snakesim_hal.model.joints import Drive
 from snakesim_operator.features.commissioning.link_shares import (
-    MOVES_RAD_S,
+    MIN_RATE_RAD_S,
+    LinkShares,
+    Order,
     find_order,
-    link_shares,
+    measure_link_shares,
     swap_candidates,
 )
 from snakesim_operator.features.commissioning.lost_motion import LostMotion, find_lost_motion
-from snakesim_operator.features.commissioning.measured import Measured, Select
+from snakesim_operator.features.commissioning.measured import CheckMeasurements, Select
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
-AS_TOLD = "as the robot file says"
-LEAST_MOVED_RAD = 0.012  # a fifth of the default way to one side
-FOLLOWED = 0.3  # of its target's way, and of its target's time; a joint without current is moved by others, at times
-NEAR = 0.12  # of a share, to the expected one
-LEAST_TORQUE_NM = 0.1  # mean along the motion; a light link's inertia may be a tenth of it against the motion
+AS_IN_FILE = "as the robot file says"
+MIN_MOVED_RAD = 0.012  # a fifth of the default motion to one side
+MIN_FOLLOWED_FRACTION = 0.3  # of its target's range and time; other joints move one without current at times
+MAX_RATIO_ERROR = 0.12  # between the fraction of the motion that the links made and the expected one
+MIN_TORQUE_NM = 0.1  # mean along the motion; a light link's inertia may be a tenth of it against the motion
 STRAIGHT_RAD = 0.08  # a robot that was laid straight by hand is straight within that
-LEVEL_RAD = 0.05  # gravity tells angles to that
-LEAST_GRAVITY_M_S2 = 5.0  # across the axis of a joint, to tell its angle
+LEVEL_RAD = 0.05  # accuracy of an angle from the direction of gravity
+MIN_GRAVITY_M_S2 = 5.0  # across the axis of a joint; with less, gravity does not give its angle
 State = Literal["confirmed", "wrong", "unknown"]
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What was found of one property of a joint."""
+class PropertyFinding:
+    """Whether one property of a joint is as the robot file says."""
 
     state: State
     reason: str = ""  # what is wrong and what to write, or why it is unknown and how it could be confirmed
     by_hand: bool = False  # confirmed by a person
 
 
-CONFIRMED = Finding("confirmed")
+CONFIRMED = PropertyFinding("confirmed")
 NO_MOTION = "it did not move; correct its drive, and run the check again"
 NO_END = "its motion did not come: the run ended before; run the check again with a longer --duration"
 NO_LINK_TURNS = "no link turns with it; correct its gear, and run the check again"
@@ -61,194 +63,245 @@ NOT_STRAIGHT = "lay the robot straight, run the check again, and add --straight"
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What was found of one joint."""
+class JointVerdict:
+    """The findings on one joint."""
 
     joint: str
-    findings: Mapping[JointProperty, Finding]
-    moved_rad: float | None = None  # by its encoder; None: its motion did not come
-    turned: float | None = None  # share of that which turned up at this joint, without its drive; None: unknown
+    findings: Mapping[JointProperty, PropertyFinding]
+    moved_rad: float | None = None  # by its encoder; None: it was not moved
+    turned: float | None = None  # fraction of that which the links made at this joint; None: unknown
     torque_nm: float | None = None  # mean along the motion; None: not measured
 
     def properties(self, state: State) -> list[JointProperty]:
-        """Return the properties that were found to be so."""
+        """Return the properties in this state."""
         return [name for name in PROPERTIES if self.findings[name].state == state]
 
     @property
-    def as_told(self) -> bool:
+    def all_confirmed(self) -> bool:
         """Whether every property was confirmed."""
         return len(self.properties("confirmed")) == len(PROPERTIES)
 
     @property
-    def verdict(self) -> str:
+    def summary(self) -> str:
         """What is wrong; otherwise what is unknown; otherwise that it is as the file says."""
-        if wrong := self.properties("wrong"):
+        wrong = self.properties("wrong")
+        if wrong:
             return "; ".join(self.findings[name].reason for name in wrong)
-        if unknown := self.properties("unknown"):
+        unknown = self.properties("unknown")
+        if unknown:
             return f"unknown: {', '.join(unknown)}"
-        return AS_TOLD
+        return AS_IN_FILE
 
-    def confirmed_by_hand(self, properties: Iterable[JointProperty]) -> "Judged":
+    def confirmed_by_hand(self, properties: Iterable[JointProperty]) -> "JointVerdict":
         """Return the same with those of its unknown properties confirmed by a person. What is wrong stays wrong."""
         findings = dict(self.findings)
         for name in properties:
             if findings[name].state == "unknown":
-                findings[name] = Finding("confirmed", by_hand=True)
+                findings[name] = PropertyFinding("confirmed", by_hand=True)
         return replace(self, findings=findings)
 
 
-def judged(
-    run: Measured, *, straight: bool = False, allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD
-) -> list[Judged]:
-    """Return what was found of every joint, tail to head.
+def judge_joints(
+    run: CheckMeasurements, *, straight: bool = False, allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD
+) -> list[JointVerdict]:
+    """Judge every joint, tail to head.
 
     Args:
         run: the measurements of a joint check.
         straight: the robot lay straight at the start, so that all angles should have been zero.
-        allowed_backlash_rad: as much may be lost in a gear when its load reverses.
+        allowed_backlash_rad: motion that may be lost in a gear when its load reverses.
     """
-    joints = range(len(run.names))
-    # A joint that brakes while it drives moves all the same, so that its links can be judged.
-    motions = [link_shares(run, joint) if _followed(run, joint) else None for joint in joints]
-    order = find_order(motions)
-    links = [0, *(order + 1)]
-    in_place = replace(
-        run, link_rate_rad_s=run.link_rate_rad_s[:, links], link_force_m_s2=run.link_force_m_s2[:, links]
-    )
-    rows: list[Judged] = []
-    for joint in joints:
-        motion = motions[joint]
-        torque_nm = _torque_along_motion(run, joint)
-        turned = float("nan")
-        findings: dict[JointProperty, Finding] = {"drive": _judge_drive(run, joint, torque_nm)}
-        if order[joint] != joint:
-            other = run.names[int(order[joint])]
-            findings["order"] = Finding("wrong", f"moves the link of {other}: their ids or cables are swapped")
-            after = f"judged once the ids of {run.names[joint]} and {other} are right; run the check again then"
-            findings |= dict.fromkeys(("sign", "gear", "zero"), Finding("unknown", after))
-        elif motion is None:
-            why = NO_MOTION if run.moved_by_target(joint).any() else NO_END
-            findings |= dict.fromkeys(("order", "sign", "gear"), Finding("unknown", why))
-            findings["zero"] = _judge_zero(in_place, joint, straight=straight)
-        else:
-            turned = float(motion.with_modules(order).turned()[joint])
-            candidates = [run.names[other] for other in swap_candidates(motions, order, joint)]
-            lost = find_lost_motion(in_place, joint)
-            findings["order"] = _judge_order(turned, candidates)
-            findings["sign"] = _judge_sign(turned, run.drives[joint])
-            findings["gear"] = _judge_gear(turned, lost, run.drives[joint], allowed_backlash_rad)
-            findings["zero"] = _judge_zero(in_place, joint, straight=straight)
-        rows.append(
-            Judged(
-                joint=run.names[joint],
-                findings=findings,
-                moved_rad=run.moved_rad(joint) if run.moved_by_target(joint).any() else None,
-                turned=None if np.isnan(turned) else turned,
-                torque_nm=torque_nm,
-            )
+    judge = _JointJudge(run, straight=straight, allowed_backlash_rad=allowed_backlash_rad)
+    return [judge.judge(joint) for joint in range(len(run.names))]
+
+
+class _JointJudge:
+    """Judges the joints of one run, with what all of their motions tell together."""
+
+    def __init__(self, run: CheckMeasurements, *, straight: bool, allowed_backlash_rad: float) -> None:
+        self._run = run
+        self._straight = straight
+        self._allowed_backlash_rad = allowed_backlash_rad
+        # A joint that brakes while it drives moves all the same, so its links can be judged.
+        self._motions: list[LinkShares | None] = [
+            measure_link_shares(run, joint) if _followed_target(run, joint) else None for joint in range(len(run.names))
+        ]
+        self._order: Order = find_order(self._motions)
+        links = [0, *(self._order + 1)]
+        self._run_in_place = replace(  # every IMU on the link on which its module really is
+            run, link_rate_rad_s=run.link_rate_rad_s[:, links], link_force_m_s2=run.link_force_m_s2[:, links]
         )
-    return rows
+
+    def judge(self, joint: int) -> JointVerdict:
+        """Judge all properties of a joint."""
+        run = self._run
+        torque_nm = _mean_driving_torque(run, joint)
+        turned = self._fraction_turned(joint)
+        moved_rad = None
+        if run.moved_by_target(joint).any():
+            moved_rad = run.moved_rad(joint)
+        return JointVerdict(
+            joint=run.names[joint],
+            findings={"drive": _judge_drive(run, joint, torque_nm), **self._judge_mounting(joint, turned)},
+            moved_rad=moved_rad,
+            turned=None if np.isnan(turned) else turned,
+            torque_nm=torque_nm,
+        )
+
+    def _fraction_turned(self, joint: int) -> float:
+        """Return the fraction of a joint's motion that its links made; NaN if it is unknown."""
+        motion = self._motions[joint]
+        if motion is None or self._order[joint] != joint:
+            return float("nan")
+        return float(motion.with_modules(self._order).motion_at_joints()[joint])
+
+    def _judge_mounting(self, joint: int, turned: float) -> dict[JointProperty, PropertyFinding]:
+        """Judge order, sign, gear and zero of a joint."""
+        if self._order[joint] != joint:
+            return self._findings_on_swapped(joint)
+        zero = _judge_zero(self._run_in_place, joint, straight=self._straight)
+        if self._motions[joint] is None:
+            was_commanded = self._run.moved_by_target(joint).any()
+            unknown = PropertyFinding("unknown", NO_MOTION if was_commanded else NO_END)
+            return {"order": unknown, "sign": unknown, "gear": unknown, "zero": zero}
+        drive = self._run.drives[joint]
+        candidates = [self._run.names[other] for other in swap_candidates(self._motions, self._order, joint)]
+        lost = find_lost_motion(self._run_in_place, joint)
+        return {
+            "order": _judge_order(turned, candidates),
+            "sign": _judge_sign(turned, drive),
+            "gear": _judge_gear(turned, lost, drive, self._allowed_backlash_rad),
+            "zero": zero,
+        }
+
+    def _findings_on_swapped(self, joint: int) -> dict[JointProperty, PropertyFinding]:
+        """Return the findings on a joint whose module is in another joint's place."""
+        names = self._run.names
+        other = names[int(self._order[joint])]
+        unknown = PropertyFinding(
+            "unknown", f"judged once the ids of {names[joint]} and {other} are right; run the check again then"
+        )
+        return {
+            "order": PropertyFinding("wrong", f"moves the link of {other}: their ids or cables are swapped"),
+            "sign": unknown,
+            "gear": unknown,
+            "zero": unknown,
+        }
 
 
-def _followed(run: Measured, joint: int) -> bool:
+def _followed_target(run: CheckMeasurements, joint: int) -> bool:
     """Return whether a joint's encoder followed its target."""
-    moved = run.moved_by_target(joint)
-    if not moved.any():
+    commanded = run.moved_by_target(joint)
+    if not commanded.any():
         return False
-    way_rad = float(np.ptp(run.target_rad[moved, joint]))
-    moves = np.abs(run.velocity_rad_s[moved, joint]) > MOVES_RAD_S
-    return run.moved_rad(joint) >= max(LEAST_MOVED_RAD, FOLLOWED * way_rad) and bool(np.mean(moves) >= FOLLOWED)
+    target_range_rad = float(np.ptp(run.target_rad[commanded, joint]))
+    is_moving = np.abs(run.velocity_rad_s[commanded, joint]) > MIN_RATE_RAD_S
+    moved_far_enough = run.moved_rad(joint) >= max(MIN_MOVED_RAD, MIN_FOLLOWED_FRACTION * target_range_rad)
+    moved_long_enough = bool(np.mean(is_moving) >= MIN_FOLLOWED_FRACTION)
+    return moved_far_enough and moved_long_enough
 
 
-def _torque_along_motion(run: Measured, joint: int) -> float | None:
-    """Return the mean of a joint's torque, positive where it drives; None where it is not measured."""
-    moves = run.moved_by_target(joint) & (np.abs(run.velocity_rad_s[:, joint]) > MOVES_RAD_S)
-    if "torque" not in run.drives[joint].measures or not moves.any():
+def _mean_driving_torque(run: CheckMeasurements, joint: int) -> float | None:
+    """Return the mean of a joint's torque, positive where it drives; None if it is not measured."""
+    velocity = run.velocity_rad_s[:, joint]
+    is_moving = run.moved_by_target(joint) & (np.abs(velocity) > MIN_RATE_RAD_S)
+    if "torque" not in run.drives[joint].measures or not is_moving.any():
         return None
-    return float(np.mean(run.torque_nm[moves, joint] * np.sign(run.velocity_rad_s[moves, joint])))
+    return float(np.mean(run.torque_nm[is_moving, joint] * np.sign(velocity[is_moving])))
 
 
-def _judge_drive(run: Measured, joint: int, torque_nm: float | None) -> Finding:
+def _judge_drive(run: CheckMeasurements, joint: int, torque_nm: float | None) -> PropertyFinding:
+    """Judge whether a joint's drive moves it. torque_nm: mean along the motion; None: not measured."""
     if not run.moved_by_target(joint).any():
-        return Finding("unknown", NO_END)
-    if not _followed(run, joint):
-        return Finding("wrong", "did not move: motor, brake, power, or a link that is held")
-    if torque_nm is not None and torque_nm < -LEAST_TORQUE_NM:
-        return Finding("wrong", "its torque has the wrong sign: it measures a brake while it drives")
+        return PropertyFinding("unknown", NO_END)
+    if not _followed_target(run, joint):
+        return PropertyFinding("wrong", "did not move: motor, brake, power, or a link that is held")
+    if torque_nm is not None and torque_nm < -MIN_TORQUE_NM:
+        return PropertyFinding("wrong", "its torque has the wrong sign: it measures a brake while it drives")
     return CONFIRMED
 
 
-def _judge_order(turned: float, candidates: Sequence[str]) -> Finding:
+def _judge_order(turned: float, candidates: Sequence[str]) -> PropertyFinding:
     """Judge whether a joint's module is in its place. candidates: joints whose modules may be there instead."""
-    if abs(turned) < NEAR:
-        return Finding("unknown", NO_LINK_TURNS)
+    if abs(turned) < MAX_RATIO_ERROR:
+        return PropertyFinding("unknown", NO_LINK_TURNS)
     if candidates:
-        return Finding("unknown", f"its module may be exchanged with that of {', '.join(candidates)}: {BY_DIRECTION}")
+        return PropertyFinding(
+            "unknown", f"its module may be exchanged with that of {', '.join(candidates)}: {BY_DIRECTION}"
+        )
     return CONFIRMED
 
 
-def _judge_sign(turned: float, drive: Drive) -> Finding:
+def _judge_sign(turned: float, drive: Drive) -> PropertyFinding:
+    """Judge whether a joint's links turn in the direction in which its encoder counts."""
     if np.isnan(turned):
-        return Finding("unknown", BY_DIRECTION)
-    if abs(turned) < NEAR:
-        return Finding("unknown", NO_LINK_TURNS)
+        return PropertyFinding("unknown", BY_DIRECTION)
+    if abs(turned) < MAX_RATIO_ERROR:
+        return PropertyFinding("unknown", NO_LINK_TURNS)
     if turned < 0:
-        return Finding("wrong", f"turns the other way: sign = {-drive.sign}")
+        return PropertyFinding("wrong", f"turns the other way: sign = {-drive.sign}")
     return CONFIRMED
 
 
-def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_backlash_rad: float) -> Finding:
+def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_backlash_rad: float) -> PropertyFinding:
+    """Judge whether a joint's links turn as far as its encoder counts. lost: its backlash; None: not known."""
     if np.isnan(turned):
-        return Finding("unknown", BY_GEAR)
-    if abs(turned) < NEAR:
-        return Finding("wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash")
+        return PropertyFinding("unknown", BY_GEAR)
+    if abs(turned) < MAX_RATIO_ERROR:
+        return PropertyFinding("wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash")
     ratio = abs(turned)
     reasons: list[str] = []
     if lost is not None and lost.lost_rad > max(allowed_backlash_rad, lost.noise_rad):
         ratio = abs(lost.ratio)
-        found = f"{lost.lost_rad:.3f} rad ({np.rad2deg(lost.lost_rad):.1f} degrees)"
+        backlash = f"{lost.lost_rad:.3f} rad ({np.rad2deg(lost.lost_rad):.1f} degrees)"
         reasons.append(
-            f"backlash of {found}: its drive turns that much further than its link when the load reverses, "
+            f"backlash of {backlash}: its drive turns that much further than its link when the load reverses, "
             f"{allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash"
         )
-    if abs(ratio - 1) >= NEAR:
-        backlash = ", or backlash, as it moved to one side only or its gyros are noisy" if lost is None else ""
-        reasons.append(f"turns {ratio:.2f} as far as its drive says: gear = {drive.gear / ratio:.3g}{backlash}")
-    return Finding("wrong", "; ".join(reasons)) if reasons else CONFIRMED
+    if abs(ratio - 1) >= MAX_RATIO_ERROR:
+        or_backlash = ""
+        if lost is None:
+            or_backlash = ", or backlash, as it moved to one side only or its gyros are noisy"
+        reasons.append(f"turns {ratio:.2f} as far as its drive says: gear = {drive.gear / ratio:.3g}{or_backlash}")
+    if reasons:
+        return PropertyFinding("wrong", "; ".join(reasons))
+    return CONFIRMED
 
 
-def _judge_zero(run: Measured, joint: int, *, straight: bool) -> Finding:
-    """Judge a joint's zero by gravity if that tells its angle, otherwise by the pose in which the robot was laid."""
+def _judge_zero(run: CheckMeasurements, joint: int, *, straight: bool) -> PropertyFinding:
+    """Judge a joint's zero by gravity if that gives its angle, otherwise by the pose in which the robot was laid."""
     at_rest = run.at_rest()
-    by_gravity_rad = _angle_by_gravity(run, joint, at_rest) if run.axes[joint] == "pitch" else None
+    by_gravity_rad = None
+    if run.axes[joint] == "pitch":
+        by_gravity_rad = _angle_by_gravity(run, joint, at_rest)
     if by_gravity_rad is not None:
-        off_rad = float(np.mean(run.angle_rad[at_rest, joint])) - by_gravity_rad
+        error_rad = float(np.mean(run.angle_rad[at_rest, joint])) - by_gravity_rad
         allowed_rad = LEVEL_RAD
     elif not straight:
-        return Finding("unknown", NOT_STRAIGHT)
+        return PropertyFinding("unknown", NOT_STRAIGHT)
     elif not run.before_motion().any():
-        return Finding("unknown", NO_REST)
+        return PropertyFinding("unknown", NO_REST)
     else:
-        off_rad = float(np.mean(run.angle_rad[run.before_motion(), joint]))
+        error_rad = float(np.mean(run.angle_rad[run.before_motion(), joint]))
         allowed_rad = STRAIGHT_RAD
-    if abs(off_rad) <= allowed_rad:
+    if abs(error_rad) <= allowed_rad:
         return CONFIRMED
     drive = run.drives[joint]
-    zero_rad = drive.zero_rad + drive.sign * drive.gear * off_rad
-    return Finding("wrong", f"its zero is off by {off_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
+    zero_rad = drive.zero_rad + drive.sign * drive.gear * error_rad
+    return PropertyFinding("wrong", f"its zero is off by {error_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
 
 
-def _angle_by_gravity(run: Measured, joint: int, at_rest: Select) -> float | None:
-    """Return a pitch joint's angle from the direction of gravity in both of its links; None where that is not known."""
-    tilts: list[float] = []
+def _angle_by_gravity(run: CheckMeasurements, joint: int, at_rest: Select) -> float | None:
+    """Return a pitch joint's angle from the direction of gravity in both of its links; None if that is not known."""
+    tilts_rad: list[float] = []
     for link in (joint, joint + 1):
         forces = run.link_force_m_s2[at_rest, link]
         known = forces[~np.isnan(forces[:, 0])]
         if not len(known):
             return None
         x, _, z = np.mean(known, axis=0)
-        if np.hypot(x, z) <= LEAST_GRAVITY_M_S2:
+        if np.hypot(x, z) <= MIN_GRAVITY_M_S2:
             return None
-        tilts.append(float(np.arctan2(x, z)))
-    difference_rad = tilts[0] - tilts[1]
+        tilts_rad.append(float(np.arctan2(x, z)))
+    difference_rad = tilts_rad[0] - tilts_rad[1]
     return float(np.arctan2(np.sin(difference_rad), np.cos(difference_rad)))

@@ -1,9 +1,9 @@
-"""How far each link turned while one joint moved, as a share of what that joint's encoder measured. Pure.
+"""Measures how far each link turned while one joint moved, as a fraction of what that joint's encoder measured. Pure.
 
-The difference of the shares of the links on both sides of joint k is what turned up at joint k. On a robot that is as
-its file says, that is 1 at k = j, the joint that moves, and elsewhere only what the encoder there measured, too,
-because held joints give way a little. Two modules whose ids are swapped break this pattern, and exchanging them
-restores it.
+The difference of the fractions of the links on both sides of joint k is the motion that the links made at joint k. On a
+robot that is as its file says, it is 1 at the joint that moves. At other joints it is only what the encoder there
+measured, too, because held joints give way a little. Two modules whose ids are swapped break this pattern, and
+exchanging them restores it.
 """
 
 from collections.abc import Sequence
@@ -13,103 +13,116 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.commissioning.measured import PITCH, YAW, Measured, Select
+from snakesim_operator.features.commissioning.measured import PITCH, YAW, CheckMeasurements, Select
 
-MOVES_RAD_S = 0.02  # slower samples tell nothing
-LEAST_SAMPLES = 8
-MISFIT = 0.1  # sum of squared shares that no IMU should have seen, from which two modules may have been swapped
-BETTER = 0.25  # of the misfit is left, if they were
-EXCLUDED = 0.4  # more misfit than as wired: the swap of two modules is excluded
-Order = NDArray[np.intp]
+MIN_RATE_RAD_S = 0.02  # slower samples tell nothing
+MIN_SAMPLES = 8
+MIN_SWAP_MISFIT = 0.1  # sum of squared fractions; two modules with less are not taken for swapped
+MAX_REMAINING_MISFIT = 0.25  # fraction of the misfit that may be left if a swap explains it
+EXCLUDED_MISFIT = 0.4  # a swap that makes the misfit this much larger is excluded
+Order = NDArray[np.intp]  # order[i]: the joint whose module is in the place of joint i
 
 
 @dataclass(frozen=True)
 class LinkShares:
-    """What was measured while one joint moved, as shares of that joint's motion by its encoder; NaN: unknown."""
+    """What was measured while one joint moved, as fractions of that joint's motion by its encoder; NaN: unknown."""
 
     links: Floats  # (links, joints): of each link, about the axis of each joint
     across: Floats  # (links, joints): of each link, across the axis of each joint: about z for pitch, about y for yaw
     seen: Floats  # (joints,): in each joint's encoder
 
-    def turned(self) -> Floats:
-        """Return what turned up at each joint, from the links on both sides of it, (joints,)."""
+    def motion_at_joints(self) -> Floats:
+        """Return the motion that the links made at each joint, from the links on both sides of it, (joints,)."""
         return np.diagonal(self.links[1:]) - np.diagonal(self.links)
 
     def with_modules(self, order: Order) -> "LinkShares":
-        """The module of joint order[i] in joint i's place: its encoder, and its IMU, on the link ahead of the joint."""
+        """Return the fractions as if the module of joint order[i] were in the place of joint i.
+
+        A module is its encoder, and its IMU, which is on the link ahead of the joint.
+        """
         links = [0, *(order + 1)]
         return LinkShares(self.links[links], self.across[links], self.seen[order])
 
     def misfit(self) -> float:
-        """Return what the IMUs measured otherwise than the encoders: a sum of squared shares."""
-        return float(np.nansum((self.turned() - self.seen) ** 2))
+        """Return by how much the IMUs disagree with the encoders: a sum of squared fractions."""
+        return float(np.nansum((self.motion_at_joints() - self.seen) ** 2))
 
     def misfit_elsewhere(self, place: int) -> float:
         """Return the misfit at all joints but one, whose sign and gear may be wrong, and across the axes of all."""
-        turned_across = np.diagonal(self.across[1:]) - np.diagonal(self.across)
-        elsewhere = np.delete(self.turned() - self.seen, place)
-        return float(np.nansum(elsewhere**2) + np.nansum(turned_across**2))
+        motion_across = np.diagonal(self.across[1:]) - np.diagonal(self.across)
+        elsewhere = np.delete(self.motion_at_joints() - self.seen, place)
+        return float(np.nansum(elsewhere**2) + np.nansum(motion_across**2))
 
 
-def link_shares(run: Measured, joint: int) -> LinkShares:
-    """Return what links and encoders did while a joint moved."""
-    moved = run.moved_by_target(joint)
+def measure_link_shares(run: CheckMeasurements, joint: int) -> LinkShares:
+    """Return what links and encoders measured while a joint moved."""
+    commanded = run.moved_by_target(joint)
     speed = run.velocity_rad_s[:, joint]
-    moves = moved & (np.abs(speed) > MOVES_RAD_S)
-    seen = np.array([_share(rate, speed, moves) for rate in run.velocity_rad_s.T])
-    components = [run.component(k) for k in range(len(run.axes))]
-    across = [YAW + PITCH - component for component in components]
+    moving = commanded & (np.abs(speed) > MIN_RATE_RAD_S)
+    seen = np.array([_fit_fraction(rate, speed, moving) for rate in run.velocity_rad_s.T])
+    along_axes = [run.component(k) for k in range(len(run.axes))]
+    across_axes = [YAW + PITCH - component for component in along_axes]
     return LinkShares(
-        links=_shares_of_links(run, joint, moved, moves, components),
-        across=_shares_of_links(run, joint, moved, moves, across),
+        links=_fractions_of_links(run, joint, commanded, moving, along_axes),
+        across=_fractions_of_links(run, joint, commanded, moving, across_axes),
         seen=seen,
     )
 
 
-def _shares_of_links(run: Measured, joint: int, moved: Select, moves: Select, components: Sequence[int]) -> Floats:
+def _fractions_of_links(
+    run: CheckMeasurements, joint: int, commanded: Select, moving: Select, components: Sequence[int]
+) -> Floats:
     """Return how much of the joint's motion each link made about an axis of each joint, (links, joints).
 
-    A joint's axis is the same in both of its links' frames, so that their shares about it may be subtracted. Those
+    A joint's axis is the same in both of its links' frames, so that their fractions about it may be subtracted. Those
     across it may be, as long as the joint is nearly straight.
     """
     speed = run.velocity_rad_s[:, joint]
-    by_component = {
-        at: [_share(rate, speed, moves) for rate in run.link_rate_rad_s[:, :, at].T] for at in set(components)
-    }
-    shares = np.array([by_component[at] for at in components]).T
-    if np.isnan(shares[0]).all():
-        angle_rad = _about_mean(run.angle_rad[:, joint], moved)
-        shares[0] = [_share(_about_mean(run.base_turn_rad[:, at], moved), angle_rad, moved) for at in components]
-    return shares
+    by_component: dict[int, list[float]] = {}
+    for component in set(components):
+        rates = run.link_rate_rad_s[:, :, component].T
+        by_component[component] = [_fit_fraction(rate, speed, moving) for rate in rates]
+    fractions = np.array([by_component[component] for component in components]).T
+    if np.isnan(fractions[0]).all():  # link 0 has no IMU; motion capture may have measured its angle
+        angle_rad = _remove_mean(run.angle_rad[:, joint], commanded)
+        for k, component in enumerate(components):
+            base_rad = _remove_mean(run.base_turn_rad[:, component], commanded)
+            fractions[0, k] = _fit_fraction(base_rad, angle_rad, commanded)
+    return fractions
 
 
-def _about_mean(signal: Floats, where: Select) -> Floats:
+def _remove_mean(signal: Floats, where: Select) -> Floats:
     return signal - np.mean(signal[where])
 
 
-def _share(rate: Floats, speed: Floats, moves: Select) -> float:
-    """Return by least squares how much of `speed` is in `rate`; NaN when too little was measured."""
-    known = moves & ~np.isnan(rate)
-    if known.sum() < LEAST_SAMPLES:
+def _fit_fraction(signal: Floats, reference: Floats, where: Select) -> float:
+    """Return by least squares how much of a reference is in a signal; NaN if too little was measured."""
+    known = where & ~np.isnan(signal)
+    if known.sum() < MIN_SAMPLES:
         return float("nan")
-    return float(rate[known] @ speed[known] / (speed[known] @ speed[known]))
+    return float(signal[known] @ reference[known] / (reference[known] @ reference[known]))
 
 
 def find_order(motions: Sequence[LinkShares | None]) -> Order:
-    """Return whose module is in the place of each joint's: swaps of two, as long as one makes both motions fit.
+    """Return whose module is in the place of each joint's.
 
-    Both motions are asked together: one alone may tell little, when the floor lets few links turn. A motion is None
-    where a joint did not move.
+    The pair whose exchange leaves the smallest misfit is exchanged, as long as the exchange explains the motions of
+    both joints. Both motions count together: one alone may tell little, when the floor lets few links turn.
+
+    Args:
+        motions: what was measured while each joint moved; None where a joint did not move.
     """
     order = np.arange(len(motions))
     pairs = [(j, k) for j in range(len(motions)) for k in range(j + 1, len(motions))]
     while pairs:
-        misfits = [_misfit(motions, _with_swap(order, *pair)) for pair in pairs]
+        misfits = [_total_misfit(motions, _with_swap(order, *pair)) for pair in pairs]
         best = pairs[int(np.argmin(misfits))]
         swapped = _with_swap(order, *best)
-        own = [motions[j] for j in best]
-        before = _misfit(own, order)
-        if before < MISFIT or _misfit(own, swapped) > BETTER * before:
+        motions_of_pair = [motions[j] for j in best]
+        misfit_before = _total_misfit(motions_of_pair, order)
+        if misfit_before < MIN_SWAP_MISFIT:
+            break
+        if _total_misfit(motions_of_pair, swapped) > MAX_REMAINING_MISFIT * misfit_before:
             break
         order = swapped
         pairs = [pair for pair in pairs if not {*pair} & {*best}]
@@ -123,13 +136,13 @@ def swap_candidates(motions: Sequence[LinkShares | None], order: Order, joint: i
         if other == joint:
             continue
         swapped = _with_swap(order, joint, other)
-        more = 0.0
+        additional_misfit = 0.0
         for mover in (joint, other):
             motion = motions[mover]
             if motion is not None:
                 as_wired = motion.with_modules(order).misfit_elsewhere(_place(order, mover))
-                more += motion.with_modules(swapped).misfit_elsewhere(_place(swapped, mover)) - as_wired
-        if more < EXCLUDED:
+                additional_misfit += motion.with_modules(swapped).misfit_elsewhere(_place(swapped, mover)) - as_wired
+        if additional_misfit < EXCLUDED_MISFIT:
             candidates.append(other)
     return candidates
 
@@ -139,7 +152,7 @@ def _place(order: Order, module: int) -> int:
     return int(np.flatnonzero(order == module)[0])
 
 
-def _misfit(motions: Sequence[LinkShares | None], order: Order) -> float:
+def _total_misfit(motions: Sequence[LinkShares | None], order: Order) -> float:
     return sum(motion.with_modules(order).misfit() for motion in motions if motion is not None)
 
 

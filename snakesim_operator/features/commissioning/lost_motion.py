@@ -1,11 +1,11 @@
-"""How much motion of a drive is lost in its gear when its load reverses: backlash. Pure.
+"""Measures how much motion of a drive is lost in its gear when its load reverses: backlash. Pure.
 
     rate of the link = ratio * rate of the drive       while the teeth of the gear touch
 
-A gear of another ratio loses a share of every motion: the link's rate is proportional to the drive's all the time.
-Backlash loses the same angle at each reversal, however long the motion: the rates are proportional but for the time in
-which the drive crosses the backlash. So the ratio is the one that most samples agree on, and what the drive turned
-further than the link, by that ratio, spans the backlash. A delay between IMU and encoder is estimated along with it.
+A gear of another ratio loses a fraction of every motion: the link's rate is proportional to the drive's all the time.
+Backlash loses the same angle at each reversal, however long the motion: the rates are proportional except while the
+drive crosses the backlash. So the ratio is the one that most samples agree on. With that ratio, the range of the
+drive angle minus the link angle is the backlash. A delay between IMU and encoder is estimated along with the ratio.
 """
 
 from dataclasses import dataclass
@@ -13,121 +13,139 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.commissioning.link_shares import LEAST_SAMPLES
-from snakesim_operator.features.commissioning.measured import Measured
+from snakesim_operator.features.commissioning.link_shares import MIN_SAMPLES
+from snakesim_operator.features.commissioning.measured import CheckMeasurements
 
-SMOOTHED_S = 0.04  # to either side: rates are slopes over that time, so that noisy angles give no noisy rates
-AROUND_S = 0.1  # before and after a joint's motion
-FAST = 0.3  # of the highest rate: slower samples tell no ratio
-AGREES = 0.06  # of the highest rate: such a sample agrees with a ratio
+SLOPE_HALF_WINDOW_S = 0.04  # rates are slopes over that time to either side, so that noisy angles give no noisy rates
+MARGIN_S = 0.1  # before and after a joint's motion
+FAST_FRACTION = 0.3  # of the highest rate; slower samples tell no ratio
+AGREEMENT = 0.06  # of the highest rate; a sample that is nearer to a ratio agrees with it
+MIN_ASSUMED_RATIO = 0.5  # a link behind a slower gear has slower rates, so the agreement scales with the ratio
 MAX_RATIO = 4.0
 MIN_RATIO = 0.12  # of a link that turns at all
 RATIO_STEP = 0.01
-MIN_AGREEING = 0.2  # of the fast samples
+MIN_AGREEING = 0.2  # fraction of the fast samples
 MAX_DELAY_S = 0.03  # between IMU and encoder
-SURE = 4.0  # standard deviations
+NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
+MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, of its median absolute deviation
 
 
 @dataclass(frozen=True)
 class LostMotion:
-    """What was lost between a joint's drive and its link."""
+    """The motion that was lost between a joint's drive and its link."""
 
     lost_rad: float  # by which the drive turned further than the link, from end to end
-    noise_rad: float  # that much would be found without any backlash, by the noise of gyros and encoder
+    noise_rad: float  # that much would be measured without any backlash, by the noise of gyros and encoder
     ratio: float  # of the link's rate to the drive's, while the teeth touch
 
 
-def find_lost_motion(run: Measured, joint: int) -> LostMotion | None:
-    """Return the motion that is lost in a joint that moved to and fro; None where it is not known."""
+def find_lost_motion(run: CheckMeasurements, joint: int) -> LostMotion | None:
+    """Return the motion that is lost in a joint that moved to and fro; None if it is not known."""
     moved = np.flatnonzero(run.moved_by_target(joint))
-    by_gyros = _link_angle(run, joint)
-    if by_gyros is None or len(moved) < LEAST_SAMPLES:
+    by_gyros = _integrate_link_angle(run, joint)
+    if by_gyros is None or len(moved) < MIN_SAMPLES:
         return None
     link_rad, drift = by_gyros
     encoder_rad = run.angle_rad[:, joint]
-    half = max(round(SMOOTHED_S / run.period_s), 1)
-    around = round(AROUND_S / run.period_s)
-    window = slice(max(moved[0] - around, 2 * half), min(moved[-1] + around, len(encoder_rad) - 2 * half))
-    drive_rate = _slope(encoder_rad, half, run.period_s)
-    acceleration = _slope(drive_rate, half, run.period_s)[window]
-    link_rate = _slope(link_rad, half, run.period_s)[window]
+    half_window = max(round(SLOPE_HALF_WINDOW_S / run.period_s), 1)
+    margin = round(MARGIN_S / run.period_s)
+    begin = max(moved[0] - margin, 2 * half_window)
+    end = min(moved[-1] + margin, len(encoder_rad) - 2 * half_window)
+    window = slice(begin, end)
+    drive_rate = _slope(encoder_rad, half_window, run.period_s)
+    acceleration = _slope(drive_rate, half_window, run.period_s)[window]
+    link_rate = _slope(link_rad, half_window, run.period_s)[window]
     drive_rate = drive_rate[window]
-    ratio = _ratio(drive_rate, link_rate)
+    ratio = _find_ratio(drive_rate, link_rate)
     if ratio is None:
         return None
-    ratio, delay_s = _refined(ratio, drive_rate, link_rate, acceleration)
-    behind_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
-    behind_rad = np.convolve(behind_rad, np.full(2 * half - 1, 1 / (2 * half - 1)), "valid")
-    duration_s = len(behind_rad) * run.period_s
+    ratio, delay_s = _refine_ratio(ratio, drive_rate, link_rate, acceleration)
+    difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
+    mean_window = np.full(2 * half_window - 1, 1 / (2 * half_window - 1))
+    difference_rad = np.convolve(difference_rad, mean_window, "valid")
+    duration_s = len(difference_rad) * run.period_s
     encoder_noise_rad = float(np.std(np.diff(encoder_rad[run.at_rest()]))) / np.sqrt(2)
-    noise_rad = SURE * float(np.hypot(drift * np.sqrt(duration_s) / abs(ratio), encoder_noise_rad / np.sqrt(half)))
-    return LostMotion(float(np.ptp(behind_rad)), noise_rad, ratio)
+    gyro_drift_rad = drift * np.sqrt(duration_s) / abs(ratio)
+    noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad / np.sqrt(half_window)))
+    return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
 
 
-def _ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
-    """Return the ratio on which most of the fast samples agree; None where too few do."""
+def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
+    """Return the ratio on which most of the fast samples agree; None if too few do."""
     highest = float(np.max(np.abs(drive_rate)))
-    fast = np.abs(drive_rate) > FAST * highest
+    fast = np.abs(drive_rate) > FAST_FRACTION * highest
     magnitudes = np.arange(MIN_RATIO, MAX_RATIO, RATIO_STEP)
     candidates = np.concatenate((magnitudes, -magnitudes))
-    apart = np.abs(link_rate[fast, None] - candidates * drive_rate[fast, None])
-    # A link behind a slower gear has slower rates, and so must agree better.
-    agreeing = np.mean(apart < AGREES * highest * np.maximum(np.abs(candidates), 0.5), axis=0)
+    distances = np.abs(link_rate[fast, None] - candidates * drive_rate[fast, None])  # (samples, candidates)
+    limits = AGREEMENT * highest * np.maximum(np.abs(candidates), MIN_ASSUMED_RATIO)
+    agreeing = np.mean(distances < limits, axis=0)
     best = int(np.argmax(agreeing))
-    return float(candidates[best]) if agreeing[best] >= MIN_AGREEING else None
+    if agreeing[best] < MIN_AGREEING:
+        return None
+    return float(candidates[best])
 
 
-def _refined(ratio: float, drive_rate: Floats, link_rate: Floats, acceleration: Floats) -> tuple[float, float]:
-    """Return the ratio by least squares over the samples that agree with it, and the link's delay in seconds."""
+def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, acceleration: Floats) -> tuple[float, float]:
+    """Return the ratio by least squares over the samples that agree with it, and the link's delay in seconds.
+
+    link rate = ratio * (drive rate - delay * acceleration)
+    """
     highest = float(np.max(np.abs(drive_rate)))
-    agrees = np.abs(link_rate - ratio * drive_rate) < 1.5 * AGREES * highest * max(abs(ratio), 0.5)
-    rows = np.column_stack((drive_rate[agrees], acceleration[agrees]))
-    values = np.linalg.lstsq(rows, link_rate[agrees], rcond=None)[0]
+    distances = np.abs(link_rate - ratio * drive_rate)
+    agrees = distances < 1.5 * AGREEMENT * highest * max(abs(ratio), MIN_ASSUMED_RATIO)
+    regressors = np.column_stack((drive_rate[agrees], acceleration[agrees]))
+    values = np.linalg.lstsq(regressors, link_rate[agrees], rcond=None)[0]
     delay_s = float(np.clip(-values[1] / values[0], -MAX_DELAY_S, MAX_DELAY_S))
     return float(values[0]), delay_s
 
 
-def _link_angle(run: Measured, joint: int) -> tuple[Floats, float] | None:
+def _integrate_link_angle(run: CheckMeasurements, joint: int) -> tuple[Floats, float] | None:
     """Return the joint's angle by the gyros of its links, (n,), up to a constant, and how it drifts by their noise.
 
     The drift is a standard deviation after one second; it grows with the square root of time. None without gyros.
     """
     component = run.component(joint)
-    behind = _gyro(run, joint, component)
-    ahead = _gyro(run, joint + 1, component)
-    base_rad = run.base_turn_rad[:, component]
+    behind = _read_gyro(run, joint, component)
+    ahead = _read_gyro(run, joint + 1, component)
     if ahead is None:
         return None
+    ahead_rate, ahead_drift = ahead
     if behind is not None:
-        rate = ahead[0] - behind[0]
-        return _integrated(rate, run.period_s), float(np.hypot(ahead[1], behind[1]))
+        behind_rate, behind_drift = behind
+        return _integrate(ahead_rate - behind_rate, run.period_s), float(np.hypot(ahead_drift, behind_drift))
+    base_rad = run.base_turn_rad[:, component]
     if joint == 0 and not np.isnan(base_rad).all():
         known = np.flatnonzero(~np.isnan(base_rad))
         base_rad = np.interp(np.arange(len(base_rad)), known, base_rad[known])
-        return _integrated(ahead[0], run.period_s) - base_rad, ahead[1]
+        return _integrate(ahead_rate, run.period_s) - base_rad, ahead_drift
     return None
 
 
-def _gyro(run: Measured, link: int, component: int) -> tuple[Floats, float] | None:
+def _read_gyro(run: CheckMeasurements, link: int, component: int) -> tuple[Floats, float] | None:
     """Return a link's rate at every tick, (n,), without its bias, and its drift after a second; None without a gyro."""
     rate = run.link_rate_rad_s[:, link, component]
     known = np.flatnonzero(~np.isnan(rate))
-    still = known[run.at_rest()[known]]
-    if len(still) < LEAST_SAMPLES:
+    at_rest = known[run.at_rest()[known]]
+    if len(at_rest) < MIN_SAMPLES:
         return None
-    bias = np.median(rate[still])
-    noise = 1.4826 * np.median(np.abs(rate[still] - bias))  # a standard deviation, whatever a few samples did
+    bias = np.median(rate[at_rest])
+    noise = MAD_TO_SD * np.median(np.abs(rate[at_rest] - bias))  # a few outliers do not change it
     sample_period_s = float(np.median(np.diff(known))) * run.period_s
-    return np.interp(np.arange(len(rate)), known, rate[known] - bias), float(noise * np.sqrt(sample_period_s))
+    rate_at_ticks = np.interp(np.arange(len(rate)), known, rate[known] - bias)
+    return rate_at_ticks, float(noise * np.sqrt(sample_period_s))
 
 
-def _integrated(rate: Floats, period_s: float) -> Floats:
+def _integrate(rate: Floats, period_s: float) -> Floats:
+    """Return the integral of a rate from the first tick, by trapezoids, (n,)."""
     steps = (rate[1:] + rate[:-1]) * period_s / 2
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-def _slope(signal: Floats, half: int, period_s: float) -> Floats:
-    """Return the slope of a line through `half` samples to either side, at every sample; not valid near the ends."""
-    offsets = np.arange(-half, half + 1)
+def _slope(signal: Floats, half_window: int, period_s: float) -> Floats:
+    """Return the slope of the line through the samples around each sample, (n,); not valid near the ends.
+
+    slope = sum(k * signal[i + k]) / sum(k^2) / period       for k from -half_window to half_window
+    """
+    offsets = np.arange(-half_window, half_window + 1)
     kernel = offsets / (offsets @ offsets) / period_s
     return np.convolve(signal, kernel[::-1], "same")

@@ -1,4 +1,4 @@
-"""The measurements of a run of the joint check: what encoders, motors, IMUs and motion capture said, tick by tick."""
+"""Collects what encoders, motors, IMUs and motion capture measured in a run of the joint check, tick by tick."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,15 +18,16 @@ from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
 
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
-NO_MOTION_RAD = 1e-6  # by which a target differs from its rest while its joint is moved
-CLAMPED = 0.9  # of the largest step from the measured angle: such a target is the command limiter's
-PITCH, YAW = 1, 2  # components of a vector in a link's frame
+MIN_TARGET_MOTION_RAD = 1e-6  # a target that is further from its rest moves its joint
+CLAMPED_FRACTION = 0.9  # of the largest step from the measured angle; beyond, the command limiter set the target
+PITCH = 1  # y, component of a vector in a link's frame
+YAW = 2  # z
 Select = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A run of the joint check; rows are ticks."""
+class CheckMeasurements:
+    """The measurements of a run of the joint check; rows are ticks."""
 
     period_s: float
     names: Sequence[str]
@@ -43,7 +44,7 @@ class Measured:
     def moved_by_target(self, joint: int) -> Select:
         """Return the ticks in which the joint's target is away from its rest, (n,)."""
         target_rad = self.target_rad[:, joint]
-        return np.abs(target_rad - np.median(target_rad)) > NO_MOTION_RAD
+        return np.abs(target_rad - np.median(target_rad)) > MIN_TARGET_MOTION_RAD
 
     def at_rest(self) -> Select:
         """Return the ticks in which no joint's target is away from its rest, (n,)."""
@@ -57,27 +58,29 @@ class Measured:
     def moved_rad(self, joint: int) -> float:
         """Return how far the joint moved by its encoder, from end to end."""
         moved = self.moved_by_target(joint)
-        return float(np.ptp(self.angle_rad[moved, joint])) if moved.any() else 0.0
+        if not moved.any():
+            return 0.0
+        return float(np.ptp(self.angle_rad[moved, joint]))
 
     def component(self, joint: int) -> int:
         """Return which component of a vector in a link's frame is about the joint's axis."""
         return YAW if self.axes[joint] == "yaw" else PITCH
 
 
-def imus_of(record: RunRecord) -> Iterable[Imu]:
-    """Read every IMU message of a run. Raises ConfigError."""
+def read_imus(record: RunRecord) -> Iterable[Imu]:
+    """Yield every IMU message of a run. Raises ConfigError."""
     path = record.folder if record.alone else record.folder / RECORDING
     decoder = Decoder(Imu)
     for message in RecordingReader(path).messages([keys.IMU]):
         yield decoder.decode(message.payload, message.encoding)
 
 
-def ticks_of(record: RunRecord) -> list[int]:
-    """Return the tick of every row."""
+def tick_numbers(record: RunRecord) -> list[int]:
+    """Return the tick of every row of a run log."""
     return np.round(record.time_s * record.config.rate_hz).astype(int).tolist()
 
 
-def by_imus(imus: Iterable[Imu], ticks: Sequence[int], links: int) -> tuple[Floats, Floats]:
+def arrange_by_tick(imus: Iterable[Imu], ticks: Sequence[int], links: int) -> tuple[Floats, Floats]:
     """Return angular rates and specific forces of the links, both (n, links, 3); NaN where no IMU reported."""
     row_of_tick = {tick: row for row, tick in enumerate(ticks)}
     rates = np.full((len(ticks), links, 3), np.nan)
@@ -90,17 +93,27 @@ def by_imus(imus: Iterable[Imu], ticks: Sequence[int], links: int) -> tuple[Floa
     return rates, forces
 
 
-def measured(
+def collect_measurements(
     config: RunConfig, robot: Description, ticks: Sequence[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
-) -> Measured:
-    """Return what joints, IMUs and motion capture measured. columns: those of `COLUMNS`, one row a tick."""
-    rates, forces = by_imus(imus, ticks, len(robot.links))
-    sensor = config.robot.sensors.pose
-    late = 0 if sensor is None else round(sensor.delay_s * config.rate_hz)
+) -> CheckMeasurements:
+    """Return what joints, IMUs and motion capture measured.
+
+    Args:
+        config: of the run.
+        robot: its description.
+        ticks: the tick of every row.
+        columns: those of `COLUMNS`, one row a tick.
+        imus: every IMU message of the run.
+    """
+    rates, forces = arrange_by_tick(imus, ticks, len(robot.links))
+    pose_sensor = config.robot.sensors.pose
+    delay_ticks = 0
+    if pose_sensor is not None:
+        delay_ticks = round(pose_sensor.delay_s * config.rate_hz)
     poses = np.full_like(columns["orientation_wxyz"], np.nan)
-    poses[: len(poses) - late] = columns["orientation_wxyz"][late:]
-    target_rad = unclamped(columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad)
-    return Measured(
+    poses[: len(poses) - delay_ticks] = columns["orientation_wxyz"][delay_ticks:]
+    target_rad = remove_clamped_targets(columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad)
+    return CheckMeasurements(
         period_s=config.period_ns * 1e-9,
         names=[joint.name for joint in robot.joints],
         axes=[joint.axis for joint in robot.joints],
@@ -111,37 +124,40 @@ def measured(
         target_rad=target_rad,
         link_rate_rad_s=rates,
         link_force_m_s2=forces,
-        base_turn_rad=_turns(poses),
+        base_turn_rad=_integrate_base_rate(poses),
     )
 
 
-def unclamped(target_rad: Floats, angle_rad: Floats, max_step_rad: float) -> Floats:
+def remove_clamped_targets(target_rad: Floats, angle_rad: Floats, max_step_rad: float) -> Floats:
     """Return the targets of the check, (n, joints), without those to which the command limiter brought them.
 
     A joint without current is swung by the motion of others. Once it is `max_step_rad` from its target, the limiter
     moves the target along with it, which is no motion of the check.
     """
-    clamped = np.abs(target_rad - angle_rad) > CLAMPED * max_step_rad
+    clamped = np.abs(target_rad - angle_rad) > CLAMPED_FRACTION * max_step_rad
     at_rest_rad = np.nanmedian(np.where(clamped, np.nan, target_rad), axis=0)
     return np.where(clamped, at_rest_rad, target_rad)
 
 
-def _turns(wxyz: Floats) -> Floats:
+def _integrate_base_rate(orientation_wxyz: Floats) -> Floats:
     """Return the integral of the base's angular rate in its own frame from the first known orientation, (n, 3).
 
-    That is what a gyro on the base would measure. A rotation from the first orientation would not be about the axis of
-    a joint any more once the body has rolled, as a straight body on a flat floor does.
+    A gyro on the base would measure that rate. A rotation from the first orientation would not be about the axis of a
+    joint any more once the body has rolled, as a straight body on a flat floor does. The rotation from one orientation
+    to the next is small, so its vector is the antisymmetric part of its matrix.
     """
-    turns = np.full((len(wxyz), 3), np.nan)
-    known = np.flatnonzero(np.isfinite(wxyz).all(axis=1) & (np.abs(wxyz).sum(axis=1) > 0))
-    if not len(known):
-        return turns
-    turned = np.zeros(3)
-    before = rotation_from_quaternion(wxyz[known[0]])
-    for row in known:
-        now = rotation_from_quaternion(wxyz[row])
-        step = before.T @ now  # small: of one tick, or of a few
-        turned = turned + np.array((step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1])) / 2
-        turns[row] = turned
+    integral = np.full((len(orientation_wxyz), 3), np.nan)
+    is_known = np.isfinite(orientation_wxyz).all(axis=1) & (np.abs(orientation_wxyz).sum(axis=1) > 0)
+    known_rows = np.flatnonzero(is_known)
+    if not len(known_rows):
+        return integral
+    angle = np.zeros(3)
+    before = rotation_from_quaternion(orientation_wxyz[known_rows[0]])
+    for row in known_rows:
+        now = rotation_from_quaternion(orientation_wxyz[row])
+        step = before.T @ now
+        twice_the_vector = np.array((step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]))
+        angle = angle + twice_the_vector / 2
+        integral[row] = angle
         before = now
-    return turns
+    return integral

@@ -27,38 +27,43 @@ def must_be_own(path: Path) -> None:
 
 
 def joints_on_drives(path: Path, running: Sequence[Joint]) -> list[Joint]:
-    """The joints of a robot file with the modes that their drives have, which may be fewer. Raises ConfigError.
+    """Return the joints of a robot file with the modes that their drives have, which may be fewer. Raises ConfigError.
 
-    running: those of a host; a backend leaves out modes that its drives do not have.
+    Args:
+        path: robot file.
+        running: the joints of a host; its backend leaves out the modes that its drives do not have.
     """
     joints = decode(read_part(str(path), "robots"), RobotFile).joint_table
-    for i, (said, runs) in enumerate(zip(joints, running, strict=False)):
-        modes = [mode for mode in said.drive.modes if mode in runs.drive.modes]
-        joints[i] = dataclasses.replace(
-            said, drive=msgspec.structs.replace(said.drive, modes=modes or said.drive.modes)
-        )
+    for i, (in_file, on_host) in enumerate(zip(joints, running, strict=False)):
+        modes = [mode for mode in in_file.drive.modes if mode in on_host.drive.modes]
+        drive = msgspec.structs.replace(in_file.drive, modes=modes or in_file.drive.modes)
+        joints[i] = dataclasses.replace(in_file, drive=drive)
     return joints
 
 
-def change_joints(path: Path, values: dict[str, dict[str, Any]], how: str) -> None:
-    """Set fields of `[joints.NAME]`, each with who, when and how beside it. Raises ConfigError; then nothing changed.
+def change_joints(path: Path, values: dict[str, dict[str, Any]], origin: str) -> None:
+    """Set fields of `[joints.NAME]`, each with a comment on its origin. Raises ConfigError; then nothing changed.
 
-    values: joint -> field -> value.
+    Args:
+        path: robot file.
+        values: joint -> field -> value.
+        origin: how the values were found; user and date are added.
     """
     document = tomlkit.parse(read_text(path))
-    joints = _section(document, "joints", super_table=True)
-    said = f"{how}, {user_name()}, {date.today().isoformat()}"
+    joints = _get_section(document, "joints", super_table=True)
+    comment = f"{origin}, {user_name()}, {date.today().isoformat()}"
     for name, fields in values.items():
-        section = _section(joints, name, super_table=False)
+        section = _get_section(joints, name, super_table=False)
         for field, value in fields.items():
-            item = tomlkit.item(round(value, 5) if isinstance(value, float) else value)
-            item.comment(said)
+            rounded = round(value, 5) if isinstance(value, float) else value
+            item = tomlkit.item(rounded)
+            item.comment(comment)
             section[field] = item
-    _replace(path, document)
+    _replace_file(path, document)
 
 
 def write_checked(path: Path, checked: Checked) -> None:
-    """Set the section [checked]. Raises ConfigError; then nothing changed."""
+    """Write the section `[checked]` of a robot file. Raises ConfigError; then nothing changed."""
     document = tomlkit.parse(read_text(path))
     section = tomlkit.table()
     section.comment("written by `snakesim joints check`; it counts until the joints above or their drives change")
@@ -66,13 +71,14 @@ def write_checked(path: Path, checked: Checked) -> None:
         if value:
             section[name] = value
     document["checked"] = section
-    _replace(path, document)
+    _replace_file(path, document)
 
 
-def _replace(path: Path, document: tomlkit.TOMLDocument) -> None:
-    """Write a robot file once its new content has been read as one. Raises ConfigError; then nothing changed."""
+def _replace_file(path: Path, document: tomlkit.TOMLDocument) -> None:
+    """Replace a robot file, once its new content could be read. Raises ConfigError; then nothing changed."""
     content = tomlkit.dumps(document).encode()
-    candidate = path.with_name(f".{path.name}")  # beside it, as `extends` may name a file from there
+    # The candidate is in the same folder, because `extends` may name a file relative to it.
+    candidate = path.with_name(f".{path.name}")
     try:
         write_whole(candidate, content)
         decode(read_part(str(candidate), "robots"), RobotFile)
@@ -85,10 +91,11 @@ def _replace(path: Path, document: tomlkit.TOMLDocument) -> None:
         candidate.unlink(missing_ok=True)
 
 
-def _section(within: Any, name: str, *, super_table: bool) -> Any:
-    if name not in within:
-        within[name] = tomlkit.table(is_super_table=super_table)
-    section = within[name]
+def _get_section(parent: Any, name: str, *, super_table: bool) -> Any:
+    """Return a section, which is made if it is missing. Raises ConfigError if it is written within one line."""
+    if name not in parent:
+        parent[name] = tomlkit.table(is_super_table=super_table)
+    section = parent[name]
     if not isinstance(section, Table):
         raise ConfigError(f"`{name}` is written within one line: write it as a section, [joints.{name}]")
     return section

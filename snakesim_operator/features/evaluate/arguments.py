@@ -13,24 +13,30 @@ if TYPE_CHECKING:
 
     from snakesim_hal.base.step_limit import Pulse
 
-TASK = "run"  # under which `snakesim --help` lists it
+TASK = "run"  # the heading of `snakesim --help` that lists it
 
 
 def add_commands(commands: Any) -> None:
-    """Add the three to the parser of `snakesim`."""
-    tried = commands.add_parser(
+    """Add `evaluate`, `sweep` and `optimize` to the parser of `snakesim`."""
+    _add_evaluate(commands)
+    _add_sweep(commands)
+    _add_optimize(commands)
+
+
+def _add_evaluate(commands: Any) -> None:
+    command = commands.add_parser(
         "evaluate",
         help="run controllers on many fields; a table with confidence intervals, and a page",
         epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run; "
         "130 stopped by Ctrl-C, and --resume goes on.",
     )
-    tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
-    tried.add_argument(
+    command.add_argument("suite", help="name of a shipped suite, or path of a suite file")
+    command.add_argument(
         "--controllers", "--controller", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
     )
-    tried.add_argument("--fields", type=number(1, 100_000), metavar="N", help="fields for each row and controller")
-    tried.add_argument("--rows", metavar="1,2,...", help="only these rows of the table, by number")
-    tried.add_argument(
+    command.add_argument("--fields", type=number(1, 100_000), metavar="N", help="fields for each row and controller")
+    command.add_argument("--rows", metavar="1,2,...", help="only these rows of the table, by number")
+    command.add_argument(
         "--against",
         action="append",
         default=[],
@@ -38,42 +44,46 @@ def add_commands(commands: Any) -> None:
         metavar="DIR",
         help="pair with the score card there",
     )
-    _add_set(tried)
-    _add_shared(tried)
-    tried.set_defaults(act=_evaluate)
+    _add_set(command)
+    _add_shared(command)
+    command.set_defaults(act=_evaluate)
 
-    swept = commands.add_parser("sweep", help="run a scenario with different values of any setting")
-    swept.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
-    swept.add_argument(
+
+def _add_sweep(commands: Any) -> None:
+    command = commands.add_parser("sweep", help="run a scenario with different values of any setting")
+    command.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
+    command.add_argument(
         "--vary", action="append", required=True, metavar="KEY=LOW:HIGH:COUNT", help="or KEY=[A, B]; may be repeated"
     )
-    swept.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each value (1)")
-    _add_set(swept)
-    _add_shared(swept)
-    swept.set_defaults(act=_sweep)
+    command.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each value (1)")
+    _add_set(command)
+    _add_shared(command)
+    command.set_defaults(act=_sweep)
 
-    searched = commands.add_parser("optimize", help="search settings for the best mean of a number of the summary")
-    searched.add_argument("scenario", help="name of a shipped scenario or path of its file; with --rows, of a suite")
-    searched.add_argument("--rows", metavar="1,2,...", help="on these rows of a suite, with what it draws")
-    searched.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
-    searched.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
-    searched.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
-    searched.add_argument(
+
+def _add_optimize(commands: Any) -> None:
+    command = commands.add_parser("optimize", help="search settings for the best mean of a number of the summary")
+    command.add_argument("scenario", help="name of a shipped scenario or path of its file; with --rows, of a suite")
+    command.add_argument("--rows", metavar="1,2,...", help="on these rows of a suite, with what it draws")
+    command.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
+    command.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
+    command.add_argument("--minimise", action="store_true", help="search the smallest instead of the largest")
+    command.add_argument(
         "--trials", type=number(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
     )
-    searched.add_argument(
+    command.add_argument(
         "--seeds",
         type=number(1, 100_000),
         default=1,
         metavar="N",
         help="runs for each trial, or fields for each row (1)",
     )
-    searched.add_argument(
+    command.add_argument(
         "--storage", type=Path, metavar="FILE", help="SQLite file; an old one goes on (default: a new one in runs/)"
     )
-    _add_set(searched)
-    _add_workers(searched)
-    searched.set_defaults(act=_optimize)
+    _add_set(command)
+    _add_workers(command)
+    command.set_defaults(act=_optimize)
 
 
 def _add_set(parser: argparse.ArgumentParser) -> None:
@@ -103,8 +113,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return _guarded_if_one_run(arguments, _evaluate_with)
 
 
+def _sweep(arguments: argparse.Namespace) -> int:
+    return _guarded_if_one_run(arguments, _sweep_with)
+
+
 def _guarded_if_one_run(arguments: argparse.Namespace, act: "Callable[[argparse.Namespace, Pulse | None], int]") -> int:
-    """A single run is computed in a child, which can be ended whatever its controller does."""
+    """Run a command; with `--only` in a child process, which can be ended whatever its controller does."""
     _check_extra()
     if arguments.only is None:
         return act(arguments, None)
@@ -114,75 +128,77 @@ def _guarded_if_one_run(arguments: argparse.Namespace, act: "Callable[[argparse.
 
 
 def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
-    from snakesim_hal.model.scenario import parse_set
-    from snakesim_operator.features.evaluate.evaluation import Request, go
-    from snakesim_operator.features.evaluate.suite import also_set, read_suite
+    from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
+    from snakesim_operator.features.evaluate.suite import override_suite, read_suite
 
     suite, source = read_suite(arguments.suite)
-    suite = also_set(suite, {one.key: one.value for one in map(parse_set, arguments.set)})
-    controllers = [name.strip() for name in (arguments.controllers or "").split(",") if name.strip()]
-    again = ["evaluate", arguments.suite, *(["--controllers", ",".join(controllers)] if controllers else [])]
+    suite = override_suite(suite, _parse_settings(arguments.set))
+    names = (arguments.controllers or "").split(",")
+    controllers = [name.strip() for name in names if name.strip()]
+    command = ["snakesim", "evaluate", arguments.suite]
+    if controllers:
+        command += ["--controllers", ",".join(controllers)]
     if arguments.rows:
-        again += ["--rows", arguments.rows]
-    again += [word for value in arguments.set for word in ("--set", value)]
-    fields = arguments.fields or suite.fields
-    chosen = controllers or suite.controllers
-    rows = _numbers(arguments.rows or "", "--rows")
-    name = Path(arguments.suite).stem
-    return go(
-        Request(suite, source, name, chosen, fields, rows=rows, against=arguments.against, **_shared(arguments, again)),
-        pulse,
+        command += ["--rows", arguments.rows]
+    command += _repeat_option("--set", arguments.set)
+    request = EvaluationRequest(
+        suite=suite,
+        source=source,
+        name=Path(arguments.suite).stem,
+        controllers=controllers or suite.controllers,
+        fields=arguments.fields or suite.fields,
+        rows=_parse_numbers(arguments.rows or "", "--rows"),
+        against=arguments.against,
+        **_shared_values(arguments, command),
     )
-
-
-def _numbers(text: str, flag: str) -> list[int]:
-    """Raises ConfigError."""
-    from snakesim_hal.base.errors import ConfigError
-
-    words = [word.strip() for word in text.split(",") if word.strip()]
-    if not all(word.isdecimal() and len(word) < 7 for word in words):
-        raise ConfigError(f"{flag} {text[:60]}: give whole numbers, such as {flag} 1,2")
-    return [int(word) for word in words]
-
-
-def _sweep(arguments: argparse.Namespace) -> int:
-    return _guarded_if_one_run(arguments, _sweep_with)
+    return evaluate(request, pulse)
 
 
 def _sweep_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
-    from snakesim_hal.model.scenario import parse_set
-    from snakesim_operator.features.evaluate.evaluation import Request, go
+    from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
     from snakesim_operator.features.evaluate.suite import Suite, parse_vary
 
     title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"[:200]
-    vary, always = dict(map(parse_vary, arguments.vary)), {one.key: one.value for one in map(parse_set, arguments.set)}
-    suite = Suite(title=title, scenario=arguments.scenario, set=always, vary=vary)
-    again = ["sweep", arguments.scenario]
-    for flag, values in (("--vary", arguments.vary), ("--set", arguments.set)):
-        again += [word for value in values for word in (flag, value)]
-    return go(Request(suite, "sweep", "sweep", [], arguments.seeds, **_shared(arguments, again)), pulse)
+    vary = dict(map(parse_vary, arguments.vary))
+    suite = Suite(title=title, scenario=arguments.scenario, set=_parse_settings(arguments.set), vary=vary)
+    command = ["snakesim", "sweep", arguments.scenario]
+    command += _repeat_option("--vary", arguments.vary)
+    command += _repeat_option("--set", arguments.set)
+    request = EvaluationRequest(
+        suite=suite,
+        source="sweep",
+        name="sweep",
+        controllers=[],
+        fields=arguments.seeds,
+        **_shared_values(arguments, command),
+    )
+    return evaluate(request, pulse)
 
 
-def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
+def _shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+    """Return the values of an `EvaluationRequest` that both commands have. command: that runs one case again."""
     names = ("seed", "only", "out", "resume", "cluster", "workers")
-    return {"again": shlex.join(["snakesim", *again]), **{name: getattr(arguments, name) for name in names}}
+    values = {name: getattr(arguments, name) for name in names}
+    values["command"] = shlex.join(command)
+    return values
 
 
 def _optimize(arguments: argparse.Namespace) -> int:
     _check_extra()
     from snakesim_hal.base.process import stop_signals_raise
     from snakesim_hal.base.terminal import say
-    from snakesim_operator.features.evaluate.optimize import Request, optimize
+    from snakesim_operator.features.evaluate.optimize import SearchRequest, optimize
     from snakesim_operator.run.conclusion import INTERRUPTED
     from snakesim_operator.run.folder import named_after
 
-    given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}
-    given["rows"] = _numbers(arguments.rows or "", "--rows")
-    given["seed"] = 1 if arguments.seed is None else arguments.seed
+    values = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)}
     storage = arguments.storage or named_after("optimize").with_suffix(".db")
+    values["storage"] = storage
+    values["rows"] = _parse_numbers(arguments.rows or "", "--rows")
+    values["seed"] = 1 if arguments.seed is None else arguments.seed
     with stop_signals_raise():
         try:
-            return optimize(Request(**{**given, "storage": storage}))
+            return optimize(SearchRequest(**values))
         except KeyboardInterrupt:  # no trial that is done is lost
             if storage.is_file():
                 say(f"stopped: {storage} keeps the trials that are done; the same command goes on with")
@@ -190,7 +206,34 @@ def _optimize(arguments: argparse.Namespace) -> int:
             return INTERRUPTED
 
 
+def _parse_settings(texts: list[str]) -> dict[str, Any]:
+    """Return the values of `--set`, by key. Raises ConfigError."""
+    from snakesim_hal.model.scenario import parse_set
+
+    overrides = map(parse_set, texts)
+    return {override.key: override.value for override in overrides}
+
+
+def _parse_numbers(text: str, option: str) -> list[int]:
+    """Return the numbers of a list such as `1,2`. Raises ConfigError."""
+    from snakesim_hal.base.errors import ConfigError
+
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not all(word.isdecimal() and len(word) < 7 for word in words):
+        raise ConfigError(f"{option} {text[:60]}: give whole numbers, such as {option} 1,2")
+    return [int(word) for word in words]
+
+
+def _repeat_option(option: str, values: list[str]) -> list[str]:
+    """Return the words of an option that is given once for each value."""
+    words: list[str] = []
+    for value in values:
+        words += [option, value]
+    return words
+
+
 def _check_extra() -> None:
+    """Raise an error that names the extra `evaluate` if it is not installed."""
     from snakesim_operator.base import extras
 
     extras.check("evaluate", "this command")

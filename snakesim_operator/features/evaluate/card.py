@@ -1,13 +1,14 @@
-"""The score card of an evaluation: what each controller did in each row, by what code, and how it pairs with others.
+"""The score card of an evaluation: what each controller did in each row, by what code, and how it compares with others.
 
-Two controllers are compared on the same fields only (McNemar's exact test of the fields that one crossed and the other
-did not), and p is corrected for how many comparisons there are (Holm).
+Two controllers are compared on the same fields only, by McNemar's exact test. Its p values are corrected for the number
+of comparisons by Holm's method.
 """
 
 import math
 import os
 import platform
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,46 +19,56 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_operator.features.evaluate.case import Case, code_digest
 from snakesim_operator.features.evaluate.store import Results
-from snakesim_operator.features.evaluate.table import Line, lines_of, wilson
+from snakesim_operator.features.evaluate.table import ResultRow, group_results, wilson_interval
 
 CARD = "card.json"
-OF_CROSSED, OF_ALL = True, False
-METRICS = {  # number of the summary -> its name, digits, and of which runs the median is
-    "advance_m_s": ("speed, m/s", 3, OF_CROSSED),
-    "body_lengths_s": ("speed, body lengths/s", 3, OF_CROSSED),
-    "energy_j_per_m": ("energy, J/m", 1, OF_CROSSED),
-    "cost_of_transport": ("cost of transport", 3, OF_CROSSED),
-    "propulsive_efficiency": ("propulsive efficiency", 3, OF_CROSSED),
-    "jam_ratio": ("jam ratio", 3, OF_ALL),
-    "impulse_n_s_per_m": ("contact impulse, N·s/m", 1, OF_CROSSED),
-    "torque_headroom": ("torque headroom", 2, OF_ALL),
-    "form_closure": ("form closure, share of time", 3, OF_ALL),
-    "planning_fraction": ("planning, share of turns", 2, OF_ALL),
-    "desired_force_correlation": ("solved forces: correlation with measured", 2, OF_ALL),
-    "desired_force_error": ("solved forces: median error", 2, OF_ALL),
-    "empty_push_points": ("solved forces: push-points that carried nothing", 2, OF_ALL),
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number of the summary whose median is on the card."""
+
+    label: str
+    digits: int
+    of_crossed: bool = False  # of the runs that reached their goal, instead of all runs
+
+
+METRICS = {
+    "advance_m_s": Metric("speed, m/s", 3, of_crossed=True),
+    "body_lengths_s": Metric("speed, body lengths/s", 3, of_crossed=True),
+    "energy_j_per_m": Metric("energy, J/m", 1, of_crossed=True),
+    "cost_of_transport": Metric("cost of transport", 3, of_crossed=True),
+    "propulsive_efficiency": Metric("propulsive efficiency", 3, of_crossed=True),
+    "jam_ratio": Metric("jam ratio", 3),
+    "impulse_n_s_per_m": Metric("contact impulse, N·s/m", 1, of_crossed=True),
+    "torque_headroom": Metric("torque headroom", 2),
+    "form_closure": Metric("form closure, share of time", 3),
+    "planning_fraction": Metric("planning, share of turns", 2),
+    "desired_force_correlation": Metric("solved forces: correlation with measured", 2),
+    "desired_force_error": Metric("solved forces: median error", 2),
+    "empty_push_points": Metric("solved forces: push-points that carried nothing", 2),
 }
 
 
 class Crossing(msgspec.Struct, frozen=True):
-    """One run: whether it crossed, and what names its field whatever the controller."""
+    """One run: whether it reached its goal."""
 
     controller: str
     row: str
     field: int
-    same: str
+    same: str  # hash of the configuration without its controller: equal for runs of two controllers that may be paired
     crossed: bool
 
 
 class Score(msgspec.Struct, frozen=True):
-    """One row with one controller; a metric that no run knows is null."""
+    """One row with one controller."""
 
     controller: str
     row: str
     runs: int
     crossed: int | None
-    interval: tuple[float, float]  # 95 %
-    medians: dict[str, float | None]
+    interval: tuple[float, float]  # 95 %, of the success rate
+    medians: dict[str, float | None]  # by the metric; null: no run knows it
 
 
 class Card(msgspec.Struct, frozen=True):
@@ -65,40 +76,46 @@ class Card(msgspec.Struct, frozen=True):
 
     suite: str
     version: str
-    code: str  # digest of SnakeSIM's code; a controller's file outside of it is not looked at
+    code: str  # digest of SnakeSIM's code; a controller's file outside of it does not count
     machine: str
     fields: list[int]
     scores: list[Score]
     crossings: list[Crossing]
 
 
-class Paired(msgspec.Struct, frozen=True):
+class Comparison(msgspec.Struct, frozen=True):
     """Two controllers on the fields of one row that both were tried on."""
 
     row: str
     one: str
     other: str
     fields: int
-    only_one: int  # crossed
+    only_one: int  # fields that only the first controller crossed
     only_other: int
-    p: float  # corrected
+    p: float  # corrected for the number of comparisons
 
 
-def card_of(suite: str, cases: Sequence[Case], done: Results) -> Card:
-    """Of all cases that are done."""
-    crossings = [
-        Crossing(case.controller, case.setting, case.field, _same(case), done[case.id].numbers.get("crossed") is True)
-        for case in cases
-        if case.id in done
-    ]
+def make_card(suite: str, cases: Sequence[Case], done: Results) -> Card:
+    """Return the score card of all cases that are done. suite: name of the evaluation."""
+    crossings: list[Crossing] = []
+    for case in cases:
+        if case.id in done:
+            crossed = done[case.id].numbers.get("crossed") is True
+            crossings.append(Crossing(case.controller, case.setting, case.field, _hash_any_controller(case), crossed))
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
-    fields = sorted({case.field for case in cases})
-    scores = [_score(line) for line in lines_of(cases, done)]
-    return Card(suite, version("snakesim"), code_digest(), machine, fields, scores, crossings)
+    return Card(
+        suite=suite,
+        version=version("snakesim"),
+        code=code_digest(),
+        machine=machine,
+        fields=sorted({case.field for case in cases}),
+        scores=[_score(row) for row in group_results(cases, done)],
+        crossings=crossings,
+    )
 
 
 def read_card(path: Path) -> Card:
-    """A card, or the folder that holds it. Raises ConfigError."""
+    """Return the card in a file, or in the folder that holds it. Raises ConfigError."""
     file = path / CARD if path.is_dir() else path
     try:
         return msgspec.json.decode(file.read_bytes(), type=Card)
@@ -106,77 +123,141 @@ def read_card(path: Path) -> Card:
         raise ConfigError(f"--against {path}: no score card ({error}); give the folder of an evaluation") from None
 
 
-def compare(card: Card, others: Sequence[Card]) -> list[Paired]:
-    """Its first controller with each other one, then each of its with those of other cards, row by row."""
-    names = list(dict.fromkeys(one.controller for one in card.crossings))
-    found = [paired for name in names[1:] for paired in _paired(card, names[0], card, name, name)]
+def compare(card: Card, others: Sequence[Card]) -> list[Comparison]:
+    """Compare controllers row by row, with p values corrected for the number of comparisons.
+
+    The first controller of the card is compared with each of its other controllers. Then each of its controllers is
+    compared with each controller of the other cards.
+    """
+    names = _controllers(card)
+    comparisons: list[Comparison] = []
+    for name in names[1:]:
+        comparisons += _compare_pair(card, names[0], card, name, label=name)
     for other in others:
         for name in names:
-            for theirs in dict.fromkeys(one.controller for one in other.crossings):
-                found += _paired(card, name, other, theirs, f"{theirs} ({other.version}, {other.code})")
-    return [msgspec.structs.replace(one, p=p) for one, p in zip(found, holm([one.p for one in found]), strict=True)]
+            for other_name in _controllers(other):
+                label = f"{other_name} ({other.version}, {other.code})"
+                comparisons += _compare_pair(card, name, other, other_name, label=label)
+    corrected = holm([comparison.p for comparison in comparisons])
+    return [msgspec.structs.replace(comparison, p=p) for comparison, p in zip(comparisons, corrected, strict=True)]
 
 
 def mcnemar(only_one: int, only_other: int) -> float:
-    """Exact, two-sided: p of as uneven a split of the fields on which they differ, if neither were better."""
-    differ = only_one + only_other
-    tail = sum(math.comb(differ, k) for k in range(min(only_one, only_other) + 1)) / 2**differ
+    """Return the two-sided p value of McNemar's exact test.
+
+    It is the probability that the n discordant fields split as unevenly as this, if neither controller were better:
+
+        p = min(1, 2 * sum over k <= min(only_one, only_other) of binomial(n, k) / 2^n)
+
+    Source: McNemar (1947), in its exact form by the binomial distribution.
+    """
+    n = only_one + only_other
+    tail = sum(math.comb(n, k) for k in range(min(only_one, only_other) + 1)) / 2**n
     return min(2 * tail, 1.0)
 
 
-def holm(values: Sequence[float]) -> list[float]:
-    """p of each, corrected for how many there are (Holm 1979)."""
-    corrected, highest = [0.0] * len(values), 0.0
-    for rank, i in enumerate(sorted(range(len(values)), key=lambda i: values[i])):
-        highest = max(highest, min((len(values) - rank) * values[i], 1.0))
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p values corrected for their number m: of the k-th smallest, the maximum over i <= k of (m - i + 1) p_i.
+
+    Source: Holm (1979), "A simple sequentially rejective multiple test procedure".
+    """
+    count = len(p_values)
+    corrected = [0.0] * count
+    highest = 0.0
+    ascending = sorted(range(count), key=lambda i: p_values[i])
+    for rank, i in enumerate(ascending):
+        highest = max(highest, min((count - rank) * p_values[i], 1.0))
         corrected[i] = highest
     return corrected
 
 
-def text(card: Card, pairs: Sequence[Paired]) -> list[str]:
-    """For a terminal: the numbers that the table does not have, and the pairs."""
-    found = [f"score card: {card.suite}, snakesim {card.version}, code {card.code}, {card.machine}"]
-    found.append(f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed")
+def card_lines(card: Card, comparisons: Sequence[Comparison]) -> list[str]:
+    """Return the card for a terminal: the numbers that the table does not have, and the comparisons."""
+    lines = [f"score card: {card.suite}, snakesim {card.version}, code {card.code}, {card.machine}"]
+    lines.append(f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed")
     for score in card.scores:
-        low, high = (100 * end for end in score.interval)
-        crossed = "no goal" if score.crossed is None else f"{score.crossed}/{score.runs} ({low:.0f}-{high:.0f} %)"
-        found.append(f"  {score.row}, {score.controller}: {crossed}")
-        for key, (name, digits, _) in METRICS.items():
-            value = score.medians[key]
-            found.append(f"    {name:<48}{'unknown' if value is None else f'{value:z.{digits}f}'}")
-    for one in pairs:
-        words = f"{one.only_one} fields only by the first, {one.only_other} only by the second, of {one.fields}"
-        found.append(f"  {one.row}: {one.one} against {one.other}: {words}; p = {one.p:.2g}")
-    if pairs:
-        found.append(f"p: McNemar's exact test, Holm's correction for {len(pairs)} comparisons")
-    return found
+        lines += _score_lines(score)
+    for comparison in comparisons:
+        counts = (
+            f"{comparison.only_one} fields only by the first, {comparison.only_other} only by the second, "
+            f"of {comparison.fields}"
+        )
+        lines.append(
+            f"  {comparison.row}: {comparison.one} against {comparison.other}: {counts}; p = {comparison.p:.2g}"
+        )
+    if comparisons:
+        lines.append(f"p: McNemar's exact test, Holm's correction for {len(comparisons)} comparisons")
+    return lines
 
 
-def _score(line: Line) -> Score:
-    medians = {key: _median(line.values(key, of_crossed=which)) for key, (_, _, which) in METRICS.items()}
-    return Score(line.controller, line.setting, line.runs, line.crossed, wilson(line.crossed or 0, line.runs), medians)
+def _score_lines(score: Score) -> list[str]:
+    crossed = "no goal"
+    if score.crossed is not None:
+        low, high = score.interval
+        crossed = f"{score.crossed}/{score.runs} ({100 * low:.0f}-{100 * high:.0f} %)"
+    lines = [f"  {score.row}, {score.controller}: {crossed}"]
+    for key, metric in METRICS.items():
+        median = score.medians[key]
+        shown = "unknown"
+        if median is not None:
+            shown = f"{median:z.{metric.digits}f}"
+        lines.append(f"    {metric.label:<48}{shown}")
+    return lines
+
+
+def _score(row: ResultRow) -> Score:
+    medians = {key: _median(row.values(key, of_crossed=metric.of_crossed)) for key, metric in METRICS.items()}
+    return Score(
+        controller=row.controller,
+        row=row.setting,
+        runs=row.runs,
+        crossed=row.crossed,
+        interval=wilson_interval(row.crossed or 0, row.runs),
+        medians=medians,
+    )
 
 
 def _median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if values else None
+    if not values:
+        return None
+    return float(np.median(values))
 
 
-def _same(case: Case) -> str:
+def _hash_any_controller(case: Case) -> str:
+    """Return a hash of a case's configuration without its controller: it names the field and all that it sets."""
     config = msgspec.json.decode(case.config, type=RunConfig)
     return config_hash(msgspec.structs.replace(config, controller="any", controllers={}))
 
 
-def _paired(card: Card, one: str, other: Card, name: str, called: str) -> list[Paired]:
-    theirs = {crossing.same: crossing.crossed for crossing in other.crossings if crossing.controller == name}
-    found: list[Paired] = []
+def _controllers(card: Card) -> list[str]:
+    """Return the controllers of a card, in the order in which they were tried."""
+    return list(dict.fromkeys(crossing.controller for crossing in card.crossings))
+
+
+def _compare_pair(card: Card, controller: str, other: Card, other_controller: str, *, label: str) -> list[Comparison]:
+    """Compare two controllers in each row in which both were tried on the same fields; p is not corrected yet.
+
+    Args:
+        card: the card of the first controller.
+        controller: its name.
+        other: the card of the second controller.
+        other_controller: its name.
+        label: how the second controller is shown.
+    """
+    other_crossed = {
+        crossing.same: crossing.crossed for crossing in other.crossings if crossing.controller == other_controller
+    }
+    outcomes: dict[str, list[tuple[bool, bool]]] = {}  # row -> whether first and second crossed each shared field
+    for crossing in card.crossings:
+        if crossing.controller == controller and crossing.same in other_crossed:
+            pairs = outcomes.setdefault(crossing.row, [])
+            pairs.append((crossing.crossed, other_crossed[crossing.same]))
+    comparisons: list[Comparison] = []
     for row in dict.fromkeys(crossing.row for crossing in card.crossings):
-        both = [
-            (crossing.crossed, theirs[crossing.same])
-            for crossing in card.crossings
-            if (crossing.controller, crossing.row) == (one, row) and crossing.same in theirs
-        ]
-        if both:
-            ours_only, theirs_only = both.count((True, False)), both.count((False, True))
-            p = mcnemar(ours_only, theirs_only)
-            found.append(Paired(row, one, called, len(both), ours_only, theirs_only, p))
-    return found
+        if row in outcomes:
+            pairs = outcomes[row]
+            only_one = pairs.count((True, False))
+            only_other = pairs.count((False, True))
+            p = mcnemar(only_one, only_other)
+            comparisons.append(Comparison(row, controller, label, len(pairs), only_one, only_other, p))
+    return comparisons

@@ -1,4 +1,4 @@
-"""One case: a configuration to run, and the numbers that come of it. Runs in a worker process."""
+"""One case of an evaluation: a configuration to run, and the numbers of its summary. Runs in a worker process."""
 
 import hashlib
 import threading
@@ -16,9 +16,9 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import simulate
 
 Number = bool | int | float | str | None
-OF_THE_CLOCK = {"wall_s", "real_time_factor", "overruns", "answered_fraction"}  # differ from run to run
-GAVE_UP = "gave_up"  # the number that says that a run was ended because it was stuck
-_turn = threading.Lock()  # a run takes what is printed: one at a time in a process
+WALL_CLOCK_NUMBERS = {"wall_s", "real_time_factor", "overruns", "answered_fraction"}  # they differ from run to run
+GAVE_UP = "gave_up"  # the number that is true if a run was ended because it was stuck
+_one_run_lock = threading.Lock()  # a run captures what is printed, so a process makes one run at a time
 
 
 @dataclass(frozen=True)
@@ -37,24 +37,24 @@ class Case:
 
     @property
     def columns(self) -> dict[str, Number]:
-        """What names it in the results."""
+        """The columns that identify this case in the results."""
         return {"row": self.row, "setting": self.setting, "controller": self.controller, "field": self.field}
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a case."""
+class CaseOutcome(msgspec.Struct, frozen=True, kw_only=True):
+    """The result of a case."""
 
     numbers: dict[str, Number] = {}  # the plain fields of the run's summary
     error: str | None = None  # why there was no run
 
 
 class TimeLimitError(BaseException):
-    """Raised in a run whose wall time is over. No `Exception`: a controller's guard must not catch it."""
+    """Raised in a run whose wall time is over. It is no `Exception`, because a controller's guard must not catch it."""
 
 
 @cache
 def code_digest() -> str:
-    """Names the code that is installed here: results of other code are not mixed with these."""
+    """Return a digest of the installed code, so that results of other code are not mixed with these."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[3].glob("snakesim_*/**/*.py")):
         digest.update(path.read_bytes())
@@ -62,35 +62,50 @@ def code_digest() -> str:
 
 
 def case_id(config: RunConfig, give_up_s: float) -> str:
-    """Equal for equal configurations and equal code."""
+    """Return an id that is equal for equal configurations and equal code."""
     return f"{config_hash(config)}-{code_digest()}-{give_up_s:g}"
 
 
-def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Outcome:
-    """Run it, and return the numbers. Anything but a SnakesimError is raised: a fault of this worker, perhaps."""
+def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> CaseOutcome:
+    """Run a case in this process, and return its numbers.
+
+    Args:
+        config: the whole configuration as JSON.
+        code: digest of the code that the case is for.
+        give_up_s: robot time without an advance after which the run is ended.
+        limit_s: wall time after which it is stopped.
+
+    Raises:
+        Exception: whatever is no SnakesimError, such as a fault of this worker or of a controller.
+    """
     if code != code_digest():
-        return Outcome(error="the worker has another version of SnakeSIM; install the same, and go on with --resume")
-    with _turn:
+        return CaseOutcome(
+            error="the worker has another version of SnakeSIM; install the same, and go on with --resume"
+        )
+    with _one_run_lock:
         try:
-            asked = msgspec.json.decode(config, type=RunConfig)
-            check(asked)
-            with closing(StepLimit(limit_s, error=TimeLimitError)) as limit, limit:
-                result = simulate(asked, until_goal=True, give_up_s=give_up_s, turn_limit_s=limit_s)
-            return Outcome(
-                numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up and not result.summary.crossed}
-            )
+            return _simulate_case(msgspec.json.decode(config, type=RunConfig), give_up_s, limit_s)
         except TimeLimitError:
             return took_too_long(limit_s)
         except SnakesimError as error:
-            return Outcome(error=str(error))
+            return CaseOutcome(error=str(error))
 
 
-def took_too_long(limit_s: float) -> Outcome:
+def _simulate_case(config: RunConfig, give_up_s: float, limit_s: float) -> CaseOutcome:
+    check(config)
+    with closing(StepLimit(limit_s, error=TimeLimitError)) as limit, limit:
+        result = simulate(config, until_goal=True, give_up_s=give_up_s, turn_limit_s=limit_s)
+    numbers = plain_numbers(result.summary)
+    numbers[GAVE_UP] = result.gave_up and not result.summary.crossed
+    return CaseOutcome(numbers=numbers)
+
+
+def took_too_long(limit_s: float) -> CaseOutcome:
     """Return the outcome of a case that was stopped at its limit of wall time."""
-    return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
+    return CaseOutcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
 
 
 def plain_numbers(summary: RunSummary) -> dict[str, Number]:
-    """Every plain field that depends on nothing but configuration and code."""
-    fields = {name: getattr(summary, name) for name in summary.__struct_fields__ if name not in OF_THE_CLOCK}
+    """Return every plain field of a summary that depends only on configuration and code."""
+    fields = {name: getattr(summary, name) for name in summary.__struct_fields__ if name not in WALL_CLOCK_NUMBERS}
     return {name: value for name, value in fields.items() if isinstance(value, Number)}

@@ -1,4 +1,4 @@
-"""The workers that run cases: processes on this computer, or those of a lab's Dask cluster."""
+"""Runs cases on workers: processes on this computer, or those of a lab's Dask cluster."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from snakesim_operator.base.worker_pool import MAX_DEATHS, CallTookTooLongError, Raised, WorkerDiedError, WorkerPool
 from snakesim_operator.base.worker_pool import Outcome as CallOutcome
-from snakesim_operator.features.evaluate.case import Case, Outcome, code_digest, run_case, took_too_long
+from snakesim_operator.features.evaluate.case import Case, CaseOutcome, code_digest, run_case, took_too_long
 
 if TYPE_CHECKING:  # Dask takes a second to import, and only `--cluster` needs it
     from distributed import Client, Future
@@ -16,13 +16,13 @@ KILL_AFTER_S = 30.0  # beyond a case's own limit, which only Python code obeys; 
 
 
 class Workers(Protocol):
-    """What runs cases."""
+    """Runs cases, several at a time."""
 
     def size(self) -> int:
         """Return how many cases run at a time now."""
         ...
 
-    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
         """Run all cases; yield each with its outcome as it is done.
 
         They begin in the order given. No two may have one id.
@@ -59,14 +59,12 @@ class LocalWorkers:
         self._pool = pool
 
     def size(self) -> int:
-        """Return how many cases run at a time."""
         return self._pool.size
 
-    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
-        """Run all cases; yield each with its outcome as it is done."""
+    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
         if not cases:
             return
-        calls = [_arguments(case) for case in cases]
+        calls = [_call_arguments(case) for case in cases]
         limit_s = max(case.limit_s for case in cases) + KILL_AFTER_S
         for number, outcome in self._pool.run(run_case, calls, limit_s):
             yield cases[number], _outcome_of_call(cases[number], outcome)
@@ -79,21 +77,19 @@ class ClusterWorkers:
         self._client = client
 
     def size(self) -> int:
-        """Return how many workers the cluster has now."""
         return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
 
-    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
-        """Run all cases; yield each with its outcome as it is done."""
+    def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
         from distributed import as_completed
 
         submitted: dict[Future, Case] = {}
-        for place, case in enumerate(cases):
+        for index, case in enumerate(cases):
             future = self._client.submit(
                 run_case,
-                *_arguments(case),
+                *_call_arguments(case),
                 key=case.id,
                 retries=RETRIES,
-                priority=-place,  # otherwise the last comes first
+                priority=-index,  # otherwise the last case begins first
             )
             submitted[future] = case
         for future in as_completed(submitted, loop=self._client.loop):
@@ -101,11 +97,11 @@ class ClusterWorkers:
             future.release()
 
 
-def _arguments(case: Case) -> tuple[bytes, str, float, float]:
+def _call_arguments(case: Case) -> tuple[bytes, str, float, float]:
     return case.config, code_digest(), case.give_up_s, case.limit_s
 
 
-def _outcome_of_call(case: Case, outcome: CallOutcome) -> Outcome:
+def _outcome_of_call(case: Case, outcome: CallOutcome) -> CaseOutcome:
     if not isinstance(outcome, Raised):
         return outcome.value
     match outcome.error:
@@ -113,24 +109,24 @@ def _outcome_of_call(case: Case, outcome: CallOutcome) -> Outcome:
             return _outcome_of_deaths(MAX_DEATHS)
         case CallTookTooLongError():
             return took_too_long(case.limit_s)
-        case error:  # whatever a controller raised; the other cases go on
+        case error:  # a controller may raise anything; the other cases go on
             return _outcome_of_error(error)
 
 
-def _outcome_of_future(future: "Future") -> Outcome:
+def _outcome_of_future(future: "Future") -> CaseOutcome:
     from distributed.scheduler import KilledWorker
 
     try:
         return future.result()
     except KilledWorker as error:
         return _outcome_of_deaths(error.allowed_failures + 1)
-    except Exception as error:  # noqa: BLE001 - whatever a controller raised; the other cases go on
+    except Exception as error:  # noqa: BLE001 - a controller may raise anything; the other cases go on
         return _outcome_of_error(error)
 
 
-def _outcome_of_deaths(count: int) -> Outcome:
-    return Outcome(error=f"its worker process died, {count} times; its memory may not suffice")
+def _outcome_of_deaths(count: int) -> CaseOutcome:
+    return CaseOutcome(error=f"its worker process died, {count} times; its memory may not suffice")
 
 
-def _outcome_of_error(error: Exception) -> Outcome:
-    return Outcome(error=f"{type(error).__name__}: {error}"[:300])
+def _outcome_of_error(error: Exception) -> CaseOutcome:
+    return CaseOutcome(error=f"{type(error).__name__}: {error}"[:300])

@@ -1,4 +1,4 @@
-"""Runs the cases of a suite, keeps what is done, prints the table and draws the page."""
+"""Runs the cases of a suite, stores what is done, prints the table and draws the page."""
 
 import re
 import secrets
@@ -17,155 +17,196 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.base.dask_cluster import check_address
 from snakesim_operator.features.evaluate import store
-from snakesim_operator.features.evaluate.card import CARD, Card, card_of, compare, read_card, text
+from snakesim_operator.features.evaluate.card import CARD, Card, card_lines, compare, make_card, read_card
 from snakesim_operator.features.evaluate.case import Case
 from snakesim_operator.features.evaluate.cluster import workers
-from snakesim_operator.features.evaluate.page import page
+from snakesim_operator.features.evaluate.page import render_page
 from snakesim_operator.features.evaluate.progress import Progress
-from snakesim_operator.features.evaluate.suite import Suite, cases_of, rows_of
-from snakesim_operator.features.evaluate.table import best_of, lines_of, table, worst
+from snakesim_operator.features.evaluate.suite import Suite, make_cases, select_rows
+from snakesim_operator.features.evaluate.table import best_controller, group_results, table_lines, worst_failures
 from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.folder import named_after
 from snakesim_operator.run.in_process import run_in_process
 
-FRESH = (1_000_000, 2_000_000_000)  # fields that a suite draws: beyond any that settings were tuned on
+FIRST_DRAWN_FIELD = 1_000_000  # fields that a suite draws are beyond any that parameters were tuned on
+LAST_DRAWN_FIELD = 2_000_000_000
 PAGE = "evaluation.html"
 
 
 @dataclass(frozen=True)
-class Request:
-    """What the command line asks for."""
+class EvaluationRequest:
+    """The request of the command line."""
 
+    # Cases.
     suite: Suite
     source: str  # the suite's file, or the command that stands for one
     name: str
-    controllers: Sequence[str]  # none: the scenario's
+    controllers: Sequence[str]  # none: that of the scenario
     fields: int
-    again: str  # the command for one case, but for `--only`
-    seed: int | None = None  # None: 1, or fields that the suite draws
+    seed: int | None = None  # number of the first field; None: 1, or drawn by the suite
     rows: Sequence[int] = ()  # none: all
-    against: Sequence[Path] = ()  # other evaluations' score cards
-    only: str | None = None
+    only: str | None = None  # the one case to run
+    # Results.
+    command: str = ""  # the command that runs one case, without `--only`
+    against: Sequence[Path] = ()  # score cards of other evaluations
     out: Path | None = None
     resume: bool = False
+    # Workers.
     cluster: str | None = None
     workers: int | None = None
 
 
-def go(request: Request, pulse: Pulse | None = None) -> int:
-    """Run all cases that are not done yet, or one as a run of its own. pulse: of that one, as of `run_in_process`.
+def evaluate(request: EvaluationRequest, pulse: Pulse | None = None) -> int:
+    """Run all cases that are not done yet, or one case as a run with its own folder.
 
-    Returns: 0; 1 when a case could not run; 130 when it was stopped, which loses no case that is done.
+    Args:
+        request: the cases, and what to do with them.
+        pulse: of the one case, as in `run_in_process`.
+
+    Returns:
+        0; 1 if a case could not run; 130 if it was stopped, which loses no case that is done.
     """
     if request.only is not None:
-        return _run_one(request, request.only, pulse)
+        return _run_one_case(request, request.only, pulse)
     with stop_signals_raise():
         try:
-            return _run_all(request)
+            return _run_all_cases(request)
         except KeyboardInterrupt:
             say("stopped before any case was begun")
             return INTERRUPTED
 
 
-def _run_all(request: Request) -> int:
+def _run_all_cases(request: EvaluationRequest) -> int:
+    """Run all cases that are not done yet, and write the results. Return the exit code."""
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out")
     check_address(request.cluster)
-    others = [read_card(path) for path in request.against]
-    seed = first_field(request)
-    cases = cases_of(request.suite, request.source, request.controllers, request.fields, seed)
-    cases = rows_of(cases, request.rows, request.source)
+    other_cards = [read_card(path) for path in request.against]
+    seed = choose_first_field(request)
+    cases = make_cases(request.suite, request.source, request.controllers, request.fields, seed)
+    cases = select_rows(cases, request.rows, request.source)
     out = request.out or named_after(request.name)
-    with store.opened(out, resume=request.resume) as kept:
-        todo = list({case.id: case for case in cases if case.id not in kept.done}.values())
-        todo.sort(key=lambda case: case.field)  # whenever it ends early, every row has as many fields
+    with store.open_store(out, resume=request.resume) as results:
+        todo = list({case.id: case for case in cases if case.id not in results.done}.values())
+        todo.sort(key=lambda case: case.field)  # if it is stopped, every row has results of the same fields
         if request.resume:
             say(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
         try:
             if todo:
-                _run(request, todo, kept, out)
-            _finish(request, cases, kept.done, out, others)
+                _run_on_workers(request, todo, results, out)
+            _report(request, cases, results.done, out, other_cards)
         except KeyboardInterrupt:
-            done = sum(case.id in kept.done for case in cases)
-            drawn = f" --seed {seed}" if request.suite.fresh else ""
+            done = sum(case.id in results.done for case in cases)
             say(f"stopped: {done} of {len(cases)} cases are done; the same command goes on with")
-            say(f"  --resume --out {shlex.quote(str(out))}{drawn}")
+            seed_option = f" --seed {seed}" if request.suite.fresh else ""
+            say(f"  --resume --out {shlex.quote(str(out))}{seed_option}")
             return INTERRUPTED
-        return 1 if any(kept.done[case.id].error is not None for case in cases) else 0
+        has_errors = any(results.done[case.id].error is not None for case in cases)
+        return 1 if has_errors else 0
 
 
-def first_field(request: Request) -> int:
-    """As asked for, else 1, or drawn now and said. Raises ConfigError."""
-    if request.seed is not None or not request.suite.fresh:
-        return 1 if request.seed is None else request.seed
+def choose_first_field(request: EvaluationRequest) -> int:
+    """Return the number of the first field: as requested, or drawn now if the suite draws its fields, or 1.
+
+    Raises:
+        ConfigError: an evaluation is resumed, and it is not known which fields were drawn.
+    """
+    if request.seed is not None:
+        return request.seed
+    if not request.suite.fresh:
+        return 1
     if request.resume:
         raise ConfigError("--resume: this suite draws its fields; name with --seed those that were printed as drawn")
-    seed = secrets.randbelow(FRESH[1] - FRESH[0]) + FRESH[0]
+    seed = secrets.randbelow(LAST_DRAWN_FIELD - FIRST_DRAWN_FIELD) + FIRST_DRAWN_FIELD
     say(f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again")
     return seed
 
 
-def _run_one(request: Request, only: str, pulse: Pulse | None) -> int:
-    """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
-    case = choose(request.suite, request.source, only)
+def _run_one_case(request: EvaluationRequest, only: str, pulse: Pulse | None) -> int:
+    """Run one case in this process, with the whole folder of a run. Return the exit code of `snakesim run`."""
+    case = find_case(request.suite, request.source, only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
     return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, pulse=pulse)
 
 
-def choose(suite: Suite, source: str, only: str) -> Case:
-    """The case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
-    named = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
-    if named is None:
+def find_case(suite: Suite, source: str, only: str) -> Case:
+    """Return the case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
+    parts = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
+    if parts is None:
         raise ConfigError(f"--only {short(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1")
-    cases = cases_of(suite, source, [named["controller"]], 1, int(named["field"]))
-    fitting = [case for case in cases if named["row"] is None or case.row == int(named["row"])]
-    if len(fitting) == 1:
-        return fitting[0]
+    cases = make_cases(suite, source, [parts["controller"]], 1, int(parts["field"]))
+    matching = [case for case in cases if parts["row"] is None or case.row == int(parts["row"])]
+    if len(matching) == 1:
+        return matching[0]
     rows = ", ".join(f"{case.row} ({case.setting})" for case in cases[:12])
-    raise ConfigError(f"--only {only}: add one of the rows, as in {name_of(cases[0])}; there are {rows}")
+    raise ConfigError(f"--only {only}: add one of the rows, as in {name_case(cases[0])}; there are {rows}")
 
 
-def name_of(case: Case) -> str:
-    """As `--only` takes it."""
+def name_case(case: Case) -> str:
+    """Return the name of a case as `--only` accepts it."""
     return f"{case.controller}:{case.field}:{case.row}"
 
 
-def _run(request: Request, todo: Sequence[Case], kept: store.Store, out: Path) -> None:
-    with workers(request.cluster, request.workers) as working, Progress(len(todo)) as shown:
+def _run_on_workers(request: EvaluationRequest, todo: Sequence[Case], results: store.ResultStore, out: Path) -> None:
+    """Run cases on workers, and store each as it is done."""
+    with workers(request.cluster, request.workers) as pool, Progress(len(todo)) as progress:
         where = request.cluster or "on this computer"
-        say(f"{len(todo)} cases on {working.size()} workers, {where}")
+        say(f"{len(todo)} cases on {pool.size()} workers, {where}")
         say(f"results: {out}; if this ends early, --resume --out {out} goes on")
-        for case, outcome in working.solve(todo):
-            kept.add(case, outcome)
-            shown.done(outcome)
+        for case, outcome in pool.solve(todo):
+            results.append(case, outcome)
+            progress.count(outcome)
 
 
-def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: Path, others: Sequence[Card]) -> None:
-    lines = lines_of(cases, done)
-    best = best_of(lines)
-    failed = worst([case for case in cases if case.controller == best], done)
-    for words in table(lines):
-        say(words)
-    if any(line.runs == 1 and line.crossed is None for line in lines):
+def _report(
+    request: EvaluationRequest, cases: Sequence[Case], done: store.Results, out: Path, other_cards: Sequence[Card]
+) -> None:
+    """Print the table and the worst failures, and write tables, score card and page."""
+    rows = group_results(cases, done)
+    for line in table_lines(rows):
+        say(line)
+    if any(row.runs == 1 and row.crossed is None for row in rows):
         say("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
-    if broken := [(case, why) for case in cases if (why := done[case.id].error) is not None]:
-        say(f"{len(broken)} could not run, the first: {name_of(broken[0][0])}: {broken[0][1]}")
-    again = [
-        (f"{case.setting}, {name_of(case)}", why, f"{request.again} --only {shlex.quote(name_of(case))}")
-        for case, why in failed
-    ]
-    if again:
-        say(f"the worst {len(again)} of {best}:" if len(again) > 1 else f"the worst of {best}:")
-    for name, why, command in again:
-        for words in (f"  {name}: {why}", f"    {command}"):
-            say(words)
+    _print_errors(cases, done)
+    best = best_controller(rows)
+    failures = _find_failures(request, [case for case in cases if case.controller == best], done)
+    _print_failures(best, failures)
     paths = store.write_tables(out, cases, done)
-    card = card_of(request.name, cases, done)
-    if request.suite.fresh or others:
-        for words in text(card, compare(card, others)):
-            say(words)
+    card = make_card(request.name, cases, done)
+    if request.suite.fresh or other_cards:
+        for line in card_lines(card, compare(card, other_cards)):
+            say(line)
     write_text(out / CARD, msgspec.json.format(msgspec.json.encode(card), indent=1).decode())
-    write_text(out / PAGE, page(request.suite.title or request.name, request.source, lines, again))
+    write_text(out / PAGE, render_page(request.suite.title or request.name, request.source, rows, failures))
     for path in (*paths, out / CARD, out / PAGE):
         say(f"written: {path}")
+
+
+def _print_errors(cases: Sequence[Case], done: store.Results) -> None:
+    """Print how many cases could not run, and why the first of them could not."""
+    broken = [case for case in cases if done[case.id].error is not None]
+    if broken:
+        first = broken[0]
+        say(f"{len(broken)} could not run, the first: {name_case(first)}: {done[first.id].error}")
+
+
+def _find_failures(
+    request: EvaluationRequest, cases: Sequence[Case], done: store.Results
+) -> list[tuple[str, str, str]]:
+    """Return the worst failures, each with its name, how it ended, and the command that runs it again."""
+    failures: list[tuple[str, str, str]] = []
+    for case, reason in worst_failures(cases, done):
+        name = name_case(case)
+        failures.append((f"{case.setting}, {name}", reason, f"{request.command} --only {shlex.quote(name)}"))
+    return failures
+
+
+def _print_failures(controller: str, failures: Sequence[tuple[str, str, str]]) -> None:
+    if len(failures) > 1:
+        say(f"the worst {len(failures)} of {controller}:")
+    elif failures:
+        say(f"the worst of {controller}:")
+    for name, reason, command in failures:
+        say(f"  {name}: {reason}")
+        say(f"    {command}")

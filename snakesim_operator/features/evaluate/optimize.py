@@ -1,4 +1,4 @@
-"""`snakesim optimize`: searches settings for the best mean of a number, with Optuna; a file keeps all trials."""
+"""`snakesim optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
 
 import shlex
 import time
@@ -18,7 +18,7 @@ from snakesim_hal.base.errors import ConfigError, short
 from snakesim_hal.base.terminal import say
 from snakesim_hal.model.scenario import compose, parse_set
 from snakesim_operator.base.dask_cluster import check_address
-from snakesim_operator.features.evaluate.case import GAVE_UP, Case, Outcome, code_digest
+from snakesim_operator.features.evaluate.case import GAVE_UP, Case, CaseOutcome, code_digest
 from snakesim_operator.features.evaluate.cluster import Workers, workers
 from snakesim_operator.features.evaluate.search_file import (
     NUMBER,
@@ -29,7 +29,14 @@ from snakesim_operator.features.evaluate.search_file import (
     hash_configurations,
     open_study,
 )
-from snakesim_operator.features.evaluate.suite import Suite, also_set, cases_of, read_suite, rows_of, seeds_of
+from snakesim_operator.features.evaluate.suite import (
+    Suite,
+    make_cases,
+    override_suite,
+    read_suite,
+    seed_keys,
+    select_rows,
+)
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.progress import in_minutes
 
@@ -37,8 +44,8 @@ Span = FloatDistribution | IntDistribution
 
 
 @dataclass(frozen=True)
-class Request:
-    """What the command line asks for."""
+class SearchRequest:
+    """The request of the command line."""
 
     scenario: str  # a suite's name, where rows are given
     vary: Sequence[str]  # key=low:high
@@ -54,47 +61,61 @@ class Request:
     rows: Sequence[int] = ()  # of the suite
 
 
-def optimize(request: Request) -> int:
-    """Search until so many trials have a result, or have been tried. Returns 0, or 1 when no trial has a result."""
-    space = dict(map(_span, request.vary))
+def optimize(request: SearchRequest) -> int:
+    """Search until the requested number of trials have a result, or have been tried.
+
+    Returns:
+        0; 1 if no trial has a result.
+
+    Raises:
+        ConfigError: the request is invalid, or the file is of another search.
+    """
+    space = dict(map(_parse_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(
             f"--goal {request.goal}: the summary of a run has no such number; it has path_distance_m, advance_m_s, ..."
         )
-    cases_at_ends: list[Case] = []
-    for end in ("low", "high"):  # before anything is started
-        cases_at_ends += _cases(request, {key: getattr(one, end) for key, one in space.items()})
+    # Both ends of all ranges are configured before anything is started, so that an invalid range is an error now.
+    cases_at_ends = _cases_of_trial(request, {key: span.low for key, span in space.items()})
+    cases_at_ends += _cases_of_trial(request, {key: span.high for key, span in space.items()})
     check_address(request.cluster)
     study = open_study(request.storage, _search_command(request, space, cases_at_ends))
     study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
-    have = len(study.get_trials(states=(TrialState.COMPLETE,)))
-    already = f"holds {have} trials already" if have else "keeps all trials"
+    completed = len(study.get_trials(states=(TrialState.COMPLETE,)))
+    already = f"holds {completed} trials already" if completed else "keeps all trials"
     say(f"{request.storage} {already}; --storage {shlex.quote(str(request.storage))} goes on with them")
-    if left := max(request.trials - have, 0):
-        began, todo = time.monotonic(), left
-        numbers = free_numbers(study)
-        with workers(request.cluster, request.workers) as working:
-            while left > 0:
-                asked: list[Trial] = []
-                for number in islice(numbers, min(left, working.size())):
-                    trial = study.ask(dict[str, BaseDistribution](space))
-                    trial.set_user_attr(NUMBER, number)
-                    asked.append(trial)
-                _run_trials(request, study, asked, working)
-                left -= len(asked)
-                passed_s = time.monotonic() - began
-                left_s = passed_s / (todo - left) * left
-                say(f"{todo - left} of {todo} trials, {in_minutes(passed_s)} passed, about {in_minutes(left_s)} left")
-    return _conclude(request, study)
+    if request.trials > completed:
+        _search(request, study, space, request.trials - completed)
+    return _report_best(request, study)
 
 
-def _search_command(request: Request, space: Mapping[str, Span], cases_at_ends: Sequence[Case]) -> SearchCommand:
-    """Returns what decides what the trials' numbers mean; workers and the number of trials do not."""
+def _search(request: SearchRequest, study: Study, space: Mapping[str, Span], trials: int) -> None:
+    """Run a number of trials, as many at a time as there are workers, and print the progress."""
+    start_s = time.monotonic()
+    left = trials
+    numbers = free_numbers(study)
+    with workers(request.cluster, request.workers) as pool:
+        while left > 0:
+            batch: list[Trial] = []
+            for number in islice(numbers, min(left, pool.size())):
+                trial = study.ask(dict[str, BaseDistribution](space))
+                trial.set_user_attr(NUMBER, number)
+                batch.append(trial)
+            _run_trials(request, study, batch, pool)
+            left -= len(batch)
+            done = trials - left
+            passed_s = time.monotonic() - start_s
+            left_s = passed_s / done * left
+            say(f"{done} of {trials} trials, {in_minutes(passed_s)} passed, about {in_minutes(left_s)} left")
+
+
+def _search_command(request: SearchRequest, space: Mapping[str, Span], cases_at_ends: Sequence[Case]) -> SearchCommand:
+    """Return everything that decides what the trials' numbers mean; workers and the number of trials do not."""
     return SearchCommand(
         scenario=request.scenario,
         rows=list(request.rows),
-        vary={key: f"{limits.low!r}:{limits.high!r}" for key, limits in space.items()},
-        set={one.key: one.value for one in map(parse_set, request.set)},
+        vary={key: f"{span.low!r}:{span.high!r}" for key, span in space.items()},
+        set=_set_values(request),
         set_words=list(request.set),
         goal=request.goal,
         direction="minimize" if request.minimize else "maximize",
@@ -105,40 +126,45 @@ def _search_command(request: Request, space: Mapping[str, Span], cases_at_ends: 
     )
 
 
-def _run_trials(request: Request, study: Study, asked: Sequence[Trial], working: Workers) -> None:
-    """Runs all cases of these trials, and tells the study and the user what came of each trial."""
-    cases = {trial.number: _cases(request, trial.params) for trial in asked}
-    outcomes: dict[str, Outcome] = {}
-    for case, outcome in working.solve(list({case.id: case for own in cases.values() for case in own}.values())):
+def _run_trials(request: SearchRequest, study: Study, trials: Sequence[Trial], pool: Workers) -> None:
+    """Run all cases of these trials, store the result of each trial in the study, and print it."""
+    cases_of_trial = {trial.number: _cases_of_trial(request, trial.params) for trial in trials}
+    unique_cases = {case.id: case for cases in cases_of_trial.values() for case in cases}
+    outcomes: dict[str, CaseOutcome] = {}
+    for case, outcome in pool.solve(list(unique_cases.values())):
         outcomes[case.id] = outcome
-    for trial in asked:
-        values = [outcomes[case.id].numbers.get(request.goal) for case in cases[trial.number]]
-        known = [float(value) for value in values if isinstance(value, int | float)]
-        words = ", ".join(f"{key} {value:.4g}" for key, value in trial.params.items())
-        number = trial.user_attrs[NUMBER]
-        if len(known) < len(values):
-            why = next((outcomes[case.id].error for case in cases[trial.number] if outcomes[case.id].error), "unknown")
-            study.tell(trial, state=TrialState.FAIL)
-            say(f"trial {number}: {words}: no {request.goal}: {why}")
-        else:
-            trial.set_user_attr(RESULTS, known)
-            first_run = outcomes[cases[trial.number][0].id]
-            trial.set_user_attr(STUCK, bool(first_run.numbers.get(GAVE_UP)))
-            study.tell(trial, float(np.mean(known)))
-            say(f"trial {number}: {words}: {np.mean(known):.4g}")
+    for trial in trials:
+        _store_result(request, study, trial, [outcomes[case.id] for case in cases_of_trial[trial.number]])
 
 
-def _conclude(request: Request, study: Study) -> int:
-    """Prints the best trial, and the command that repeats it."""
+def _store_result(request: SearchRequest, study: Study, trial: Trial, outcomes: Sequence[CaseOutcome]) -> None:
+    """Store the result of a trial, or that it failed because a run has no number, and print it."""
+    numbers = [outcome.numbers.get(request.goal) for outcome in outcomes]
+    known = [float(number) for number in numbers if isinstance(number, int | float)]
+    parameters = ", ".join(f"{key} {value:.4g}" for key, value in trial.params.items())
+    label = f"trial {trial.user_attrs[NUMBER]}: {parameters}"
+    if len(known) < len(numbers):
+        reason = next((outcome.error for outcome in outcomes if outcome.error), "unknown")
+        study.tell(trial, state=TrialState.FAIL)
+        say(f"{label}: no {request.goal}: {reason}")
+        return
+    trial.set_user_attr(RESULTS, known)
+    trial.set_user_attr(STUCK, bool(outcomes[0].numbers.get(GAVE_UP)))
+    study.tell(trial, float(np.mean(known)))
+    say(f"{label}: {np.mean(known):.4g}")
+
+
+def _report_best(request: SearchRequest, study: Study) -> int:
+    """Print the best trial, and the command that repeats it. Return the exit code."""
     if not study.get_trials(states=(TrialState.COMPLETE,)):
         say(f"no trial had a {request.goal}")
         return 1
     best = study.best_trial
     say(f"best {request.goal}: {best.value:.4g}, trial {best.user_attrs[NUMBER]}")
     if request.rows:
-        chosen = [*request.set, *(f"{key}={value!r}" for key, value in best.params.items())]
         rows = ",".join(map(str, request.rows))
-        say(f"  {_command(['snakesim', 'evaluate', request.scenario, '--rows', rows], chosen)}")
+        words = ["snakesim", "evaluate", request.scenario, "--rows", rows]
+        say(f"  {_command_line(words, request.set, best.params)}")
         return 0
     results = best.user_attrs[RESULTS]
     if len(results) > 1:
@@ -146,32 +172,46 @@ def _conclude(request: Request, study: Study) -> int:
     if best.user_attrs[STUCK]:
         say("  the search ended this run when it was stuck; this command runs it to its end, so its number may differ:")
     table = compose(request.scenario, list(map(parse_set, request.set)))
-    seeds = seeds_of(table)
-    found = {**best.params, **dict.fromkeys(seeds, request.seed)}
-    chosen = [*request.set, *(f"{key}={value!r}" for key, value in found.items())]
+    values = {**best.params, **dict.fromkeys(seed_keys(table), request.seed)}
     words = ["snakesim", "run", request.scenario, "--clock-mode", "lockstep"]
-    words += ["--until-goal"] if table.values.get("mission", {}).get("goal") else []  # without one it would be refused
-    say(f"  {_command(words, chosen)}")
+    if table.values.get("mission", {}).get("goal"):
+        words.append("--until-goal")  # without a goal it would be refused
+    say(f"  {_command_line(words, request.set, values)}")
     return 0
 
 
-def _command(words: Sequence[str], chosen: Sequence[str]) -> str:
-    return shlex.join([*words, *(word for one in chosen for word in ("--set", one))])
+def _command_line(words: Sequence[str], settings: Sequence[str], values: Mapping[str, Any]) -> str:
+    """Return a command with `--set` for each setting, as the user typed it, and for each value."""
+    words = list(words)
+    for setting in (*settings, *(f"{key}={value!r}" for key, value in values.items())):
+        words += ["--set", setting]
+    return shlex.join(words)
 
 
-def _cases(request: Request, params: dict[str, Any]) -> list[Case]:
-    always = {one.key: one.value for one in map(parse_set, request.set)}
-    suite = read_suite(request.scenario)[0] if request.rows else Suite(scenario=request.scenario)
-    cases = cases_of(also_set(suite, {**always, **params}), "optimize", [], request.seeds, request.seed)
-    return rows_of(cases, request.rows, request.scenario)
+def _set_values(request: SearchRequest) -> dict[str, Any]:
+    """Return the values of `--set`, by key."""
+    overrides = map(parse_set, request.set)
+    return {override.key: override.value for override in overrides}
 
 
-def _span(text: str) -> tuple[str, Span]:
-    """key=low:high; whole numbers where both are."""
+def _cases_of_trial(request: SearchRequest, parameters: dict[str, Any]) -> list[Case]:
+    """Return the cases of a trial: each seed, in each requested row of a suite. Raises ConfigError."""
+    if request.rows:
+        suite, _ = read_suite(request.scenario)
+    else:
+        suite = Suite(scenario=request.scenario)
+    suite = override_suite(suite, {**_set_values(request), **parameters})
+    cases = make_cases(suite, "optimize", [], request.seeds, request.seed)
+    return select_rows(cases, request.rows, request.scenario)
+
+
+def _parse_span(text: str) -> tuple[str, Span]:
+    """Return key and range of `key=low:high`: of whole numbers if both ends are. Raises ConfigError."""
     key, _, given = (part.strip() for part in text.partition("="))
     try:
         low, high = given.split(":")
-        whole = low.strip("-").isdecimal() and high.strip("-").isdecimal()
-        return key, IntDistribution(int(low), int(high)) if whole else FloatDistribution(float(low), float(high))
+        if low.strip("-").isdecimal() and high.strip("-").isdecimal():
+            return key, IntDistribution(int(low), int(high))
+        return key, FloatDistribution(float(low), float(high))
     except ValueError:
         raise ConfigError(f"--vary {short(text)}: give key=low:high, such as control.propulsion_n=5:40") from None

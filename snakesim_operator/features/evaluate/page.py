@@ -1,96 +1,135 @@
-"""An evaluation as one page that needs no network and no other file; it looks like a run's report."""
+"""Draws an evaluation as one page that needs no network and no other file; it looks like the report of a run."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from snakesim_operator.features.evaluate.table import Line, best_of, columns, wilson
+from snakesim_operator.features.evaluate.table import ResultRow, best_controller, known_columns, wilson_interval
 from snakesim_operator.results.page.charts import Figure
 from snakesim_operator.results.page.html import render
 
-HEIGHT = 300
-SPREAD = 0.5  # of the room of a setting, over which its controllers stand
+HEIGHT_PX = 300
+CONTROLLER_SPREAD = 0.5  # of the distance between two settings, over which the points of the controllers are spread
 Point = tuple[float, float, float]  # middle, lower and upper end
+PointOf = Callable[[ResultRow], Point | None]
 
 
-def page(title: str, about: str, lines: Sequence[Line], worst: Sequence[tuple[str, str, str]]) -> str:
-    """The whole page. worst: the name of a case, why it failed, and the command that opens it."""
-    controllers = list(dict.fromkeys(line.controller for line in lines))
-    head, *rows = columns(lines)
+def render_page(title: str, source: str, rows: Sequence[ResultRow], failures: Sequence[tuple[str, str, str]]) -> str:
+    """Return the whole page as HTML.
+
+    Args:
+        title: heading of the page.
+        source: the suite file, or the command that stands for one.
+        rows: of the table.
+        failures: of the worst cases, each with its name, how it ended, and the command that runs it again.
+    """
+    controllers = list(dict.fromkeys(row.controller for row in rows))
+    head, *cells = known_columns(rows)
     return render(
         Path(__file__).parent / "evaluation.html",
         len(controllers),
         title=title,
-        about=about,
-        runs=sum(line.runs for line in lines),
+        about=source,
+        runs=sum(row.runs for row in rows),
         figures=[
-            _figure("Fields crossed, %", lines, controllers, _success),
-            _figure("Speed, m/s", lines, controllers, _spread("advance_m_s", of_crossed=True)),
-            _figure("Energy, J/m", lines, controllers, _spread("energy_j_per_m", of_crossed=True)),
-            _figure("Advance, m", lines, controllers, _spread("advance_m")),
-            _figure("Stood still, s", lines, controllers, _spread("stalled_s")),
+            _draw_figure("Fields crossed, %", rows, controllers, _crossed_percent),
+            _draw_figure("Speed, m/s", rows, controllers, _quartiles_of("advance_m_s", of_crossed=True)),
+            _draw_figure("Energy, J/m", rows, controllers, _quartiles_of("energy_j_per_m", of_crossed=True)),
+            _draw_figure("Advance, m", rows, controllers, _quartiles_of("advance_m")),
+            _draw_figure("Stood still, s", rows, controllers, _quartiles_of("stalled_s")),
         ],
-        goals=any(line.crossed is not None for line in lines),
+        goals=any(row.crossed is not None for row in rows),
         head=head,
-        rows=rows,
-        worst=worst,
-        best=best_of(lines),
+        rows=cells,
+        worst=failures,
+        best=best_controller(rows),
     )
 
 
-def _success(line: Line) -> Point | None:
-    if line.crossed is None:
+def _crossed_percent(row: ResultRow) -> Point | None:
+    """Return the success rate with its 95 % interval, in percent; None without a goal."""
+    if row.crossed is None:
         return None
-    low, high = wilson(line.crossed, line.runs)
-    return 100 * line.crossed / line.runs, 100 * low, 100 * high
+    low, high = wilson_interval(row.crossed, row.runs)
+    return 100 * row.crossed / row.runs, 100 * low, 100 * high
 
 
-def _spread(name: str, *, of_crossed: bool = False) -> Callable[[Line], Point | None]:
-    def point(line: Line) -> Point | None:
-        values = line.values(name, of_crossed=of_crossed)
-        return None if not values else tuple(np.percentile(values, [50, 25, 75]).tolist())
+def _quartiles_of(name: str, *, of_crossed: bool = False) -> PointOf:
+    """Return a function that gives median and quartiles of a number of the summary; None if it is not known."""
 
-    return point
+    def quartiles(row: ResultRow) -> Point | None:
+        values = row.values(name, of_crossed=of_crossed)
+        if not values:
+            return None
+        middle, lower, upper = np.percentile(values, [50, 25, 75]).tolist()
+        return middle, lower, upper
+
+    return quartiles
 
 
-def _figure(
-    axis: str, lines: Sequence[Line], controllers: Sequence[str], value: Callable[[Line], Point | None]
-) -> Figure | None:
-    """A point for each line, over its setting: over the number that is varied, if that is one."""
+def _draw_figure(axis: str, rows: Sequence[ResultRow], controllers: Sequence[str], point_of: PointOf) -> Figure | None:
+    """Draw a point for each row, over its setting, or over the number that is varied; None without any point."""
+    over_number = all(row.value is not None for row in rows)
     traces: list[Figure] = []
-    over_number = all(line.value is not None for line in lines)
     for i, controller in enumerate(controllers):
-        known = [(line, p) for line in lines if line.controller == controller and (p := value(line)) is not None]
-        aside = SPREAD * ((i + 0.5) / len(controllers) - 0.5)
-        trace = {
-            "type": "scatter",
-            "mode": "lines+markers" if over_number else "markers",
-            "name": controller,
-            "x": [line.value if over_number else line.row + aside for line, _ in known],
-            "y": [round(p[0], 6) for _, p in known],
-            "error_y": {
-                "type": "data",
-                "symmetric": False,
-                "array": [round(p[2] - p[0], 6) for _, p in known],
-                "arrayminus": [round(p[0] - p[1], 6) for _, p in known],
-                "thickness": 1.4,
-            },
-            "text": [line.setting for line, _ in known],
-            "hovertemplate": "%{text}: %{y:.3g}",
-            "marker": {"size": 9, "color": f"--joint-{i}"},
-            "line": {"color": f"--joint-{i}", "width": 1.2},
-        }
-        traces += [trace] if known else []
-    names = {line.row: line.setting for line in lines}
-    ticks = {"tickmode": "array", "tickvals": list(names), "ticktext": list(names.values()), "automargin": True}
+        offset = CONTROLLER_SPREAD * ((i + 0.5) / len(controllers) - 0.5)
+        points: list[tuple[ResultRow, Point]] = []
+        for row in rows:
+            point = point_of(row) if row.controller == controller else None
+            if point is not None:
+                points.append((row, point))
+        if points:
+            traces.append(_draw_trace(controller, i, points, over_number=over_number, offset=offset))
+    if not traces:
+        return None
+    x_axis: Figure = {"title": {"text": ""}}
+    if not over_number:
+        x_axis |= _setting_ticks(rows)
     layout = {
-        "height": HEIGHT,
+        "height": HEIGHT_PX,
         "hovermode": "closest",
         "showlegend": len(controllers) > 1,
-        "xaxis": {"title": {"text": ""}, **({} if over_number else {**ticks, "range": [0.5, max(names) + 0.5]})},
+        "xaxis": x_axis,
         "yaxis": {"title": {"text": axis}, "rangemode": "tozero"},
         "shapes": [],
         "annotations": [],
     }
-    return {"label": axis, "data": traces, "layout": layout} if traces else None
+    return {"label": axis, "data": traces, "layout": layout}
+
+
+def _draw_trace(
+    controller: str, index: int, points: Sequence[tuple[ResultRow, Point]], *, over_number: bool, offset: float
+) -> Figure:
+    """Return the points of one controller. offset: of their x, so that controllers do not hide each other."""
+    color = f"--joint-{index}"
+    return {
+        "type": "scatter",
+        "mode": "lines+markers" if over_number else "markers",
+        "name": controller,
+        "x": [row.value if over_number else row.row + offset for row, _ in points],
+        "y": [round(middle, 6) for _, (middle, _, _) in points],
+        "error_y": {
+            "type": "data",
+            "symmetric": False,
+            "array": [round(upper - middle, 6) for _, (middle, _, upper) in points],
+            "arrayminus": [round(middle - lower, 6) for _, (middle, lower, _) in points],
+            "thickness": 1.4,
+        },
+        "text": [row.setting for row, _ in points],
+        "hovertemplate": "%{text}: %{y:.3g}",
+        "marker": {"size": 9, "color": color},
+        "line": {"color": color, "width": 1.2},
+    }
+
+
+def _setting_ticks(rows: Sequence[ResultRow]) -> Figure:
+    """Return the x axis with the name of each setting at its number."""
+    names = {row.row: row.setting for row in rows}
+    return {
+        "tickmode": "array",
+        "tickvals": list(names),
+        "ticktext": list(names.values()),
+        "automargin": True,
+        "range": [0.5, max(names) + 0.5],
+    }

@@ -2,39 +2,46 @@
 
 import time
 
-from snakesim_operator.features.evaluate.case import Outcome
+from snakesim_operator.features.evaluate.case import CaseOutcome
 from snakesim_operator.run.progress import OneLine, in_minutes
 
-PLAIN_PERIOD_S = 10.0
+PLAIN_PERIOD_S = 10.0  # between two lines where the output is no terminal
 
 
 class Progress(OneLine):
-    """Counts what is done."""
+    """Counts the cases that are done, and prints how many there are."""
 
     def __init__(self, total: int) -> None:
         super().__init__()
+        # Counts.
         self._total = total
-        self._done = self._with_goal = self._crossed = self._errors = 0
-        self._began = time.monotonic()
-        self._next = self._began + PLAIN_PERIOD_S
+        self._done = 0
+        self._with_goal = 0
+        self._crossed = 0
+        self._errors = 0
+        # Times, by the monotonic clock.
+        self._start_s = time.monotonic()
+        self._next_line_s = self._start_s + PLAIN_PERIOD_S
 
-    def done(self, outcome: Outcome) -> None:
-        """One more."""
+    def count(self, outcome: CaseOutcome) -> None:
+        """Count one more case, and print the line if it is due."""
+        crossed = outcome.numbers.get("crossed")
         self._done += 1
-        self._with_goal += isinstance(outcome.numbers.get("crossed"), bool)
-        self._crossed += outcome.numbers.get("crossed") is True
+        self._with_goal += isinstance(crossed, bool)
+        self._crossed += crossed is True
         self._errors += outcome.error is not None
-        now = time.monotonic()
-        if self.terminal or now >= self._next or self._done == self._total:
-            self._next = now + PLAIN_PERIOD_S
-            self.put(self._text(now))
+        now_s = time.monotonic()
+        if self.terminal or now_s >= self._next_line_s or self._done == self._total:
+            self._next_line_s = now_s + PLAIN_PERIOD_S
+            self.put(self._text(now_s))
 
-    def _text(self, now: float) -> str:
-        passed_s = now - self._began
+    def _text(self, now_s: float) -> str:
+        passed_s = now_s - self._start_s
         left_s = passed_s / self._done * (self._total - self._done)
         parts = [f"{self._done} of {self._total} cases"]
         if self._with_goal:
             parts.append(f"{self._crossed} crossed")
         if self._errors:
             parts.append(f"{self._errors} could not run")
-        return "  ".join([*parts, f"{in_minutes(passed_s)} passed, about {in_minutes(left_s)} left"])
+        parts.append(f"{in_minutes(passed_s)} passed, about {in_minutes(left_s)} left")
+        return "  ".join(parts)

@@ -47,8 +47,8 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
     configurations: str  # hash of what scenario, robot and scene files give at the ends of the ranges
     code: str  # hash of the installed code
 
-    def in_words(self, storage: Path) -> str:
-        """Returns the command that goes on with the search, as a user types it."""
+    def command_line(self, storage: Path) -> str:
+        """Return the command that continues the search, as a user types it."""
         words = ["snakesim", "optimize", self.scenario]
         if self.rows:
             words += ["--rows", ",".join(map(str, self.rows))]
@@ -64,7 +64,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def hash_configurations(cases: Sequence[Case]) -> str:
-    """Returns a hash of the whole configurations of these cases."""
+    """Return a hash of the whole configurations of these cases."""
     digest = hashlib.sha256()
     for case in cases:
         digest.update(case.config)
@@ -72,28 +72,29 @@ def hash_configurations(cases: Sequence[Case]) -> str:
 
 
 def open_study(path: Path, command: SearchCommand) -> Study:
-    """Opens the search in a file, or begins one. Raises ConfigError for the file of another search, and for no file."""
+    """Open the search in a file, or begin one. Raises ConfigError for the file of another search, and for no file."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         storage = _storage_in(path)
-        kept = optuna.get_all_study_summaries(storage)
-        used = [summary for summary in kept if summary.n_trials or COMMAND in summary.user_attrs]
+        summaries = optuna.get_all_study_summaries(storage)
+        used = [summary for summary in summaries if summary.n_trials or COMMAND in summary.user_attrs]
         if not used:
-            for summary in kept:  # of a process that was killed before its first trial
+            for summary in summaries:  # of a process that was killed before its first trial
                 optuna.delete_study(study_name=summary.study_name, storage=storage)
             return _begin_study(storage, command)
         _check_same_search(path, used[0].user_attrs.get(COMMAND), command)
         study = optuna.load_study(study_name=used[0].study_name, storage=storage)
     except STORAGE_ERRORS as error:
-        reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0][:200]
+        message = getattr(error, "strerror", None) or str(error)
+        reason = message.splitlines()[0][:200]
         raise ConfigError(f"--storage {path}: {reason}; choose another file") from None
     _repeat_trials_without_result(study)
     return study
 
 
 def free_numbers(study: Study) -> Iterator[int]:
-    """Yields numbers to print for further trials, from 1: those that no trial with a result has."""
+    """Yield numbers to print for further trials, from 1: those that no trial with a result has."""
     taken = {trial.user_attrs.get(NUMBER) for trial in study.get_trials(states=(TrialState.COMPLETE,))}
     number = 0
     while True:
@@ -103,7 +104,7 @@ def free_numbers(study: Study) -> Iterator[int]:
 
 
 def _storage_in(path: Path) -> RDBStorage:
-    """Opens the file by its name. In a URL SQLAlchemy and Optuna give `?`, `%`, `#` and braces a meaning."""
+    """Open the file by its name. In a URL SQLAlchemy and Optuna give `?`, `%`, `#` and braces a meaning."""
     engine_options = {
         "creator": lambda: sqlite3.connect(path, check_same_thread=False),
         "poolclass": QueuePool,  # as SQLAlchemy has it for a file; this URL has no file
@@ -120,14 +121,14 @@ def _begin_study(storage: BaseStorage, command: SearchCommand) -> Study:
 
 
 def _repeat_trials_without_result(study: Study) -> None:
-    """Ends the trials of a process that was killed, and asks for their values again."""
+    """End the trials of a process that was killed, and enqueue their values again."""
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         study.tell(trial.number, state=TrialState.FAIL)
         study.enqueue_trial(trial.params)
 
 
 def _check_same_search(path: Path, kept: Any, command: SearchCommand) -> None:
-    """Raises ConfigError that names each difference between the command in the file and this one."""
+    """Raise a ConfigError that names each difference between the command in the file and this one."""
     try:
         there = msgspec.convert(kept, SearchCommand)
     except msgspec.ValidationError:
@@ -141,16 +142,16 @@ def _check_same_search(path: Path, kept: Any, command: SearchCommand) -> None:
         return
     raise ConfigError(
         f"--storage {path}: the file holds another search, whose trials are not comparable with this one's. "
-        f"{'; '.join(differences)}. Go on with that search by `{there.in_words(path)}`, or choose another file"
+        f"{'; '.join(differences)}. Go on with that search by `{there.command_line(path)}`, or choose another file"
     )
 
 
 def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
-    """Yields what differs, in words of the command line."""
+    """Yield what differs, in words of the command line."""
     if there.scenario != here.scenario:
         yield f"scenario: {there.scenario} there, {here.scenario} here"
     if there.rows != here.rows:
-        yield f"--rows: {_rows_in_words(there)} there, {_rows_in_words(here)} here"
+        yield f"--rows: {_format_rows(there)} there, {_format_rows(here)} here"
     yield from _differing_keys("--vary", there.vary, here.vary)
     yield from _differing_keys("--set", there.set, here.set)
     if there.goal != here.goal:
@@ -173,10 +174,11 @@ def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
 
 def _differing_keys(option: str, there: dict[str, Any], here: dict[str, Any]) -> Iterator[str]:
     for key in sorted(there.keys() | here.keys()):
-        before, now = there.get(key, "not given"), here.get(key, "not given")
+        before = there.get(key, "not given")
+        now = here.get(key, "not given")
         if before != now:
             yield f"{option} {key}: {before} there, {now} here"
 
 
-def _rows_in_words(command: SearchCommand) -> str:
+def _format_rows(command: SearchCommand) -> str:
     return ",".join(map(str, command.rows)) or "all"

@@ -1,4 +1,4 @@
-"""Results on disk: a line a case as it is done, and at the end a table for other programs."""
+"""Keeps results on disk: a line for each case as it is done, and at the end a table for other programs."""
 
 import csv
 import fcntl
@@ -16,38 +16,50 @@ import pyarrow.parquet as pq
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import exported
-from snakesim_operator.features.evaluate.case import GAVE_UP, OF_THE_CLOCK, Case, Number, Outcome
+from snakesim_operator.features.evaluate.case import GAVE_UP, WALL_CLOCK_NUMBERS, Case, CaseOutcome, Number
 from snakesim_operator.results.summary import RunSummary
 
-CASES, PARQUET, CSV = "cases.jsonl", "results.parquet", "results.csv"
-Results = dict[str, Outcome]  # by the case's id
-ARROW = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+CASES = "cases.jsonl"
+PARQUET = "results.parquet"
+CSV = "results.csv"
+Results = dict[str, CaseOutcome]  # by the case's id
+ARROW_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 
 
-class _Line(msgspec.Struct, frozen=True):
+class _StoredCase(msgspec.Struct, frozen=True):
+    """A line of the file of finished cases."""
+
     id: str
-    outcome: Outcome
+    outcome: CaseOutcome
     about: dict[str, Number] = {}
 
 
-class Store:
-    """The file of finished cases, open for more of them."""
+class ResultStore:
+    """The file of finished cases, open for appending."""
 
     def __init__(self, handle: int, done: Results) -> None:
         self._handle = handle
         self.done = done
 
-    def add(self, case: Case, outcome: Outcome) -> None:
-        """Keep a finished case; it is on the disk when this returns."""
-        line = _Line(case.id, outcome, case.columns)
+    def append(self, case: Case, outcome: CaseOutcome) -> None:
+        """Store a finished case; it is on the disk when this returns."""
+        line = _StoredCase(case.id, outcome, case.columns)
         os.write(self._handle, msgspec.json.encode(line) + b"\n")
         os.fsync(self._handle)
         self.done[case.id] = outcome
 
 
 @contextmanager
-def opened(folder: Path, *, resume: bool) -> Iterator[Store]:
-    """Hold a folder's results. Raises ConfigError when they are another evaluation's."""
+def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
+    """Open a folder's results for this process alone.
+
+    Args:
+        folder: of the evaluation; it is made if it is missing.
+        resume: whether the folder may hold results already.
+
+    Raises:
+        ConfigError: the folder cannot be used, holds an evaluation, or another process writes there.
+    """
     path = folder / CASES
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -60,48 +72,68 @@ def opened(folder: Path, *, resume: bool) -> Iterator[Store]:
             raise ConfigError(
                 f"--out {folder} holds an evaluation; go on with it by --resume, or choose another folder"
             )
-        yield Store(handle, _read(path, handle))
+        yield ResultStore(handle, _read_results(path, handle))
     except BlockingIOError:
         raise ConfigError(f"--out {folder}: another evaluation is writing there; choose another folder") from None
     finally:
         os.close(handle)
 
 
-def _read(path: Path, handle: int) -> Results:
-    """What is done. A last line that a kill has cut is removed; a case without a run is tried again."""
+def _read_results(path: Path, handle: int) -> Results:
+    """Return the results of finished cases.
+
+    A last line that is incomplete, because the process was killed, is removed. A case without a run is left out, so
+    that it is tried again.
+    """
     content = path.read_bytes()
     os.ftruncate(handle, content.rfind(b"\n") + 1)
     done: Results = {}
     for text in content.split(b"\n")[:-1]:
         with suppress(msgspec.DecodeError):
-            line = msgspec.json.decode(text, type=_Line)
+            line = msgspec.json.decode(text, type=_StoredCase)
             if line.outcome.error is None:
                 done[line.id] = line.outcome
     return done
 
 
 def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Path]:
-    """Results in the order of the cases, as Parquet and CSV; nothing in them depends on the clock."""
-    columns = _columns()
-    finished = [(case, done[case.id]) for case in cases if case.id in done]
-    rows = [{**one.numbers, **case.columns, "error": one.error} for case, one in finished]
-    paths = [folder / PARQUET, folder / CSV]
+    """Write the results in the order of the cases, as Parquet and CSV, and return the paths.
+
+    No value depends on the wall clock, so two evaluations of the same cases give the same files.
+    """
+    columns = _column_types()
+    rows: list[dict[str, Number]] = []
+    for case in cases:
+        if case.id in done:
+            outcome = done[case.id]
+            rows.append({**outcome.numbers, **case.columns, "error": outcome.error})
+    parquet_path = folder / PARQUET
+    csv_path = folder / CSV
     schema = pa.schema(list(columns.items()))
-    with exported(paths[0]) as partial:
+    with exported(parquet_path) as partial:
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), partial)
-    with exported(paths[1]) as partial, partial.open("x", newline="", encoding="utf-8") as file:
+    with exported(csv_path) as partial, partial.open("x", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(columns), extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    return paths
+    return [parquet_path, csv_path]
 
 
-def _columns() -> dict[str, Any]:
-    """Names and types: what identifies a case, then every plain field of a summary."""
-    found = {"row": ARROW[int], "setting": ARROW[str], "controller": ARROW[str], "field": ARROW[int]}
+def _column_types() -> dict[str, Any]:
+    """Return name and Arrow type of each column: what identifies a case, then every plain field of a summary."""
+    columns = {
+        "row": ARROW_TYPES[int],
+        "setting": ARROW_TYPES[str],
+        "controller": ARROW_TYPES[str],
+        "field": ARROW_TYPES[int],
+    }
     for name, hint in typing.get_type_hints(RunSummary).items():
-        either = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        plain = [one for one in either if one is not types.NoneType]
-        if name not in OF_THE_CLOCK and len(plain) == 1 and plain[0] in ARROW:
-            found.setdefault(name, ARROW[plain[0]])
-    return {**found, GAVE_UP: ARROW[bool], "error": ARROW[str]}
+        if name in WALL_CLOCK_NUMBERS:
+            continue
+        alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+        not_none = [alternative for alternative in alternatives if alternative is not types.NoneType]
+        if len(not_none) == 1 and not_none[0] in ARROW_TYPES:
+            columns.setdefault(name, ARROW_TYPES[not_none[0]])
+    columns[GAVE_UP] = ARROW_TYPES[bool]
+    columns["error"] = ARROW_TYPES[str]
+    return columns

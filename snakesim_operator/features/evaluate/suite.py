@@ -1,4 +1,4 @@
-"""The suite file: settings that a controller is tried in, each on many fields.
+"""Reads the suite file: settings that a controller is tried in, each on many fields.
 
     scenario = "field"                              # what all cases begin with
     fields = 20                                     # when --fields is not given
@@ -29,6 +29,7 @@ A field is a number: the run's seed, and that of every random field in the scene
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -48,8 +49,8 @@ MAX_CASES = 200_000
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 
 
-class Row(FileStruct, frozen=True, kw_only=True):
-    """A setting by name."""
+class SuiteRow(FileStruct, frozen=True, kw_only=True):
+    """A setting with a name: `[[row]]`."""
 
     name: Annotated[str, Meta(min_length=1, max_length=80)]
     set: dict[str, Any] = {}
@@ -69,14 +70,14 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     set: dict[str, Any] = {}
     unset: list[str] = []
     vary: dict[str, list[Any] | str] = {}
-    row: list[Row] = []
+    row: list[SuiteRow] = []
     draw: list[Draw] = []
-    fresh: bool = False  # fields that nobody has seen are drawn, unless --seed says which
+    fresh: bool = False  # new fields are drawn for every evaluation, unless --seed gives the first one
 
 
 @dataclass(frozen=True)
-class Setting:
-    """One row of the table: what is set, and its name."""
+class SuiteSetting:
+    """One row of the table: its name, and the values that it sets."""
 
     name: str
     overrides: list[Override]
@@ -85,84 +86,119 @@ class Setting:
 
 
 def read_suite(name: str) -> tuple[Suite, str]:
-    """A shipped suite or a file, and where it came from. Raises ConfigError."""
+    """Return a shipped suite or a suite file, and its path. Raises ConfigError."""
     path = find(name, "suites")
     return decode(read_table(path), Suite), str(path)
 
 
-def also_set(suite: Suite, given: dict[str, Any]) -> Suite:
-    """The suite with these keys set in every row, over what suite and row say."""
-    rows = [msgspec.structs.replace(row, set={**row.set, **given}) for row in suite.row]
-    return msgspec.structs.replace(suite, set={**suite.set, **given}, row=rows)
+def override_suite(suite: Suite, values: dict[str, Any]) -> Suite:
+    """Return the suite with these keys set in every row, over what suite and row set."""
+    rows = [msgspec.structs.replace(row, set={**row.set, **values}) for row in suite.row]
+    return msgspec.structs.replace(suite, set={**suite.set, **values}, row=rows)
 
 
-def rows_of(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
-    """Those of some rows, by number; none: of all. Raises ConfigError."""
-    if wrong := next((row for row in rows if row not in {case.row for case in cases}), None):
-        raise ConfigError(f"--rows {wrong}: {source} has rows 1 to {cases[-1].row}")
-    return [case for case in cases if not rows or case.row in rows]
+def select_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
+    """Return the cases of some rows, by number; all cases if no row is given. Raises ConfigError for a missing row."""
+    known = {case.row for case in cases}
+    for row in rows:
+        if row not in known:
+            raise ConfigError(f"--rows {row}: {source} has rows 1 to {cases[-1].row}")
+    if not rows:
+        return list(cases)
+    return [case for case in cases if case.row in rows]
 
 
-def settings_of(suite: Suite, source: str) -> list[Setting]:
-    """The rows of the table in order. Raises ConfigError."""
-    always = [*_overrides(suite.set, f"{source}: [set]")]
-    always += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
-    varied = {key: _values(key, given, source) for key, given in suite.vary.items()}
-    words = _short_names(list(varied))
-    found: list[Setting] = []
-    for row in suite.row or [Row(name="")]:
-        where = f"{source}: row {row.name!r}" if row.name else source
-        own = [*_overrides(row.set, where), *(Override(key, None, where) for key in row.unset)]
-        draws = _draws(suite, row.without, where)
-        for values in itertools.product(*varied.values()):
-            parts = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
-            name = ", ".join(filter(None, [row.name, *parts])) or "as it is"
-            here = [Override(key, v, f"{source}: [vary]") for key, v in zip(varied, values, strict=True)]
-            number = values[0] if len(values) == 1 and not row.name and _is_number(values[0]) else None
-            found.append(Setting(name, [*always, *own, *here], number, draws))
-    twice = {one.name for one in found if sum(other.name == one.name for other in found) > 1}
-    if twice:
-        raise ConfigError(f"{source}: two rows are called {min(twice)!r}; rename one")
-    return found
+def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
+    """Return the rows of the table in order. Raises ConfigError.
 
-
-def cases_of(suite: Suite, source: str, controllers: Sequence[str], fields: int, seed: int) -> list[Case]:
-    """Every case in the order of the table, with its whole configuration. Raises ConfigError.
-
-    What the suite asks for is checked here on the first field of each row; a later field that cannot be laid out is
-    named in its result.
+    Each named row is combined with each combination of the varied values.
     """
-    settings = settings_of(suite, source)
-    if (count := len(settings) * len(controllers or [""]) * fields) > MAX_CASES:
+    common = list(_flatten_overrides(suite.set, f"{source}: [set]"))
+    common += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
+    varied = {key: _list_values(key, given, source) for key, given in suite.vary.items()}
+    labels = _short_names(list(varied))
+    settings: list[SuiteSetting] = []
+    for row in suite.row or [SuiteRow(name="")]:
+        where = f"{source}: row {row.name!r}" if row.name else source
+        of_row = list(_flatten_overrides(row.set, where))
+        of_row += [Override(key, None, where) for key in row.unset]
+        draws = _draws_of_row(suite, row.without, where)
+        for combination in itertools.product(*varied.values()):
+            parts = [row.name] if row.name else []
+            of_combination: list[Override] = []
+            for key, value in zip(varied, combination, strict=True):
+                parts.append(f"{labels[key]} {_short_text(value)}")
+                of_combination.append(Override(key, value, f"{source}: [vary]"))
+            name = ", ".join(parts) or "as it is"
+            number = None
+            if len(combination) == 1 and not row.name and _is_number(combination[0]):
+                number = combination[0]
+            settings.append(SuiteSetting(name, [*common, *of_row, *of_combination], number, draws))
+    _check_names_differ(settings, source)
+    return settings
+
+
+def _check_names_differ(settings: Sequence[SuiteSetting], source: str) -> None:
+    counts = Counter(setting.name for setting in settings)
+    repeated = [name for name, count in counts.items() if count > 1]
+    if repeated:
+        raise ConfigError(f"{source}: two rows are called {min(repeated)!r}; rename one")
+
+
+def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: int, seed: int) -> list[Case]:
+    """Return every case in the order of the table, with its whole configuration.
+
+    The values that the suite sets are checked here on the first field of each row. A later field that cannot be laid
+    out is named in its result.
+
+    Args:
+        suite: the suite.
+        source: where it came from, for messages.
+        controllers: to try; none: that of the scenario.
+        fields: number of fields for each row and controller.
+        seed: number of the first field.
+
+    Raises:
+        ConfigError: the suite is invalid, or has too many cases.
+    """
+    settings = make_settings(suite, source)
+    count = len(settings) * len(controllers or [""]) * fields
+    if count > MAX_CASES:
         raise ConfigError(f"{source}: {count} cases; at most {MAX_CASES} are allowed")
-    found: list[Case] = []
+    cases: list[Case] = []
     for number, setting in enumerate(settings, 1):
         for controller in controllers or [None]:
-            chosen = [Override("controller", controller, f"--controllers {controller}")] if controller else []
-            clock_mode = Override("clock_mode", "lockstep", "--clock-mode lockstep")
-            table = compose(suite.scenario, [clock_mode, *chosen, *setting.overrides])
+            table = _compose_setting(suite, setting, controller)
             for field in range(seed, seed + fields):
-                config = _on_field(table, field, setting.draws)
+                config = _configure_field(table, field, setting.draws)
                 if field == seed:
-                    _check(config, table, f"{source}, row {number} ({setting.name}), field {field}")
-                found.append(
+                    _check_config(config, table, f"{source}, row {number} ({setting.name}), field {field}")
+                cases.append(
                     Case(
-                        case_id(config, suite.give_up_s),
-                        number,
-                        setting.name,
-                        config.commander,
-                        field,
-                        written(config),
-                        suite.give_up_s,
-                        suite.limit_s,
-                        setting.value,
+                        id=case_id(config, suite.give_up_s),
+                        row=number,
+                        setting=setting.name,
+                        controller=config.commander,
+                        field=field,
+                        config=written(config),
+                        give_up_s=suite.give_up_s,
+                        limit_s=suite.limit_s,
+                        value=setting.value,
                     )
                 )
-    return found
+    return cases
+
+
+def _compose_setting(suite: Suite, setting: SuiteSetting, controller: str | None) -> Table:
+    """Return the scenario with the values of a setting. controller: None: that of the scenario."""
+    overrides = [Override("clock_mode", "lockstep", "--clock-mode lockstep")]
+    if controller:
+        overrides.append(Override("controller", controller, f"--controllers {controller}"))
+    return compose(suite.scenario, [*overrides, *setting.overrides])
 
 
 def parse_vary(text: str) -> tuple[str, list[Any] | str]:
-    """`key=low:high:count` or `key=[a, b, c]` of --vary. Raises ConfigError."""
+    """Return key and values of `--vary key=low:high:count` or `key=[a, b, c]`. Raises ConfigError."""
     key, equals, given = (part.strip() for part in text.partition("="))
     if not (key and equals and given):
         raise ConfigError(f"--vary {short(text)}: give key=low:high:count, such as control.look_ahead_m=0.05:0.2:4")
@@ -174,7 +210,8 @@ def parse_vary(text: str) -> tuple[str, list[Any] | str]:
         raise ConfigError(f"--vary {short(text)}: {short(given)} is no list; write it as in TOML, [1, 2]") from None
 
 
-def _check(config: RunConfig, table: Table, where: str) -> None:
+def _check_config(config: RunConfig, table: Table, where: str) -> None:
+    """Raise a ConfigError that names the place if a configuration cannot be run."""
     try:
         check(config)
         check_plugins(config, table)
@@ -182,16 +219,17 @@ def _check(config: RunConfig, table: Table, where: str) -> None:
         raise ConfigError(f"{where}: {error}") from None
 
 
-def seeds_of(table: Table) -> list[str]:
-    """The settings that a field's number stands for."""
+def seed_keys(table: Table) -> list[str]:
+    """Return the keys that are set to a field's number: the run's seed, and that of every random field."""
     scene = table.values.get("scene")
     random_fields = scene.get("random_field") if isinstance(scene, dict) else None
     count = len(random_fields) if isinstance(random_fields, list) else 0
     return ["seed", *(f"scene.random_field.{i}.seed" for i in range(count))]
 
 
-def _on_field(table: Table, field: int, draws: Sequence[Draw] = ()) -> RunConfig:
-    for key in seeds_of(table):
+def _configure_field(table: Table, field: int, draws: Sequence[Draw]) -> RunConfig:
+    """Return the configuration of one field, with the values that are drawn for it."""
+    for key in seed_keys(table):
         table.put(key, field, "--seed")
     for draw in draws:
         for override in draw.on_field(field):
@@ -199,37 +237,45 @@ def _on_field(table: Table, field: int, draws: Sequence[Draw] = ()) -> RunConfig
     return decode(table, RunConfig)
 
 
-def _draws(suite: Suite, without: Sequence[str], where: str) -> list[Draw]:
-    """Those of the suite that a row keeps. Raises ConfigError."""
-    drawn = {key for draw in suite.draw for key in draw.set}
-    if wrong := next((key for key in without if key not in drawn), None):
-        raise ConfigError(f"{where}: `without` names {wrong!r}, which no [[draw]] sets")
-    kept = [[key for key in draw.set if key not in without] for draw in suite.draw]
-    return [msgspec.structs.replace(draw, set=keys) for draw, keys in zip(suite.draw, kept, strict=True) if keys]
+def _draws_of_row(suite: Suite, without: Sequence[str], where: str) -> list[Draw]:
+    """Return the suite's draws without the keys that a row leaves out. Raises ConfigError for a key of no draw."""
+    drawn_keys = {key for draw in suite.draw for key in draw.set}
+    for key in without:
+        if key not in drawn_keys:
+            raise ConfigError(f"{where}: `without` names {key!r}, which no [[draw]] sets")
+    draws: list[Draw] = []
+    for draw in suite.draw:
+        kept = [key for key in draw.set if key not in without]
+        if kept:
+            draws.append(msgspec.structs.replace(draw, set=kept))
+    return draws
 
 
-def _overrides(given: dict[str, Any], origin: str, prefix: str = "") -> Iterator[Override]:
-    """Nested tables are dotted keys; a list replaces the whole list."""
-    for key, value in given.items():
+def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") -> Iterator[Override]:
+    """Yield an override for each value; nested tables become dotted keys, and a list replaces the whole list."""
+    for key, value in values.items():
         if isinstance(value, dict) and value:
-            yield from _overrides(value, origin, f"{prefix}{key}.")
+            yield from _flatten_overrides(value, origin, f"{prefix}{key}.")
         else:
             yield Override(prefix + key, value, origin)
 
 
-def _values(key: str, given: list[Any] | str, source: str) -> list[Any]:
-    if isinstance(given, list):
-        if not given:
-            raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value")
-        return given
-    return spaced(given, f"{source}: `vary.{key}`")
+def _list_values(key: str, given: list[Any] | str, source: str) -> list[Any]:
+    """Return the values of a `[vary]` entry: those of the list, or evenly spaced ones. Raises ConfigError."""
+    if isinstance(given, str):
+        return space_evenly(given, f"{source}: `vary.{key}`")
+    if not given:
+        raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value")
+    return given
 
 
-def spaced(given: str, where: str) -> list[float]:
-    """The numbers of `low:high:count`, both ends included."""
+def space_evenly(given: str, where: str) -> list[float]:
+    """Return the numbers of `low:high:count`, both ends included. Raises ConfigError. where: for the message."""
     try:
         low, high, count = (float(part) for part in given.split(":"))
-        if not (math.isfinite(low) and math.isfinite(high) and count.is_integer() and 2 <= count <= 1000):
+        is_finite = math.isfinite(low) and math.isfinite(high)
+        is_a_count = count.is_integer() and 2 <= count <= 1000
+        if not (is_finite and is_a_count):
             raise ValueError
     except ValueError:
         raise ConfigError(
@@ -239,13 +285,19 @@ def spaced(given: str, where: str) -> list[float]:
 
 
 def _short_names(keys: list[str]) -> dict[str, str]:
-    """The last part of each dotted key, or all of it where two keys share that."""
-    last = [key.rpartition(".")[2] for key in keys]
-    return {key: end if last.count(end) == 1 else key for key, end in zip(keys, last, strict=True)}
+    """Return the last part of each dotted key, or the whole key if two keys share the last part."""
+    last_parts = [key.rpartition(".")[2] for key in keys]
+    names: dict[str, str] = {}
+    for key, last_part in zip(keys, last_parts, strict=True):
+        is_unique = last_parts.count(last_part) == 1
+        names[key] = last_part if is_unique else key
+    return names
 
 
 def _short_text(value: object) -> str:
-    return f"{value:g}" if isinstance(value, float) else short(str(value), 40)
+    if isinstance(value, float):
+        return f"{value:g}"
+    return short(str(value), 40)
 
 
 def _is_number(value: object) -> bool:

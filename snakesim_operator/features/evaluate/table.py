@@ -7,69 +7,92 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_operator.features.evaluate.case import GAVE_UP, Case, Outcome
+from snakesim_operator.features.evaluate.case import GAVE_UP, Case, CaseOutcome
 from snakesim_operator.features.evaluate.store import Results
 
-Z95 = 1.959964
-T95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)  # of 1 to 8 degrees of freedom
+Z95 = 1.959964  # two-sided 95 % quantile of the normal distribution
+T95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)  # of Student's t, for 1 to 8 degrees of freedom
 UNKNOWN = "–"
 HEAD = ("setting", "controller", "crossed", "95 %", "m", "95 % of m", "m/s", "J/m", "stood s", "time s", "errors")
-WORST = 5
+TEXT_COLUMNS = 2  # setting and controller: always shown, and aligned to the left
+MAX_FAILURES = 5  # that are listed
 
 
 @dataclass(frozen=True)
-class Line:
-    """One setting with one controller."""
+class ResultRow:
+    """The results of one setting with one controller: a row of the table."""
 
-    row: int
+    row: int  # number of the setting, from 1
     setting: str
     controller: str
     value: float | None  # of the setting, where that is one number
-    outcomes: list[Outcome]
+    outcomes: list[CaseOutcome]
 
     @property
     def runs(self) -> int:
-        """With those that could not begin."""
+        """The number of runs, with those that could not begin."""
         return len(self.outcomes)
 
     @property
     def errors(self) -> int:
-        """Cases without a run."""
-        return sum(one.error is not None for one in self.outcomes)
+        """The number of cases without a run."""
+        return sum(outcome.error is not None for outcome in self.outcomes)
 
     @property
     def crossed(self) -> int | None:
-        """Of all runs, also those that could not begin; None when they had no goal."""
-        crossings = [one.numbers.get("crossed") for one in self.outcomes if one.error is None]
-        return None if crossings and all(one is None for one in crossings) else sum(one is True for one in crossings)
+        """The number of runs that reached their goal; None if they had no goal."""
+        crossings = [outcome.numbers.get("crossed") for outcome in self.outcomes if outcome.error is None]
+        had_no_goal = crossings and all(crossed is None for crossed in crossings)
+        if had_no_goal:
+            return None
+        return sum(crossed is True for crossed in crossings)
 
     def values(self, name: str, *, of_crossed: bool = False) -> list[float]:
-        """The known values of one number; of_crossed: of the runs that reached their goal, where there is one."""
-        chosen = [one for one in self.outcomes if not of_crossed or one.numbers.get("crossed") in (True, None)]
-        found = [one.numbers.get(name) for one in chosen]
-        return [float(value) for value in found if isinstance(value, int | float)]
+        """Return the known values of one number of the summary.
+
+        Args:
+            name: of the number.
+            of_crossed: only of the runs that reached their goal, and of those that had none.
+        """
+        values: list[float] = []
+        for outcome in self.outcomes:
+            missed_goal = outcome.numbers.get("crossed") not in (True, None)
+            value = outcome.numbers.get(name)
+            if isinstance(value, int | float) and not (of_crossed and missed_goal):
+                values.append(float(value))
+        return values
 
     @property
     def cells(self) -> list[str]:
-        """As in the table, below HEAD."""
-        crossed = self.crossed
-        low, high = wilson(crossed or 0, self.runs)
+        """The texts of this row, below HEAD."""
+        duration = "crossed_s" if self.crossed else "duration_s"
         return [
             self.setting,
             self.controller,
-            UNKNOWN if crossed is None else f"{crossed}/{self.runs}",
-            UNKNOWN if crossed is None else f"{100 * low:.0f}-{100 * high:.0f}",
-            _median(self.values("advance_m"), 2),
+            self._crossed_of_runs(),
+            self._crossed_interval(),
+            _format_median(self.values("advance_m"), 2),
             self._advance_interval(),
-            _median(self.values("advance_m_s", of_crossed=True), 3),
-            _median(self.values("energy_j_per_m", of_crossed=True), 1),
-            _median(self.values("stalled_s"), 1),
-            _median(self.values("crossed_s" if crossed else "duration_s", of_crossed=True), 1),
+            _format_median(self.values("advance_m_s", of_crossed=True), 3),
+            _format_median(self.values("energy_j_per_m", of_crossed=True), 1),
+            _format_median(self.values("stalled_s"), 1),
+            _format_median(self.values(duration, of_crossed=True), 1),
             str(self.errors or ""),
         ]
 
+    def _crossed_of_runs(self) -> str:
+        if self.crossed is None:
+            return UNKNOWN
+        return f"{self.crossed}/{self.runs}"
+
+    def _crossed_interval(self) -> str:
+        if self.crossed is None:
+            return UNKNOWN
+        low, high = wilson_interval(self.crossed, self.runs)
+        return f"{100 * low:.0f}-{100 * high:.0f}"
+
     def _advance_interval(self) -> str:
-        """Without a goal the advance is the result, and needs an interval; with one the crossings have it."""
+        """Return the interval of the mean advance; with a goal, the success rate has an interval instead."""
         advances_m = self.values("advance_m")
         if self.crossed is not None or len(advances_m) < 2:
             return UNKNOWN
@@ -77,107 +100,148 @@ class Line:
         return f"{low:.2f} to {high:.2f}"
 
 
-def lines_of(cases: Sequence[Case], done: Results) -> list[Line]:
-    """One for each setting and controller that has results, in the order of the cases."""
-    found: dict[tuple[int, str], Line] = {}
+def group_results(cases: Sequence[Case], done: Results) -> list[ResultRow]:
+    """Return a row for each setting and controller that has results, in the order of the cases."""
+    rows: dict[tuple[int, str], ResultRow] = {}
     for case in cases:
         if case.id in done:
             key = (case.row, case.controller)
-            line = found.setdefault(key, Line(case.row, case.setting, case.controller, case.value, []))
-            line.outcomes.append(done[case.id])
-    return list(found.values())
+            row = rows.setdefault(key, ResultRow(case.row, case.setting, case.controller, case.value, []))
+            row.outcomes.append(done[case.id])
+    return list(rows.values())
 
 
-def columns(lines: Sequence[Line]) -> list[list[str]]:
-    """HEAD, and the cells of each line, without the columns of which nothing is known."""
-    rows = [list(HEAD), *(line.cells for line in lines)]
-    keep = [i for i in range(len(HEAD)) if i < 2 or any(row[i].strip(UNKNOWN) for row in rows[1:])]
-    return [[row[i] for i in keep] for row in rows]
+def known_columns(rows: Sequence[ResultRow]) -> list[list[str]]:
+    """Return HEAD and the cells of each row, without the columns in which nothing is known."""
+    table = [list(HEAD), *(row.cells for row in rows)]
+    kept: list[int] = []
+    for column in range(len(HEAD)):
+        has_a_value = any(cells[column].strip(UNKNOWN) for cells in table[1:])
+        if column < TEXT_COLUMNS or has_a_value:
+            kept.append(column)
+    return [[cells[column] for column in kept] for cells in table]
 
 
-def table(lines: Sequence[Line]) -> list[str]:
-    """For a terminal. Speed, energy and time are medians of the runs that crossed, the others of all runs."""
-    rows = columns(lines)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    texts: list[str] = []
-    for row in rows:
-        cells = [cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
-        texts.append("  ".join(cells).rstrip())
-    return texts
+def table_lines(rows: Sequence[ResultRow]) -> list[str]:
+    """Return the table for a terminal. Speed, energy and time are medians of the runs that crossed, others of all."""
+    table = known_columns(rows)
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines: list[str] = []
+    for cells in table:
+        padded: list[str] = []
+        for column, (cell, width) in enumerate(zip(cells, widths, strict=True)):
+            is_text = column < TEXT_COLUMNS
+            padded.append(cell.ljust(width) if is_text else cell.rjust(width))
+        lines.append("  ".join(padded).rstrip())
+    return lines
 
 
-def best_of(lines: Sequence[Line]) -> str:
-    """The controller that crossed most: its failures are worth a look."""
+def best_controller(rows: Sequence[ResultRow]) -> str:
+    """Return the controller that crossed most often; its failures are the most interesting ones."""
     crossed: Counter[str] = Counter()
-    for line in lines:
-        crossed[line.controller] += line.crossed or 0
+    for row in rows:
+        crossed[row.controller] += row.crossed or 0
     return max(crossed, key=lambda name: crossed[name], default="")
 
 
-def worst(cases: Sequence[Case], done: Results) -> list[tuple[Case, str]]:
-    """The cases that came least far, and why they ended, as far as it is known."""
-    failed = [case for case in cases if case.id in done and not _well(done[case.id])]
-    failed.sort(key=lambda case: _share(done[case.id]))
-    return [(case, _why(done[case.id])) for case in failed[:WORST]]
+def worst_failures(cases: Sequence[Case], done: Results) -> list[tuple[Case, str]]:
+    """Return the cases that failed and advanced least, each with how it ended, as far as that is known."""
+    failed = [case for case in cases if case.id in done and not _succeeded(done[case.id])]
+    failed.sort(key=lambda case: _advance_fraction(done[case.id]))
+    return [(case, _describe_end(done[case.id])) for case in failed[:MAX_FAILURES]]
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """95 % confidence interval of a share (Wilson 1927)."""
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a success rate.
+
+    With p = successes / n, n trials and z = 1.96:
+
+        (p + z^2 / (2 n) -+ z sqrt(p (1 - p) / n + z^2 / (4 n^2))) / (1 + z^2 / n)
+
+    Source: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
+    """
     if trials == 0:
         return 0.0, 1.0
-    share, z2 = successes / trials, Z95**2 / trials
-    middle = (share + z2 / 2) / (1 + z2)
-    half = Z95 * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials)) / (1 + z2)
-    return max(middle - half, 0.0), min(middle + half, 1.0)
+    p = successes / trials
+    z2_by_n = Z95**2 / trials
+    center = (p + z2_by_n / 2) / (1 + z2_by_n)
+    half_width = Z95 * math.sqrt(p * (1 - p) / trials + z2_by_n / (4 * trials)) / (1 + z2_by_n)
+    return max(center - half_width, 0.0), min(center + half_width, 1.0)
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Returns the 95 % confidence interval of the mean, by Student's t. values: two or more."""
+    """Return the 95 % confidence interval of the mean of two or more values: mean -+ t s / sqrt(n), by Student's t."""
     mean = float(np.mean(values))
     standard_error = float(np.std(values, ddof=1)) / math.sqrt(len(values))
-    half = _student_t95(len(values) - 1) * standard_error
-    return mean - half, mean + half
+    half_width = _student_t95(len(values) - 1) * standard_error
+    return mean - half_width, mean + half_width
 
 
-def _student_t95(degrees: int) -> float:
-    """Two-sided 95 % quantile. Source: Abramowitz and Stegun, table 26.10 and equation 26.7.5."""
-    if degrees <= len(T95):
-        return T95[degrees - 1]
-    first = (Z95**3 + Z95) / 4
-    second = (5 * Z95**5 + 16 * Z95**3 + 3 * Z95) / 96
-    return Z95 + first / degrees + second / degrees**2
+def _student_t95(degrees_of_freedom: int) -> float:
+    """Return the two-sided 95 % quantile of Student's t: from a table, or by its expansion in 1 / n.
+
+        t = z + (z^3 + z) / (4 n) + (5 z^5 + 16 z^3 + 3 z) / (96 n^2)
+
+    Source: Abramowitz and Stegun, table 26.10 and equation 26.7.5.
+    """
+    n = degrees_of_freedom
+    if n <= len(T95):
+        return T95[n - 1]
+    z = Z95
+    first = (z**3 + z) / 4
+    second = (5 * z**5 + 16 * z**3 + 3 * z) / 96
+    return z + first / n + second / n**2
 
 
-def _median(values: list[float], digits: int) -> str:
-    return f"{np.median(values):.{digits}f}" if values else UNKNOWN
+def _format_median(values: list[float], digits: int) -> str:
+    if not values:
+        return UNKNOWN
+    return f"{np.median(values):.{digits}f}"
 
 
-def _well(outcome: Outcome) -> bool:
+def _succeeded(outcome: CaseOutcome) -> bool:
+    """Return whether a run reached its goal; without a goal, whether it ran to its end."""
+    if outcome.error is not None:
+        return False
     crossed = outcome.numbers.get("crossed")
-    return outcome.error is None and (
-        crossed is True or (crossed is None and outcome.numbers.get("ended") == "complete")
-    )
+    if crossed is None:
+        return outcome.numbers.get("ended") == "complete"
+    return crossed is True
 
 
-def _share(outcome: Outcome) -> float:
-    """Of the way to the goal; without a run less than nothing."""
-    way, goal = outcome.numbers.get("advance_m"), outcome.numbers.get("goal_m")
-    if outcome.error is not None or not isinstance(way, float):
+def _advance_fraction(outcome: CaseOutcome) -> float:
+    """Return the advance as a fraction of the way to the goal, to sort by; -1 without a run, in m without a goal."""
+    advance_m = outcome.numbers.get("advance_m")
+    goal_m = outcome.numbers.get("goal_m")
+    if outcome.error is not None or not isinstance(advance_m, float):
         return -1.0
-    return way / goal if isinstance(goal, float) and goal > 0 else way
+    if isinstance(goal_m, float) and goal_m > 0:
+        return advance_m / goal_m
+    return advance_m
 
 
-def _why(outcome: Outcome) -> str:
+def _describe_end(outcome: CaseOutcome) -> str:
+    """Return how far a run came, what its controller reported last, and how it ended."""
     if outcome.error is not None:
         return outcome.error
     numbers = outcome.numbers
-    way, goal = numbers.get("advance_m"), numbers.get("goal_m")
-    far = f"{way:.2f} m" if isinstance(way, float) else "unknown"
-    of = f" of {goal:g} m" if isinstance(goal, float) else ""
-    state, reason = numbers.get("last_state"), numbers.get("last_reason")
+    advance_m = numbers.get("advance_m")
+    goal_m = numbers.get("goal_m")
+    advance = f"{advance_m:.2f} m" if isinstance(advance_m, float) else "unknown"
+    if isinstance(goal_m, float):
+        advance += f" of {goal_m:g} m"
+    state = numbers.get("last_state")
+    reason = numbers.get("last_reason")
     if state is None:  # the pose is unknown, and with it the motion
-        state, reason = numbers.get("reported_state"), numbers.get("reported_reason")
-    last = f"{state}: {reason}" if reason else state
-    ended = "" if numbers.get("ended") == "complete" else f"; {numbers.get('ended')}"
-    ended += "; given up: no advance for too long" if numbers.get(GAVE_UP) else ""
-    return f"{far}{of}; {last or 'controller said nothing'}{ended}"
+        state = numbers.get("reported_state")
+        reason = numbers.get("reported_reason")
+    parts = [advance]
+    if reason:
+        parts.append(f"{state}: {reason}")
+    else:
+        parts.append(str(state or "controller said nothing"))
+    if numbers.get("ended") != "complete":
+        parts.append(str(numbers.get("ended")))
+    if numbers.get(GAVE_UP):
+        parts.append("given up: no advance for too long")
+    return "; ".join(parts)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.commissioning.capture import RESTS_RAD, Turn, TurnWatch
+from snakesim_operator.features.commissioning.capture import MAX_REST_RAD, HandTurn, TurnDetector
 
 JOINTS, RATE_HZ = 4, 50.0
 
@@ -19,18 +19,18 @@ def samples(seconds: float, from_rad: float, to_rad: float, shake_rad: float = 0
         yield angle_rad
 
 
-def turns(*parts: Iterator[Floats]) -> list[Turn]:
+def turns(*parts: Iterator[Floats]) -> list[HandTurn]:
     """Every turn that is found, as joint after joint is asked for."""
-    found: list[Turn] = []
-    watch = TurnWatch()
+    found: list[HandTurn] = []
+    watch = TurnDetector()
     tick = 0
     for part in parts:
         for angle_rad in part:
-            turn = watch.take(tick / RATE_HZ, angle_rad)
+            turn = watch.add_sample(tick / RATE_HZ, angle_rad)
             tick += 1
             if turn is not None:
                 found.append(turn)
-                watch = TurnWatch()  # the next joint
+                watch = TurnDetector()  # the next joint
     return found
 
 
@@ -48,8 +48,8 @@ def test_a_pause_within_a_turn_is_no_end_of_it() -> None:
 
 def test_a_turn_begins_at_rest_and_a_shaking_hand_rests() -> None:
     assert turns(samples(1, 0, 0.4), samples(2, 0.4, 0.4)) == []  # it moved already when its joint was asked for
-    assert len(turns(samples(1, 0, 0), samples(1, 0, 0.4), samples(1, 0.4, 0.4, shake_rad=RESTS_RAD / 3))) == 1
-    assert turns(samples(1, 0, 0), samples(1, 0, 0.4), samples(1, 0.4, 0.4, shake_rad=RESTS_RAD)) == []
+    assert len(turns(samples(1, 0, 0), samples(1, 0, 0.4), samples(1, 0.4, 0.4, shake_rad=MAX_REST_RAD / 3))) == 1
+    assert turns(samples(1, 0, 0), samples(1, 0, 0.4), samples(1, 0.4, 0.4, shake_rad=MAX_REST_RAD)) == []
 
 
 def test_a_joint_that_is_turned_back_was_not_turned() -> None:

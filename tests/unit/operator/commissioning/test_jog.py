@@ -1,41 +1,43 @@
-"""Where a jogged joint is told to be."""
+"""The targets of a joint that is jogged."""
 
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.commissioning.jog import AHEAD_RAD, HELD_S, Jog, JogRequest
+from snakesim_operator.features.commissioning.jog import KEY_HOLD_S, MAX_LEAD_RAD, JogRequest, JogTarget
 from tests.unit.hal.rig import description
 
 PERIOD_S = 0.01
 JOINT = description().joints[0]
 
 
-def held(jog: Jog, key: str, seconds: float, *, blocked_rad: float | None = None) -> float:
+def held(jog: JogTarget, key: str, seconds: float, *, blocked_rad: float | None = None) -> float:
     """Hold a key; the joint follows, unless it is blocked."""
     for tick in range(round(seconds / PERIOD_S)):
         if tick % 3 == 0:
-            jog.key(key)
-        jog.after(PERIOD_S, jog.target_rad if blocked_rad is None else blocked_rad)
+            jog.on_key(key)
+        jog.advance(PERIOD_S, jog.target_rad if blocked_rad is None else blocked_rad)
     return jog.target_rad
 
 
 def test_it_goes_at_its_speed_while_the_key_repeats_and_no_longer() -> None:
-    jog = Jog(JogRequest(joint="joint_1", speed_rad_s=0.1), JOINT, 0.0)
+    jog = JogTarget(JogRequest(joint="joint_1", speed_rad_s=0.1), JOINT, 0.0)
     assert held(jog, "up", 1.0) == pytest.approx(0.1)
     for _ in range(100):
-        jog.after(PERIOD_S, jog.target_rad)
-    assert not jog.moves and 0.1 < jog.target_rad <= 0.1 + 0.1 * HELD_S
+        jog.advance(PERIOD_S, jog.target_rad)
+    assert not jog.moves and 0.1 < jog.target_rad <= 0.1 + 0.1 * KEY_HOLD_S
     assert held(jog, "down", 0.5) < 0.07
     at = jog.target_rad
-    jog.key("x")
-    assert jog.after(PERIOD_S, at) == at
+    jog.on_key("x")
+    assert jog.advance(PERIOD_S, at) == at
 
 
 def test_it_stays_within_travel_limits_and_near_a_joint_that_is_blocked() -> None:
-    assert held(Jog(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(-0.2)
-    ends = Jog(JogRequest(joint="joint_1", travel_rad=3.0), JOINT, 0.0)
+    assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(-0.2)
+    ends = JogTarget(JogRequest(joint="joint_1", travel_rad=3.0), JOINT, 0.0)
     assert (ends.lower_rad, ends.upper_rad) == (JOINT.angle_min_rad, JOINT.angle_max_rad)
-    assert held(Jog(JogRequest(joint="joint_1"), JOINT, 0.0), "up", 5.0, blocked_rad=0.0) == pytest.approx(AHEAD_RAD)
+    assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "up", 5.0, blocked_rad=0.0) == pytest.approx(
+        MAX_LEAD_RAD
+    )
 
 
 def test_too_fast_is_refused() -> None:

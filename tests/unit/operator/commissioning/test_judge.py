@@ -9,8 +9,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import Drive
 from snakesim_operator.features.commissioning.check import report_lines
-from snakesim_operator.features.commissioning.judge import AS_TOLD, Judged, judged
-from snakesim_operator.features.commissioning.measured import Measured, unclamped
+from snakesim_operator.features.commissioning.judge import AS_IN_FILE, JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.measured import CheckMeasurements, remove_clamped_targets
 
 PERIOD_S = 0.01
 WAY_RAD = 0.06
@@ -22,7 +22,7 @@ SWING = np.concatenate((WAY_RAD * np.sin(np.linspace(0, np.pi, LEG)), np.zeros(R
 TO_AND_FRO = np.concatenate((SWING, -SWING))
 
 
-def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: float = 0.0) -> Measured:
+def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: float = 0.0) -> CheckMeasurements:
     """Joints that move one after the other to both sides, on IMUs at every tick; the tail link stays where it is.
 
     backlash_rad, gear: of joint_1, in truth; pitched_rad: of joint_2 in truth, while its encoder says 0.
@@ -42,7 +42,7 @@ def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: floa
     force[:, :, 2] = 9.81
     force[:, 2:] = 9.81 * np.array((-np.sin(pitched_rad), 0.0, np.cos(pitched_rad)))
     velocity: Floats = np.diff(angle, axis=0, append=0.0) / PERIOD_S
-    return Measured(
+    return CheckMeasurements(
         period_s=PERIOD_S,
         names=["joint_1", "joint_2", "joint_3"],
         axes=["yaw", "pitch", "yaw"],
@@ -67,15 +67,15 @@ def behind_backlash(drive_rad: Floats, backlash_rad: float) -> Floats:
     return link_rad
 
 
-def verdicts(run: Measured) -> list[str]:
-    return [row.verdict for row in judged(run, straight=True)]
+def verdicts(run: CheckMeasurements) -> list[str]:
+    return [row.summary for row in judge_joints(run, straight=True)]
 
 
-def states(row: Judged) -> dict[str, str]:
+def states(row: JointVerdict) -> dict[str, str]:
     return {name: row.findings[name].state for name in PROPERTIES if row.findings[name].state != "confirmed"}
 
 
-def without_imus(run: Measured, *links: int) -> Measured:
+def without_imus(run: CheckMeasurements, *links: int) -> CheckMeasurements:
     rates = run.link_rate_rad_s.copy()
     forces = run.link_force_m_s2.copy()
     rates[:, links] = np.nan
@@ -84,16 +84,16 @@ def without_imus(run: Measured, *links: int) -> Measured:
 
 
 def test_a_sound_robot_is_as_its_file_says() -> None:
-    assert verdicts(measurements()) == [AS_TOLD] * JOINTS
+    assert verdicts(measurements()) == [AS_IN_FILE] * JOINTS
 
 
 def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_wrong() -> None:
     run = without_imus(measurements(), *range(JOINTS + 1))
     run = replace(run, angle_rad=run.angle_rad + np.array((0.15, 0.0, 0.0)))
-    rows = [row.confirmed_by_hand(["order", "sign"]) for row in judged(run, straight=True)]
+    rows = [row.confirmed_by_hand(["order", "sign"]) for row in judge_joints(run, straight=True)]
     assert states(rows[0]) == {"gear": "unknown", "zero": "wrong"}
-    assert rows[0].verdict == "its zero is off by +0.150 rad: zero_rad = 0.150"
-    assert states(rows[1]) == {"gear": "unknown"} and not rows[1].as_told
+    assert rows[0].summary == "its zero is off by +0.150 rad: zero_rad = 0.150"
+    assert states(rows[1]) == {"gear": "unknown"} and not rows[1].all_confirmed
     lines = report_lines(rows)
     assert "0 of 3 joints are as the robot file says; 1 wrong; 2 unknown" in lines[JOINTS]
     assert lines[JOINTS + 1].startswith("unknown: gear of every joint: ")
@@ -101,17 +101,17 @@ def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_w
 
 
 def test_zeros_are_unknown_until_the_robot_lies_straight_or_gravity_tells_them() -> None:
-    first, second, third = judged(measurements())
+    first, second, third = judge_joints(measurements())
     assert states(first) == states(third) == {"zero": "unknown"} and "--straight" in first.findings["zero"].reason
-    assert second.as_told  # a pitch joint
+    assert second.all_confirmed  # a pitch joint
 
 
 @pytest.mark.parametrize("allowed", [False, True])
 def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
     run = measurements(backlash_rad=0.035)
-    rows = judged(run, straight=True, allowed_backlash_rad=0.04 if allowed else 0.01)
-    assert [row.as_told for row in rows[1:]] == [True, True]
-    verdict = rows[0].verdict
+    rows = judge_joints(run, straight=True, allowed_backlash_rad=0.04 if allowed else 0.01)
+    assert [row.all_confirmed for row in rows[1:]] == [True, True]
+    verdict = rows[0].summary
     if allowed:
         assert "backlash" not in verdict
     else:
@@ -119,42 +119,50 @@ def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
 
 
 def test_a_gear_of_another_ratio_is_no_backlash() -> None:
-    assert verdicts(measurements(gear=1.5)) == ["turns 0.67 as far as its drive says: gear = 1.5", AS_TOLD, AS_TOLD]
+    assert verdicts(measurements(gear=1.5)) == [
+        "turns 0.67 as far as its drive says: gear = 1.5",
+        AS_IN_FILE,
+        AS_IN_FILE,
+    ]
 
 
 def test_gravity_tells_the_zero_of_a_pitch_joint_that_is_not_straight() -> None:
     run = measurements(pitched_rad=0.2)  # the encoder says 0
-    assert verdicts(run) == [AS_TOLD, "its zero is off by -0.200 rad: zero_rad = 0.500", AS_TOLD]
-    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [AS_TOLD] * JOINTS
+    assert verdicts(run) == [AS_IN_FILE, "its zero is off by -0.200 rad: zero_rad = 0.500", AS_IN_FILE]
+    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [AS_IN_FILE] * JOINTS
 
 
 def test_a_torque_against_the_motion_that_it_drives_has_the_wrong_sign() -> None:
     run = measurements()
     wrong = replace(run, torque_nm=run.torque_nm * np.array((-1.0, 1.0, 1.0)))
     assert verdicts(wrong)[0].startswith("its torque has the wrong sign")
-    assert verdicts(wrong)[1:] == [AS_TOLD, AS_TOLD]
+    assert verdicts(wrong)[1:] == [AS_IN_FILE, AS_IN_FILE]
 
 
 @pytest.mark.parametrize("link", [0, 1])
 def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
-    row = judged(without_imus(measurements(), link), straight=True)[0]
-    assert row.turned is None and not row.as_told
+    row = judge_joints(without_imus(measurements(), link), straight=True)[0]
+    assert row.turned is None and not row.all_confirmed
     assert states(row) == {"sign": "unknown", "gear": "unknown"}
 
 
 def test_two_imus_do_not_tell_a_joint_from_others_that_would_turn_the_same_links() -> None:
     run = replace(measurements(), axes=["yaw", "yaw", "yaw"])
-    row = judged(without_imus(run, 2, 3), straight=True)[0]
+    row = judge_joints(without_imus(run, 2, 3), straight=True)[0]
     assert states(row) == {"order": "unknown"} and "joint_2, joint_3" in row.findings["order"].reason
 
 
 def test_a_joint_whose_motion_did_not_come_or_that_did_not_move_is_not_confirmed() -> None:
     run = measurements()
     ended = replace(run, target_rad=run.target_rad * np.array((1.0, 1.0, 0.0)))
-    unmoved = judged(ended, straight=True)[2]
+    unmoved = judge_joints(ended, straight=True)[2]
     assert states(unmoved) == dict.fromkeys(("drive", "order", "sign", "gear"), "unknown")
-    dead = judged(replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), straight=True)[0]
-    assert dead.verdict.startswith("did not move") and not dead.confirmed_by_hand(["order", "sign", "gear"]).as_told
+    dead = judge_joints(
+        replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), straight=True
+    )[0]
+    assert (
+        dead.summary.startswith("did not move") and not dead.confirmed_by_hand(["order", "sign", "gear"]).all_confirmed
+    )
 
 
 def test_a_dead_joint_that_others_swing_and_whose_target_the_limiter_moves_along_spoils_nothing() -> None:
@@ -163,12 +171,12 @@ def test_a_dead_joint_that_others_swing_and_whose_target_the_limiter_moves_along
     angle_rad[:, 2] = np.linspace(0.0, 0.6, TICKS)
     target_rad = run.target_rad.copy()
     target_rad[:, 2] = np.maximum(angle_rad[:, 2] - 0.35, 0.0)
-    target_rad = unclamped(target_rad, angle_rad, max_step_rad=0.35)
+    target_rad = remove_clamped_targets(target_rad, angle_rad, max_step_rad=0.35)
     assert target_rad[:, 2] == pytest.approx(0.0)
     swung = replace(run, angle_rad=angle_rad, target_rad=target_rad, link_rate_rad_s=run.link_rate_rad_s)
-    rows = judged(swung, straight=True)
+    rows = judge_joints(swung, straight=True)
     assert [row.findings["zero"].state for row in rows] == ["confirmed"] * JOINTS
-    assert rows[0].as_told and not rows[2].as_told
+    assert rows[0].all_confirmed and not rows[2].all_confirmed
 
 
 def test_motion_capture_of_the_base_stands_for_its_imu() -> None:
@@ -176,5 +184,5 @@ def test_motion_capture_of_the_base_stands_for_its_imu() -> None:
     run.link_rate_rad_s[:, 1:, 2] -= run.velocity_rad_s[:, :1]  # the tail link turned, and the body stayed
     turn = np.zeros((TICKS, 3))
     turn[:, 2] = -run.angle_rad[:, 0]
-    assert verdicts(replace(run, base_turn_rad=turn))[0] == AS_TOLD
+    assert verdicts(replace(run, base_turn_rad=turn))[0] == AS_IN_FILE
     assert "the other way" in verdicts(replace(run, base_turn_rad=-turn))[0]

@@ -6,9 +6,9 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.evaluate.card import CARD, card_of, compare, holm, mcnemar, read_card, text
-from snakesim_operator.features.evaluate.case import Outcome
-from snakesim_operator.features.evaluate.suite import Suite, cases_of
+from snakesim_operator.features.evaluate.card import CARD, card_lines, compare, holm, make_card, mcnemar, read_card
+from snakesim_operator.features.evaluate.case import CaseOutcome
+from snakesim_operator.features.evaluate.suite import Suite, make_cases
 
 
 def test_p_as_tabulated() -> None:
@@ -22,11 +22,12 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
 
     def card(controllers: list[str], seed: int, crosses: bool, **more: float):
         suite = Suite(scenario="surveyed_clutter", set={"duration_s": 3.0, **more})
-        cases = cases_of(suite, "here", controllers, 6, seed=seed)
+        cases = make_cases(suite, "here", controllers, 6, seed=seed)
         done = {
-            case.id: Outcome(numbers={**numbers, "crossed": crosses == (case.controller == "hold")}) for case in cases
+            case.id: CaseOutcome(numbers={**numbers, "crossed": crosses == (case.controller == "hold")})
+            for case in cases
         }
-        return card_of("mine", cases, done)
+        return make_card("mine", cases, done)
 
     ours = card(["path_following", "hold"], 1, crosses=True)  # hold crosses all six, the other none
     (paired,) = compare(ours, [])
@@ -40,14 +41,14 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
     assert not compare(
         card(["hold"], 1, crosses=True), [card(["hold"], 1, crosses=True, **{"scene.ground.friction": 0.3})]
     )
-    said = "\n".join(text(ours, pairs))
+    said = "\n".join(card_lines(ours, pairs))
     assert "solved forces: median error                     unknown" in said and "6/6 (61-100 %)" in said
 
 
 def test_a_card_on_disk_is_the_card(tmp_path: Path) -> None:
     suite = Suite(scenario="surveyed_clutter")
-    cases = cases_of(suite, "here", ["hold"], 1, seed=1)
-    card = card_of("mine", cases, {cases[0].id: Outcome(numbers={"crossed": False})})
+    cases = make_cases(suite, "here", ["hold"], 1, seed=1)
+    card = make_card("mine", cases, {cases[0].id: CaseOutcome(numbers={"crossed": False})})
     (tmp_path / CARD).write_bytes(msgspec.json.encode(card))
     assert read_card(tmp_path) == card
     with pytest.raises(ConfigError, match="no score card"):

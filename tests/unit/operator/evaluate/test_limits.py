@@ -3,10 +3,8 @@
 import time
 from pathlib import Path
 
-import pytest
-
-from snakesim_operator.features.evaluate.case import GAVE_UP, Outcome, code_digest, run_case
-from snakesim_operator.features.evaluate.suite import Suite, cases_of
+from snakesim_operator.features.evaluate.case import GAVE_UP, CaseOutcome, code_digest, run_case
+from snakesim_operator.features.evaluate.suite import Suite, make_cases
 
 ENDLESS = """
 from snakesim_gnc.control.hold import Hold
@@ -19,12 +17,12 @@ class Endless(Hold):
 """
 
 
-def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s: float = 600.0) -> Outcome:
+def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s: float = 600.0) -> CaseOutcome:
     """What comes of the first case."""
     goal = {"kind": "heading", "distance_m": 0.3}
     always = {"duration_s": duration_s, "mission.goal": goal}
     suite = Suite(scenario="peg_row", set=always, give_up_s=give_up_s, limit_s=limit_s)
-    case = cases_of(suite, "here", [controller], 1, seed=1)[0]
+    case = make_cases(suite, "here", [controller], 1, seed=1)[0]
     return run_case(case.config, code_digest(), case.give_up_s, case.limit_s)
 
 

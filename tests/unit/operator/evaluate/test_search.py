@@ -14,8 +14,8 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import find
 from snakesim_hal.model.textfiles import read_text
 from snakesim_operator.features.evaluate import optimize as search
-from snakesim_operator.features.evaluate.case import Case, Outcome
-from snakesim_operator.features.evaluate.optimize import Request, optimize
+from snakesim_operator.features.evaluate.case import Case, CaseOutcome
+from snakesim_operator.features.evaluate.optimize import SearchRequest, optimize
 
 PROPULSION = "control.propulsion_n"
 FIRST = {
@@ -38,11 +38,11 @@ def quick_runs() -> Iterator[None]:
         def size(self) -> int:
             return 2
 
-        def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+        def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
             for case in cases:
                 config = msgspec.json.decode(case.config)
                 value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
-                yield case, Outcome(numbers={"path_distance_m": value, "advance_m": value})
+                yield case, CaseOutcome(numbers={"path_distance_m": value, "advance_m": value})
 
     @contextmanager
     def instant_workers(*_arguments: Any) -> Iterator[InstantWorkers]:
@@ -62,7 +62,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def searched(storage: Path, **other: Any) -> None:
-    assert optimize(Request(**{**FIRST, **other, "storage": storage})) == 0
+    assert optimize(SearchRequest(**{**FIRST, **other, "storage": storage})) == 0
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:

@@ -10,7 +10,7 @@ from snakesim_hal.model.files import shipped
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
 from snakesim_operator.features.evaluate.case import Case
-from snakesim_operator.features.evaluate.suite import Suite, cases_of, read_suite, settings_of
+from snakesim_operator.features.evaluate.suite import Suite, make_cases, make_settings, read_suite
 
 ROWS = """
 scenario = "surveyed_clutter"
@@ -45,10 +45,10 @@ def config(case: Case) -> RunConfig:
 
 def test_every_row_in_every_combination(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
-    names = [setting.name for setting in settings_of(suite, source)]
+    names = [setting.name for setting in make_settings(suite, source)]
     assert len(names) == 12 and names[0] == "as shipped, density_per_m2 4, friction 0.1"
     assert names[-1] == "pegs only, density_per_m2 8, friction 0.3"
-    cases = cases_of(suite, source, ["hold", "path_following"], 2, seed=7)
+    cases = make_cases(suite, source, ["hold", "path_following"], 2, seed=7)
     assert len(cases) == 12 * 2 * 2
     assert len({case.id for case in cases}) == len(cases)
     last = config(cases[-1])
@@ -60,17 +60,17 @@ def test_every_row_in_every_combination(tmp_path: Path) -> None:
 
 def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
-    few, more = (cases_of(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (2, 7)))
+    few, more = (make_cases(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (2, 7)))
     assert {case.id for case in few} < {case.id for case in more}
     renamed = msgspec.structs.replace(suite, title="another", row=[])
-    assert {case.id for case in cases_of(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
+    assert {case.id for case in make_cases(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
 
 
 @pytest.mark.parametrize("name", shipped("suites"))
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title
-    assert len(cases_of(suite, source, suite.controllers[:1], 1, seed=1)) >= 1
+    assert len(make_cases(suite, source, suite.controllers[:1], 1, seed=1)) >= 1
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_wrong_suite_is_told_what_and_where(
 def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
     suite, source = read(tmp_path, 'scenario = "jam"\n[vary]\nseed = "1:1000:1000"')
     with pytest.raises(ConfigError, match="300000 cases"):
-        cases_of(suite, source, [], 300, 1)
+        make_cases(suite, source, [], 300, 1)
 
 
 LAB = """
@@ -128,7 +128,7 @@ without = ["scene.pegs_along_route.0.friction"]
 
 def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
     suite, source = read(tmp_path, LAB)
-    cases = cases_of(suite, source, ["hold", "path_following"], 3, seed=7)
+    cases = make_cases(suite, source, ["hold", "path_following"], 3, seed=7)
     drawn = [(case.field, config(case).scene) for case in cases]
     of_field = {field: scene.random_field[0].friction for field, scene in drawn}
     assert len(set(of_field.values())) == 3 and all(0.1 <= one <= 0.3 for one in of_field.values())
@@ -137,6 +137,6 @@ def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
     assert launch == [of_field[field] for field, _ in drawn[:6]] + [0.0] * 6
     wrong, source = read(tmp_path, LAB.replace('without = ["scene.pegs', 'without = ["pegs'))
     with pytest.raises(ConfigError, match=r"no \[\[draw\]\] sets"):
-        settings_of(wrong, source)
+        make_settings(wrong, source)
     with pytest.raises(ConfigError, match=r"`low` = 0.1 must be at most `high` = 0.03"):
         read(tmp_path, LAB.replace("high = 0.3", "high = 0.03"))

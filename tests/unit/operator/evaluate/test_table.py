@@ -5,17 +5,24 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_operator.features.evaluate.case import Case, Outcome
-from snakesim_operator.features.evaluate.table import UNKNOWN, lines_of, mean_interval, table, wilson, worst
+from snakesim_operator.features.evaluate.case import Case, CaseOutcome
+from snakesim_operator.features.evaluate.table import (
+    UNKNOWN,
+    group_results,
+    mean_interval,
+    table_lines,
+    wilson_interval,
+    worst_failures,
+)
 
 
 def case(field: int, controller: str = "poal", row: int = 1) -> Case:
     return Case(f"{controller}-{row}-{field}", row, f"density {row}", controller, field, b"{}", 12.0, 60.0)
 
 
-def outcome(advance_m: float, speed_m_s: float = 0.1) -> Outcome:
+def outcome(advance_m: float, speed_m_s: float = 0.1) -> CaseOutcome:
     reported = {"goal_m": 3.0, "advance_m": advance_m, "crossed": advance_m >= 3, "ended": "complete"}
-    return Outcome(
+    return CaseOutcome(
         numbers={**reported, "advance_m_s": speed_m_s, "last_state": "NotLocomoting", "last_reason": "stuck"}
     )
 
@@ -24,15 +31,15 @@ def outcome(advance_m: float, speed_m_s: float = 0.1) -> Outcome:
     ("successes", "trials", "low", "high"), [(8, 10, 0.490, 0.943), (0, 20, 0.0, 0.161), (100, 100, 0.963, 1.0)]
 )
 def test_wilson_as_tabulated(successes: int, trials: int, low: float, high: float) -> None:
-    assert wilson(successes, trials) == (pytest.approx(low, abs=5e-4), pytest.approx(high, abs=5e-4))
+    assert wilson_interval(successes, trials) == (pytest.approx(low, abs=5e-4), pytest.approx(high, abs=5e-4))
 
 
 def test_speed_is_of_the_runs_that_crossed() -> None:
     cases = [case(1), case(2), case(3), case(1, "hold")]
-    done = {"poal-1-1": outcome(3.0, 0.2), "poal-1-2": outcome(1.0, 0.02), "poal-1-3": Outcome(error="no room")}
-    lines = lines_of(cases, done)
+    done = {"poal-1-1": outcome(3.0, 0.2), "poal-1-2": outcome(1.0, 0.02), "poal-1-3": CaseOutcome(error="no room")}
+    lines = group_results(cases, done)
     assert [line.controller for line in lines] == ["poal"]  # of hold nothing is known yet
-    head, row = table(lines)
+    head, row = table_lines(lines)
     assert head.split()[:3] == ["setting", "controller", "crossed"]
     assert "1/3" in row and "0.200" in row and row.endswith(" 1")
 
@@ -40,11 +47,11 @@ def test_speed_is_of_the_runs_that_crossed() -> None:
 def test_without_a_goal_the_advance_has_an_interval() -> None:
     """Of the mean, by Student's t: 12.7 of its standard error for two runs."""
     cases = [case(1), case(2), case(1, row=2)]
-    done = {one.id: Outcome(numbers={"advance_m": 0.2 + 0.01 * one.field, "ended": "complete"}) for one in cases}
-    head, two_runs, one_run = table(lines_of(cases, done))
+    done = {one.id: CaseOutcome(numbers={"advance_m": 0.2 + 0.01 * one.field, "ended": "complete"}) for one in cases}
+    head, two_runs, one_run = table_lines(group_results(cases, done))
     assert head.split()[-5:] == ["m", "95", "%", "of", "m"]
     assert two_runs.endswith("0.15 to 0.28") and one_run.endswith(UNKNOWN)
-    assert "95 %" not in table(lines_of([cases[2]], done))[0]
+    assert "95 %" not in table_lines(group_results([cases[2]], done))[0]
 
 
 @pytest.mark.parametrize(("runs", "quantile"), [(2, 12.706), (4, 3.182), (11, 2.228), (31, 2.042), (1001, 1.962)])
@@ -57,9 +64,9 @@ def test_students_t_as_tabulated(runs: int, quantile: float) -> None:
 
 def test_the_worst_come_first() -> None:
     cases = [case(field) for field in (1, 2, 3, 4)]
-    done = {"poal-1-1": outcome(2.0), "poal-1-2": outcome(3.0), "poal-1-3": Outcome(error="no room")}
+    done = {"poal-1-1": outcome(2.0), "poal-1-2": outcome(3.0), "poal-1-3": CaseOutcome(error="no room")}
     done["poal-1-4"] = outcome(0.5)
-    reported = worst(cases, done)
+    reported = worst_failures(cases, done)
     assert [one.field for one, _ in reported] == [3, 4, 1]
     assert [why for _, why in reported] == [
         "no room",

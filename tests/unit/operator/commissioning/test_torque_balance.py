@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from snakesim_operator.features.commissioning.estimate import Friction, Moved, curvature, friction, slope, windowed
+from snakesim_operator.features.commissioning.smoothing import smooth, smooth_derivative, smooth_second_derivative
+from snakesim_operator.features.commissioning.torque_balance import JointRecord, TorqueBalance, fit_torque_balance
 
 TRUTH = {"dry_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005}
 INERTIA_KG_M2, WEIGHT_NM_PER_RAD, SCALE = 0.02, 1.5, 1.2
 PERIOD_S = 0.005
 
 
-def found(seed: int, *, scaled: bool) -> Friction:
+def found(seed: int, *, scaled: bool) -> TorqueBalance:
     """By a swing and three tones, with the noise of planar13."""
     pick = np.random.default_rng(seed)
     time_s = np.arange(0, 20, PERIOD_S)
@@ -26,11 +27,11 @@ def found(seed: int, *, scaled: bool) -> Friction:
     target = angle + torque / 60  # of a servo
     angle = angle + 0.0005 * pick.standard_normal(len(time_s))
     speed = speed + 0.005 * pick.standard_normal(len(time_s))
-    moved = Moved(PERIOD_S, angle, speed, told, target, 7.0)
-    weight = WEIGHT_NM_PER_RAD * windowed(angle)
-    load = weight + INERTIA_KG_M2 * slope(speed, PERIOD_S)
-    by_angle = weight + INERTIA_KG_M2 * curvature(angle, PERIOD_S)
-    return friction(moved, np.zeros(len(time_s)), load, by_angle, scaled=scaled)
+    moved = JointRecord(PERIOD_S, angle, speed, told, target, 7.0)
+    weight = WEIGHT_NM_PER_RAD * smooth(angle)
+    load = weight + INERTIA_KG_M2 * smooth_derivative(speed, PERIOD_S)
+    by_angle = weight + INERTIA_KG_M2 * smooth_second_derivative(angle, PERIOD_S)
+    return fit_torque_balance(moved, np.zeros(len(time_s)), load, by_angle, fit_scale=scaled)
 
 
 @pytest.mark.parametrize("scaled", [True, False])
@@ -41,13 +42,13 @@ def test_intervals_cover_what_they_say(scaled: bool) -> None:
         values = [getattr(trial, name) for trial in trials]
         covered = np.mean([one.covers(value) for one in values])
         assert covered >= 0.87, f"{name}: {covered}"  # 95 % of 60, less three standard deviations
-        assert np.median([one.within for one in values]) < 0.1 * value, name
+        assert np.median([one.half_width for one in values]) < 0.1 * value, name
         assert abs(np.mean([one.value for one in values]) / value - 1) < 0.05, name
 
 
 def test_a_joint_at_rest_tells_nothing() -> None:
     still = np.zeros(4000)
-    moved = Moved(PERIOD_S, still, still, still, still, 7.0)
-    none = windowed(still)
+    moved = JointRecord(PERIOD_S, still, still, still, still, 7.0)
+    none = smooth(still)
     with pytest.raises(ValueError, match="too little motion"):
-        friction(moved, still, none, none, scaled=True)
+        fit_torque_balance(moved, still, none, none, fit_scale=True)

@@ -1,0 +1,158 @@
+"""Least squares with instruments, and 95 % intervals from a jackknife over blocks of the record. Pure.
+
+Noise in a regressor shrinks its coefficient. So the normal equations are formed with instruments Z, which are other
+measurements of the same motion with another noise, instead of with the regressors X:
+
+    Z' X beta = Z' y                                                   Source: Durbin (1954)
+
+Residuals of neighboring ticks are correlated, so their scatter says too little. The covariance of beta comes from how
+beta changes when one of the n blocks of the record after the other is left out:
+
+    cov(beta) = (n - 1) / n * sum over blocks of (beta_without - beta) (beta_without - beta)'      Source: Tukey (1958)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+
+Z95 = 1.959964  # two-sided 95 % quantile of the normal distribution
+# The jackknife's intervals are widened by this factor. On emulated drives with hidden parameters, seeds 0 to 19, the
+# intervals without it covered 67 to 96 % of the true values.
+INTERVAL_FACTOR = 1.7
+MAX_CONDITION = 1e8  # of the normalized normal equations; above, the regressors are not independent
+MIN_BLOCKS_PER_VALUE = 2
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimated value with its 95 % interval."""
+
+    value: float
+    half_width: float  # the interval is value - half_width to value + half_width
+
+    def covers(self, truth: float) -> bool:
+        """Return whether the interval contains a value."""
+        return abs(truth - self.value) <= self.half_width
+
+    def scaled(self, factor: float) -> "Estimate":
+        """Return this estimate times a known factor."""
+        return Estimate(self.value * factor, self.half_width * abs(factor))
+
+    def times(self, other: "Estimate") -> "Estimate":
+        """Return the product with an independent estimate; its interval is right to first order."""
+        half_width = ((self.half_width * other.value) ** 2 + (self.value * other.half_width) ** 2) ** 0.5
+        return Estimate(self.value * other.value, half_width)
+
+    def widened(self, uncertainty: float) -> "Estimate":
+        """Return this estimate with an independent uncertainty added to its interval."""
+        return Estimate(self.value, float(np.hypot(self.half_width, uncertainty)))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The solution of a least-squares problem with k values."""
+
+    values: Floats  # (k,)
+    covariance: Floats  # (k, k)
+    degrees_of_freedom: int
+    residuals: Floats  # (rows,)
+    bias: Floats | None = None  # (k,), by which each interval is wider to either side; None: no bias
+
+    @property
+    def half_widths(self) -> Floats:
+        """The half widths of the 95 % intervals, (k,)."""
+        by_scatter: Floats = INTERVAL_FACTOR * student_95(self.degrees_of_freedom) * np.sqrt(np.diag(self.covariance))
+        if self.bias is None:
+            return by_scatter
+        return by_scatter + self.bias
+
+    @property
+    def estimates(self) -> Sequence[Estimate]:
+        """Each value with its interval."""
+        pairs = zip(self.values, self.half_widths, strict=True)
+        return [Estimate(float(value), float(half_width)) for value, half_width in pairs]
+
+    def with_bias(self, bias: Floats) -> "Fit":
+        """Return the same fit with intervals that are wider by a bias, (k,), to either side."""
+        return replace(self, bias=bias)
+
+    def divided_by(self, index: int) -> "Fit":
+        """Return the fit of all values divided by one of them, with the covariance to first order.
+
+        The Jacobian of v_i / d with respect to v is (I - v e_d' / d) / d, where d is the value at `index`.
+        """
+        divisor = self.values[index]
+        values = self.values / divisor
+        jacobian = np.eye(len(values)) / divisor
+        jacobian[:, index] -= values / divisor
+        bias = None
+        if self.bias is not None:
+            bias = np.abs(jacobian) @ self.bias
+        covariance = jacobian @ self.covariance @ jacobian.T
+        return Fit(values, covariance, self.degrees_of_freedom, self.residuals, bias)
+
+
+def solve(regressors: Floats, target: Floats, instruments: Floats, blocks: NDArray[np.int64]) -> Fit:
+    """Solve a least-squares problem with instruments.
+
+    Args:
+        regressors: X, (rows, k).
+        target: y, (rows,).
+        instruments: Z, (rows, k); the regressors themselves for ordinary least squares.
+        blocks: for each row, the number of the block of the record that it belongs to, (rows,).
+
+    Raises:
+        ValueError: the rows are too few or do not determine the values.
+    """
+    numbers = np.unique(blocks)
+    n = len(numbers)
+    k = regressors.shape[1]
+    if n < MIN_BLOCKS_PER_VALUE * k:
+        raise ValueError("too little motion is left to judge; let it run longer, with larger motion")
+    normal = instruments.T @ regressors
+    if _condition(normal, instruments, regressors) > MAX_CONDITION:
+        raise ValueError("its motion does not tell the values apart; was it moved at all?")
+    right_side = instruments.T @ target
+    values: Floats = np.linalg.solve(normal, right_side).astype(np.float64)
+    changes: list[Floats] = []  # of the values, when one block is left out
+    for number in numbers:
+        left_out = blocks == number
+        normal_without = normal - instruments[left_out].T @ regressors[left_out]
+        right_side_without = right_side - instruments[left_out].T @ target[left_out]
+        changes.append(np.linalg.solve(normal_without, right_side_without) - values)
+    covariance: Floats = (np.array(changes).T @ np.array(changes) * ((n - 1) / n)).astype(np.float64)
+    return Fit(values, covariance, n - k, target - regressors @ values)
+
+
+def _condition(normal: Floats, instruments: Floats, regressors: Floats) -> float:
+    """Return the condition number of the normal equations with all columns scaled to length 1."""
+    instrument_lengths = np.linalg.norm(instruments, axis=0) + 1e-300
+    regressor_lengths = np.linalg.norm(regressors, axis=0) + 1e-300
+    return float(np.linalg.cond(normal / np.outer(instrument_lengths, regressor_lengths)))
+
+
+def student_95(degrees_of_freedom: int) -> float:
+    """Return the two-sided 95 % quantile of Student's t.
+
+        t = z + (z^3 + z) / (4 n) + (5 z^5 + 16 z^3 + 3 z) / (96 n^2)
+
+    Source: Fisher and Cornish (1960), the expansion in 1 / n.
+    """
+    z = Z95
+    n = degrees_of_freedom
+    return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+
+
+def independent_parts(regressors: Floats) -> Floats:
+    """Return how large a part of each column, rms, no combination of the other columns makes up, (k,)."""
+    parts: list[float] = []
+    for column in range(regressors.shape[1]):
+        others = np.delete(regressors, column, axis=1)
+        coefficients = np.linalg.lstsq(others, regressors[:, column], rcond=None)[0]
+        remainder = regressors[:, column] - others @ coefficients
+        parts.append(float(np.sqrt(np.mean(remainder**2))))
+    return np.maximum(np.array(parts), 1e-12)

@@ -1,0 +1,83 @@
+"""Smoothing and differentiation of recorded signals along time, all through one short window. Pure.
+
+Every signal of an estimate passes the same window: no noisy signal is differentiated, and no signal lags another.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+
+HALF_WINDOW = 5  # ticks to either side; a smoothed signal is shorter by twice as many
+
+
+def smooth(signal: Floats) -> Floats:
+    """Return a signal smoothed along its first axis, (ticks - 2 HALF_WINDOW, ...)."""
+    return filter_columns(signal, _window())
+
+
+def smooth_derivative(signal: Floats, period_s: float) -> Floats:
+    """Return the time derivative of the smoothed signal, in the signal's unit per second."""
+    return filter_columns(signal, _window(1) / period_s)
+
+
+def smooth_second_derivative(signal: Floats, period_s: float) -> Floats:
+    """Return the second time derivative of the smoothed signal, in the signal's unit per second squared."""
+    return filter_columns(signal, _window(2) / period_s**2)
+
+
+def filter_columns(signal: Floats, kernel: Floats) -> Floats:
+    """Convolve each column with a kernel, and keep only the samples that the whole kernel covers."""
+    return np.apply_along_axis(lambda column: np.convolve(column, kernel, "valid"), 0, signal)
+
+
+def mean_of_three(signal: Floats) -> Floats:
+    """Return the mean of each sample with its two neighbors, (ticks,)."""
+    padded = np.pad(signal, 1, mode="edge")
+    return (padded[:-2] + padded[1:-1] + padded[2:]) / 3
+
+
+def direction_of_motion(velocity_rad_s: Floats) -> Floats:
+    """Return the sign of a velocity averaged over each tick, (ticks,), from -1 to 1.
+
+    Within the tick in which a joint reverses, the velocity is taken as a straight line, so the average of its sign is
+    the fraction of the tick in forward motion minus the fraction in backward motion.
+    """
+    velocity = mean_of_three(velocity_rad_s)
+    before = np.roll(velocity, 1)
+    before[0] = velocity[0]
+    after = np.roll(velocity, -1)
+    after[-1] = velocity[-1]
+    change_in_tick = np.maximum(np.abs(after - before) / 2, 1e-9)
+    return np.clip(2 * velocity / change_in_tick, -1.0, 1.0)
+
+
+def is_slow(velocity_rad_s: Floats, limit_rad_s: float, max_fraction: float) -> NDArray[np.bool_]:
+    """Return where more than a fraction of the smoothing window is slower than a limit, (ticks - 2 HALF_WINDOW,)."""
+    slow = (np.abs(mean_of_three(velocity_rad_s)) < limit_rad_s).astype(float)
+    return smooth(slow) >= max_fraction
+
+
+def _window(derivative: int = 0) -> Floats:
+    """Return the smoothing window or one of its derivatives with respect to ticks, (2 HALF_WINDOW + 1,).
+
+    With s = pi / (2 HALF_WINDOW), at tick k from the middle:
+
+        w(k)   = cos(s k)^4 / sum
+        w'(k)  = -4 s cos(s k)^3 sin(s k) / sum
+        w''(k) = s^2 (12 cos(s k)^2 sin(s k)^2 - 4 cos(s k)^4) / sum
+
+    Differences of neighboring samples instead of w'' would make accelerations too small, and so rotors too heavy.
+    """
+    s = np.pi / (2 * HALF_WINDOW)
+    phase = np.arange(-HALF_WINDOW, HALF_WINDOW + 1) * np.pi / (2 * HALF_WINDOW)
+    cos = np.cos(phase)
+    sin = np.sin(phase)
+    match derivative:
+        case 0:
+            shape = cos**4
+        case 1:
+            shape = -4 * cos**3 * sin * s
+        case _:
+            shape = (12 * cos**2 * sin**2 - 4 * cos**4) * s**2
+    return shape / np.sum(cos**4)

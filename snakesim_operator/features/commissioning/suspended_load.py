@@ -1,0 +1,136 @@
+"""The torques that the links of a robot suspended by its tail need, for their inertia and their weight. Pure.
+
+Newton's and Euler's equations from link to link, for all ticks at once. The tail link is clamped with its x axis
+pointing down, so its rotation about x does not matter.
+
+Source: Luh, Walker and Paul (1980), "On-line computational scheme for mechanical manipulators".
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.links import Link
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.solids import GRAVITY_M_S2
+
+AXES = {"yaw": (0.0, 0.0, 1.0), "pitch": (0.0, 1.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class _LinkMotion:
+    """The motion of a link in its own frame, (n, 3) each."""
+
+    omega: Floats  # angular velocity, rad/s
+    alpha: Floats  # angular acceleration, rad/s^2
+    acceleration: Floats  # of the link's rear joint, m/s^2; weight counts as an acceleration upwards
+
+
+def list_links(robot: RobotFile) -> Sequence[Link]:
+    """Return every link, tail to head, also of a robot whose file lists none."""
+    if robot.links:
+        return robot.links
+    pairs = zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)
+    return [Link(length_m=length, mass_kg=mass) for length, mass in pairs]
+
+
+def load_nm(robot: RobotFile, angle_rad: Floats, velocity_rad_s: Floats, acceleration_rad_s2: Floats) -> Floats:
+    """Return the torque that the links need at every joint, (n, joints); the rotors' inertia is not included.
+
+    All arguments are (n, joints), tail to head.
+    """
+    links = list_links(robot)
+    rotations = [
+        rotations_about(np.array(AXES[axis]), angle_rad[:, joint]) for joint, axis in enumerate(robot.axes)
+    ]  # of each joint, from the frame of the link ahead to that of the link behind
+    motions = _move_links(robot, links, rotations, velocity_rad_s, acceleration_rad_s2)
+    return _torques_through_joints(robot, links, rotations, motions)
+
+
+def _move_links(
+    robot: RobotFile,
+    links: Sequence[Link],
+    rotations: Sequence[Floats],
+    velocity_rad_s: Floats,
+    acceleration_rad_s2: Floats,
+) -> list[_LinkMotion]:
+    """Return the motion of the link ahead of each joint, from the tail to the head.
+
+    With l to the link's front joint, R of the joint, z its axis and q its angle:
+
+        a'     = R' (a + alpha x l + omega x (omega x l))
+        alpha' = R' alpha + (R' omega) x (q' z) + q'' z
+        omega' = R' omega + q' z
+    """
+    count = len(velocity_rad_s)
+    omega = np.zeros((count, 3))
+    alpha = np.zeros((count, 3))
+    acceleration = np.tile([-GRAVITY_M_S2, 0.0, 0.0], (count, 1))
+    motions: list[_LinkMotion] = []
+    for joint, axis_name in enumerate(robot.axes):
+        axis = np.array(AXES[axis_name])
+        to_front = np.array([links[joint].length_m, 0.0, 0.0])
+        acceleration = acceleration + np.cross(alpha, to_front) + np.cross(omega, np.cross(omega, to_front))
+        omega = _into_link_ahead(rotations[joint], omega)
+        alpha = _into_link_ahead(rotations[joint], alpha)
+        acceleration = _into_link_ahead(rotations[joint], acceleration)
+        joint_rate = velocity_rad_s[:, joint, None] * axis
+        alpha = alpha + np.cross(omega, joint_rate) + acceleration_rad_s2[:, joint, None] * axis
+        omega = omega + joint_rate
+        motions.append(_LinkMotion(omega, alpha, acceleration))
+    return motions
+
+
+def _torques_through_joints(
+    robot: RobotFile, links: Sequence[Link], rotations: Sequence[Floats], motions: Sequence[_LinkMotion]
+) -> Floats:
+    """Return the torque through every joint, (n, joints), by the forces on the links from the head to the tail.
+
+    With c to the center of mass, l to the front joint, I the inertia about c, and f and m from the link ahead:
+
+        F  = mass (a + alpha x c + omega x (omega x c))
+        m' = I alpha + omega x (I omega) + c x F + m + l x f
+        f' = F + f
+    """
+    count = len(motions[0].omega)
+    torque = np.zeros((count, len(motions)))
+    force = np.zeros((count, 3))  # of the link ahead on this one, in this link's frame
+    moment = np.zeros((count, 3))
+    for joint in reversed(range(len(motions))):
+        link = links[joint + 1]
+        motion = motions[joint]
+        center = np.array(link.center)
+        to_front = np.array([link.length_m, 0.0, 0.0])
+        xx, yy, zz, xy, xz, yz = link.inertia(robot.module.radius_m)
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        centripetal = np.cross(motion.omega, np.cross(motion.omega, center))
+        inertial_force = link.mass_kg * (motion.acceleration + np.cross(motion.alpha, center) + centripetal)
+        inertial_moment = motion.alpha @ inertia + np.cross(motion.omega, motion.omega @ inertia)
+        moment = inertial_moment + np.cross(center, inertial_force) + moment + np.cross(to_front, force)
+        force = inertial_force + force
+        torque[:, joint] = moment @ np.array(AXES[robot.axes[joint]])
+        force = _into_link_behind(rotations[joint], force)
+        moment = _into_link_behind(rotations[joint], moment)
+    return torque
+
+
+def _into_link_ahead(rotation: Floats, vector: Floats) -> Floats:
+    return np.einsum("nji,nj->ni", rotation, vector)
+
+
+def _into_link_behind(rotation: Floats, vector: Floats) -> Floats:
+    return np.einsum("nij,nj->ni", rotation, vector)
+
+
+def rotations_about(axis: Floats, angle_rad: Floats) -> Floats:
+    """Return the rotation matrices by angles, (n,), about a unit axis, (n, 3, 3).
+
+    R = 1 + sin(a) K + (1 - cos(a)) K K, where K v = axis x v. Source: Rodrigues' formula.
+    """
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sin = np.sin(angle_rad)[:, None, None]
+    cos = np.cos(angle_rad)[:, None, None]
+    return np.eye(3) + sin * cross + (1 - cos) * (cross @ cross)
