@@ -73,14 +73,14 @@ class CanBackend(DriveBackend):
         watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
         super().__init__(config, NAME, hardware, clock, mocap, make_modules, watchdogs_s)
 
-    def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+    def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)
 
-    def _samples(self, tick: int, timestamp_ns: int) -> Samples:
+    def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
         return self._sample_builder.make_samples(tick, timestamp_ns)
 
-    def _silent(self) -> list[Finding]:
+    def _find_silent_drives(self) -> list[Finding]:
         return []  # the monitor finds silent modules, by their answers to Syncs
 
-    def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
         return describe_sensors(config, self._reports, pose_delay_s=pose_delay_s)

@@ -209,7 +209,7 @@ class ObstacleAided:
 
     def _angles_on_path(self, located: Located, tail_s_m: float) -> Floats:
         """Return theta(s): the angles of all joints, (n_joints,), with the tail at an arc length of the path."""
-        return self._body.all_angles(located.on_path.at(tail_s_m))
+        return self._body.all_angles(located.on_path.pose_at(tail_s_m))
 
     def _has_near_obstacles(self) -> bool:
         return self._snapshot is not None and len(self._snapshot.touches) > 0
@@ -369,7 +369,7 @@ class ObstacleAided:
         """Return the nodes of the body, (2, n_nodes), when the motors will act: moved on along the path."""
         acting_s_m = located.tail_s_m + ACTUATION_DELAY_S * located.speed_m_s
         on_path = located.on_path
-        return located.nodes_w + on_path.at(acting_s_m).nodes_w - on_path.at(located.measured_s_m).nodes_w
+        return located.nodes_w + on_path.pose_at(acting_s_m).nodes_w - on_path.pose_at(located.measured_s_m).nodes_w
 
     def _no_contact_costs(self, obstacles: list[str]) -> Floats | float:
         """Return the extra cost of each contact, (k,): no_contact_cost exp(-force / CONTACT_FORCE_SCALE_N).

@@ -164,12 +164,12 @@ class ObstacleTriplet:
         s = located.tail_s_m
         last_pose = self._body_pose
         if last_pose is None or located.restarted:
-            body_pose = located.on_path.at(s)
+            body_pose = located.on_path.pose_at(s)
         else:
             last_s = last_pose.tail_s_m
             max_advance_m = max(located.trajectory.speed_m_s, 0.0) * config.overspeed_ratio * view.period_s
             followed_s = min(max(last_s, s - config.slack_m), s + config.slack_m, last_s + max_advance_m)
-            body_pose = located.on_path.at(max(followed_s, s - config.brake_m))
+            body_pose = located.on_path.pose_at(max(followed_s, s - config.brake_m))
         lift_rad = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
         reference = self._body.all_angles(body_pose) + lift_rad
         if not len(self._reference):

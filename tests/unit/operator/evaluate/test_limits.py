@@ -3,6 +3,8 @@
 import time
 from pathlib import Path
 
+import pytest
+
 from snakesim_operator.features.evaluate.case import GAVE_UP, CaseOutcome, code_digest, run_case
 from snakesim_operator.features.evaluate.suite import Suite, make_cases
 
