@@ -121,13 +121,17 @@ class Motors:
         Raises:
             BackendError: a drive does not have the mode of its setpoint.
         """
-        if setpoints.mode != self._modes:
-            self._change_modes(setpoints.mode)
-        self._inputs[self._input_indices] = setpoints.target
+        self.drive(setpoints.mode, setpoints.target, setpoints.torque_limit_nm)
+
+    def drive(self, modes: list[Mode], targets: list[float], limits_nm: list[float]) -> None:
+        """Drive the simulated motors, as `enact` does; also before a run begins, when no limiter is there yet."""
+        if modes != self._modes:
+            self._change_modes(modes)
+        self._inputs[self._input_indices] = targets
         if self._passive_indices:
             self._inputs[self._passive_indices] = 0.0
-        if setpoints.torque_limit_nm != self._commanded_limit_nm:
-            self._commanded_limit_nm = list(setpoints.torque_limit_nm)
+        if limits_nm != self._commanded_limit_nm:
+            self._commanded_limit_nm = list(limits_nm)
             self._update_limit()
 
     def derate(self, remaining_fraction: Floats) -> None:
@@ -138,7 +142,7 @@ class Motors:
     def switch_off(self) -> None:
         """Make all joints passive."""
         zeros = [0.0] * self.count
-        self.enact(SafeSetpoints([Mode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist()))
+        self.drive([Mode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist())
 
     def before_steps(self) -> None:
         """Apply a lowered limit as fast as the motor can follow, and end wind-up above it. Call it once a tick."""

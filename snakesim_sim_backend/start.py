@@ -5,7 +5,6 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
@@ -92,7 +91,7 @@ def _settle(
     """Let the snake fall and come to rest, with its motors holding the start angles."""
     modes = [Mode.POSITION] * motors.count
     limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
-    motors.enact(SafeSetpoints(modes, pose.angles_rad.tolist(), limits_nm))
+    motors.drive(modes, pose.angles_rad.tolist(), limits_nm)
     physics.set_min_friction(SETTLING_FRICTION)
     steps = max(round(ROUND_S / model.opt.timestep), 1)
     rounds = round(settle_s / (steps * model.opt.timestep))

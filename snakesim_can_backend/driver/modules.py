@@ -26,7 +26,6 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
@@ -232,8 +231,7 @@ class JointModules:
         self._arm_is_due = False
         if self._lifecycle != "armed":
             return
-        setpoints = SafeSetpoints(modes, targets.tolist(), limits_nm.tolist(), self._isolated)
-        for joint, frame in enumerate(self._setpoints.encode(setpoints)):
+        for joint, frame in enumerate(self._setpoints.encode(modes, targets, limits_nm)):
             if joint not in following:
                 continue
             wire = self._wire_of[joint]

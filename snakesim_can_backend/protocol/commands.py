@@ -23,8 +23,8 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
     ParameterOperation,
 )
-from snakesim_hal.backend import SafeSetpoints
-from snakesim_hal.wire.messages import LifecycleState
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.messages import LifecycleState, Mode
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
 MAX_TARGET_RAW = 32767  # of a signed number of 16 bits; -32768 is not used, so that the range is symmetric
@@ -45,14 +45,18 @@ class SetpointWriter:
         self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; a passive joint has no target
         self._limit_steps_per_nm = 1.0 / layout.signals["torque_limit"].scale
 
-    def encode(self, setpoints: SafeSetpoints) -> list[Frame]:
-        """Return one frame a joint, tail to head."""
-        modes = np.array(setpoints.mode, dtype=np.intp)
-        targets = np.array(setpoints.target) * self._steps_per_unit[modes]
-        limits = np.array(setpoints.torque_limit_nm) * self._limit_steps_per_nm
-        targets_raw = _round_steps(targets, -MAX_TARGET_RAW, MAX_TARGET_RAW).tolist()
-        limits_raw = _round_steps(limits, 0, MAX_TORQUE_LIMIT_RAW).tolist()
-        rows = zip(setpoints.mode, self._count, targets_raw, limits_raw, strict=True)
+    def encode(self, modes: list[Mode], targets: Floats, limits_nm: Floats) -> list[Frame]:
+        """Return one frame a joint, tail to head.
+
+        Args:
+            modes: Control mode of every joint.
+            targets: (n_joints,) rad, rad/s or N·m at the module's shaft, as the mode says.
+            limits_nm: (n_joints,) torque limits at the module's shaft.
+        """
+        mode_indices = np.array(modes, dtype=np.intp)
+        targets_raw = _round_steps(targets * self._steps_per_unit[mode_indices], -MAX_TARGET_RAW, MAX_TARGET_RAW)
+        limits_raw = _round_steps(limits_nm * self._limit_steps_per_nm, 0, MAX_TORQUE_LIMIT_RAW)
+        rows = zip(modes, self._count, targets_raw.tolist(), limits_raw.tolist(), strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 
     def confirm_sent(self, joint: int) -> None:

@@ -3,6 +3,7 @@
 import math
 from typing import get_args
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,7 +16,6 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
 )
-from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import LifecycleState, Mode
 from tests.unit.can_backend.frames import read
 
@@ -24,7 +24,7 @@ TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "to
 
 
 def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
-    (frame,) = commands.SetpointWriter(1).encode(SafeSetpoints([mode], [target], [limit_nm]))
+    (frame,) = commands.SetpointWriter(1).encode([mode], np.array([target]), np.array([limit_nm]))
     return frame
 
 
@@ -56,7 +56,7 @@ def test_a_passive_joint_gets_no_target(target: float) -> None:
 
 def test_joints_and_set_points_must_be_as_many() -> None:
     with pytest.raises(ValueError):
-        commands.SetpointWriter(3).encode(SafeSetpoints([Mode.PASSIVE] * 2, [0.0] * 2, [0.0] * 2))
+        commands.SetpointWriter(3).encode([Mode.PASSIVE] * 2, np.zeros(2), np.zeros(2))
 
 
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------
