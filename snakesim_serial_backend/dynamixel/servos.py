@@ -77,7 +77,7 @@ class Servos:
         answers = bring_up(self.servos, self._port, self._settings)
         self._may_write = True
         for i, (present, health) in enumerate(answers):
-            self._take_over_motion(i, present)
+            self.handle_answer(i, present)
             self._take_over_health(i, health)
 
     # --- reading ----------------------------------------------------------------------------------------------
@@ -110,7 +110,7 @@ class Servos:
             for i in missing:
                 answer = answers.get(self.servos[i].id)
                 if answer is not None:
-                    self._take_over_motion(i, answer)
+                    self.handle_answer(i, answer)
             missing = [i for i in missing if self.servos[i].id not in answers]
             if missing:
                 self._silent.add(missing.pop(0))
@@ -129,9 +129,9 @@ class Servos:
             servo.garbled = 0
         if len(answers.statuses) == 1:
             self._silent.clear()  # perhaps others answer again, too
-            self._take_over_motion(i, answers.statuses[0])
+            self.handle_answer(i, answers.statuses[0])
 
-    def _take_over_motion(self, i: int, status: Packet) -> None:
+    def handle_answer(self, i: int, status: Packet) -> None:
         """Put what a servo measures into the readings."""
         servo = self.servos[i]
         current, velocity, position = at.present_form.unpack(status.data)

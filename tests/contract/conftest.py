@@ -93,13 +93,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def cut_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's module."""
-    take = backend.modules.reading.take
+    process_frame = backend.modules.reading.process_frame
 
     def receive(frame: Frame) -> None:
         if parse_node(frame.id) != joint + 1:
-            take(frame)
+            process_frame(frame)
 
-    backend.modules.reading.take = receive
+    backend.modules.reading.process_frame = receive
 
 
 def cut_drive_off(backend: Any, joint: int) -> None:

@@ -115,7 +115,8 @@ def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole:
         written(tmp_path / name, whole)
     for command in COMMANDS:
         ended = snakesim(*command, cwd=tmp_path)
-        assert ended.code == 0 and not ended.err, ended
+        errors = [line for line in ended.err.splitlines() if "update() took" not in line]  # by a busy computer
+        assert ended.code == 0 and not errors, ended
     page = (tmp_path / "a.html").read_text()
     assert "The run ended early" not in page and "The record lacks" not in page
     # What repeats the run names a file that can be.

@@ -67,7 +67,7 @@ def _add_optimize(commands: Any) -> None:
     command.add_argument("--rows", metavar="1,2,...", help="on these rows of a suite, with what it draws")
     command.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
     command.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
-    command.add_argument("--minimise", action="store_true", help="search the smallest instead of the largest")
+    command.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
     command.add_argument(
         "--trials", type=number(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
     )

@@ -63,6 +63,7 @@ def test_every_refusal_is_told() -> None:
         (REPOSITORY / name).read_text(encoding="utf-8")
         for name in (
             "snakesim_hal/host/host.py",
+            "snakesim_hal/host/request_handler.py",
             "snakesim_hal/safety/lease.py",
             "snakesim_hal/faults/injector.py",
             "snakesim_hal/wire/codec.py",
