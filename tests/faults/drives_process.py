@@ -82,7 +82,7 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
     settings = backend_settings(config, backend)
     if backend is CanBackend:
         return _modules(config, settings, pose, opened)
-    parts: list[DriverTypePart] = backend.parts(config, settings)
+    parts: list[DriverTypePart] = backend.split_by_driver_type(config, settings)
     body, clock = make_body(config, settings, config.backend, pose), DriverClock(config)
     emulators = [_emulator(part, body.select(list(part.joints)), clock, opened) for part in parts]
 
