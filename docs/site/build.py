@@ -21,7 +21,17 @@ from snakesim_operator.cli import parser
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = ROOT / "build" / "site"
 SITE = ROOT / "build" / "docs"
-SHOWN = ("README.md", "CHANGELOG.md", "LICENSE", "docs", "schemas", "benchmarks", "deploy", "snakesim_gnc/guidance")
+SHOWN = (
+    "README.md",
+    "CHANGELOG.md",
+    "LICENSE",
+    "docs",
+    "schemas",
+    "benchmarks",
+    "deploy",
+    "examples",
+    "snakesim_gnc/guidance",
+)
 FENCE = re.compile(r"^(```\w+) +(\S.*)$", re.MULTILINE)  # a block, and a file's name or where it is typed
 TITLES = {"background": "in a terminal of its own", "of root": "as root", "by hand": ""}
 PACKAGES = [path.name for path in sorted(ROOT.glob("snakesim*")) if (path / "__init__.py").exists()]

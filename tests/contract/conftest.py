@@ -22,7 +22,7 @@ IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs
     "falls_silent",
     "a_closed_backend",
 )
-WHISKER = Path(__file__).parents[2] / "docs" / "whisker.py"
+WHISKER = Path(__file__).parents[2] / "examples" / "whisker.py"
 OF_SENSORS = ("sensor", "sample", "contradicts_itself", "listed")  # clauses that a camera may concern
 LOOKS_AHEAD = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',

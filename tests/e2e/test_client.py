@@ -20,7 +20,7 @@ from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 
-CLIENT, STEER, STOP = (REPOSITORY / "docs" / name for name in ("client.py", "steer.py", "stop.py"))
+CLIENT, STEER, STOP = (REPOSITORY / "examples" / name for name in ("client.py", "steer.py", "stop.py"))
 DEPTH = 8192
 ROBOT = ("triplet", "--set", "rate_hz=50", "--duration", "600", "--stay", "--clock-mode")
 EXTERNAL = ("--set", "services.control.external=true")

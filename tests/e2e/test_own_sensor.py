@@ -1,4 +1,4 @@
-"""A sensor with a message of its own, in one file outside of the packages: docs/whisker.py, of docs/sensors.md."""
+"""A sensor with a message of its own, in one file outside of the packages: examples/whisker.py, of docs/sensors.md."""
 
 import csv
 import json
@@ -22,7 +22,7 @@ from tests.whole import command as in_process
 
 pytestmark = pytest.mark.e2e
 
-ROBOT = REPOSITORY / "docs" / "planar13_whiskers.toml"
+ROBOT = REPOSITORY / "examples" / "planar13_whiskers.toml"
 PYTEST = (
     "-p",
     "no:cacheprovider",
@@ -39,10 +39,10 @@ LEFT = keys.own("left")
 @pytest.fixture
 def robot(tmp_path: Path) -> str:
     """The example, copied to where a user would have it."""
-    (tmp_path / "docs").mkdir()
+    (tmp_path / "examples").mkdir()
     for name in ("whisker.py", ROBOT.name):
-        (tmp_path / "docs" / name).write_text((REPOSITORY / "docs" / name).read_text())
-    return f"robot=./docs/{ROBOT.name}"
+        (tmp_path / "examples" / name).write_text((REPOSITORY / "examples" / name).read_text())
+    return f"robot=./examples/{ROBOT.name}"
 
 
 def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robot: str) -> None:
@@ -114,7 +114,7 @@ def test_the_contract_suite_accepts_it_and_refuses_it_when_it_lies(tmp_path: Pat
     clauses = " or ".join([*SAID, "sensor_listed", "description"])
     honest = suite(tmp_path, robot, clauses)
     assert honest.code == 0, honest.out[-3000:]
-    whisker = tmp_path / "docs" / "whisker.py"
+    whisker = tmp_path / "examples" / "whisker.py"
     told = whisker.read_text()
     for truth, lie in LIES.items():
         assert truth in told
@@ -126,7 +126,7 @@ def test_the_contract_suite_accepts_it_and_refuses_it_when_it_lies(tmp_path: Pat
 
 
 def test_a_lying_whisker_stops_the_robot_and_is_named(tmp_path: Path, robot: str) -> None:
-    whisker = tmp_path / "docs" / "whisker.py"
+    whisker = tmp_path / "examples" / "whisker.py"
     late = "bend_rad=7.0 if tick > 30 else 0.0"
     whisker.write_text(whisker.read_text().replace(BENT, late))
     done = in_process.snakesim("run", "peg_row", "--in-process", "--set", robot, "--duration", "5", cwd=tmp_path)

@@ -21,7 +21,7 @@ from tests.e2e.command import SNAKESIM, Running, environment, running
 from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
-STEER = Path(__file__).parents[2] / "docs" / "steer.py"
+STEER = Path(__file__).parents[2] / "examples" / "steer.py"
 UP, LEFT = b"\x1b[A", b"\x1b[D"
 NOTHING = Intent(timestamp_ns=0, who="nobody")
 

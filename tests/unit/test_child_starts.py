@@ -12,7 +12,14 @@ import pytest
 from snakesim_hal.base.process import child_environment, python_command
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("snakesim", *sorted(path.name for path in ROOT.glob("snakesim_*")), "benchmarks", "deploy", "docs")
+FOLDERS = (
+    "snakesim",
+    *sorted(path.name for path in ROOT.glob("snakesim_*")),
+    "benchmarks",
+    "deploy",
+    "docs",
+    "examples",
+)
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 STARTS = {

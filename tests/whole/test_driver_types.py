@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "docs" / "driver_types.py"
+SCRIPT = Path(__file__).parents[2] / "examples" / "driver_types.py"
 LINE = re.compile(
     r"(\w+) +moved ([0-9.]+) m, propulsion joints ([0-9 ]+|none), torque correlation (-?[0-9.]+), complete"
 )

@@ -11,7 +11,7 @@ import pytest
 from snakesim_operator.results.record import REPORT, RunRecord
 from tests.whole.command import snakesim
 
-SCRIPT = Path(__file__).parents[2] / "docs" / "without_sensors.py"
+SCRIPT = Path(__file__).parents[2] / "examples" / "without_sensors.py"
 SHORT = ["triplet", "--backend", "dynamixel", "--duration", "2.5", "--in-process"]
 BARE = [*SHORT, "--unset", "robot.sensors.imu"]  # and these servos have no contact sensors, whatever the file says
 

@@ -2,7 +2,7 @@
 
 [[sensors.range]]
 name = "sonar"
-model = "./docs/sonar.py:Sonar"
+model = "./examples/sonar.py:Sonar"
 range_max_m = 2.0
 settings = { cone_rad = 0.5 }
 """

@@ -4,7 +4,7 @@ In the robot file, or as planar13_whiskers.toml beside this file has it:
 
 [[sensors.own]]
 name = "left"
-model = "./docs/whisker.py:WhiskerModel"
+model = "./examples/whisker.py:WhiskerModel"
 position_m = [0.08, 0.03, 0.0]
 yaw_rad = 1.2
 settings = { length_m = 0.12 }
