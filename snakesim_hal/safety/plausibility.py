@@ -89,8 +89,7 @@ class PlausibilityCheck:
 
         measured_s = _measurement_times_s(joints, now_ns)
         elapsed_s = (measured_s - self._good_s).max(axis=0)
-        fresh = np.array(joints.age_ns, dtype=np.float64) <= self._limits.oldest_state_ns
-        sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
+        sound = self._find_sound(joints, columns)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
         jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.max_turn_rad(elapsed_s))
         settled = self._jumps.find_settled(jumped, columns[0], measured_s)
@@ -144,6 +143,12 @@ class PlausibilityCheck:
             if angle == last_angle and velocity == last_velocity and torque == last_torque:
                 return False
         return True
+
+    def _find_sound(self, joints: JointState, columns: Floats) -> Mask:
+        """Return which joints have a valid, finite and fresh state, (n_joints,)."""
+        fresh = np.array(joints.age_ns, dtype=np.float64) <= self._limits.oldest_state_ns
+        finite = np.isfinite(columns).all(axis=0)
+        return finite & fresh & np.array(joints.valid)
 
     def _make_unknown(self, tick: int, joints: Mask) -> ImplausibleState:
         names = self._find_names(joints)
