@@ -78,18 +78,26 @@ class PlausibilityCheck:
         if not joints.is_of(count):
             fault = Fault(tick=joints.tick, what="state_invalid", cause=f"no joint state of {count} joints")
             return ImplausibleState(fault, np.ones_like(self._known))
-        newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
-        columns = np.array(newest)
         if self._is_ordinary(joints):
-            self._columns = columns
+            newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+            self._columns = np.array(newest)
             self._ordinary = newest
             self._unchecked = (joints, now_ns, applied)
             return None
         self._process_unchecked_state()
+        return self._check_each_joint(joints, now_ns=now_ns, applied=applied, isolated=isolated)
 
+    def _check_each_joint(
+        self, joints: JointState, *, now_ns: int, applied: Applied | None, isolated: Mask
+    ) -> ImplausibleState | None:
+        """Do the three checks for each joint of a state that is not ordinary. The arguments are those of `check`."""
+        newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+        columns = np.array(newest)
         measured_s = _measurement_times_s(joints, now_ns)
-        elapsed_s = (measured_s - self._good_s).max(axis=0)
         sound = self._find_sound(joints, columns)
+
+        # Angles that are too far from the last good one.
+        elapsed_s = (measured_s - self._good_s).max(axis=0)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
         jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.max_turn_rad(elapsed_s))
         settled = self._jumps.find_settled(jumped, columns[0], measured_s)
@@ -99,6 +107,7 @@ class PlausibilityCheck:
         if applied is None:
             jumped = jumped & ~settled
 
+        # Keep the good values.
         good = sound & ~jumped
         self._columns = np.where(good, columns, self._columns)
         self._good_s = np.where(good, measured_s, self._good_s)

@@ -331,6 +331,13 @@ def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
     assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
 
 
+def test_a_torque_far_from_the_ends_is_not_named_by_them() -> None:
+    asked = command(ROBOT, 5.0, Mode.TORQUE)
+    measured = every(0.0, 1.45)
+    applied = limited(asked, measured, before(Mode.TORQUE, 4.0))
+    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
+
+
 BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
 
 
