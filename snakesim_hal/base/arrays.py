@@ -1,4 +1,4 @@
-"""Arrays by what they hold; shape and unit are said where one is used."""
+"""Names of array types. Shape and unit are given where an array is used."""
 
 import numpy as np
 from numpy.typing import NDArray

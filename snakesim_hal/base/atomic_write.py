@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-PARTIAL = ".partial"
+PARTIAL = ".partial"  # suffix of a file that is not complete yet
 
 
 def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
@@ -25,7 +25,7 @@ def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
     partial = path.with_name(path.name + PARTIAL)
     try:
         partial.unlink(missing_ok=True)
-        with partial.open("xb") as file:  # not through a link
+        with partial.open("xb") as file:  # exclusive: it does not write through a link
             permissions = _permissions(path)
             if permissions is not None:
                 os.fchmod(file.fileno(), permissions)
@@ -72,7 +72,7 @@ def replaced(path: Path) -> Iterator[Path]:
     and nothing is left of the other one.
     """
     partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
-    _remove(partial)  # of a process that was killed
+    _remove(partial)  # a process that was killed may have left it
     try:
         yield partial
         partial.rename(path)

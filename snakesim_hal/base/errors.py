@@ -4,12 +4,10 @@ from collections.abc import Iterable
 
 
 class SnakesimError(Exception):
-    """Base of all errors of SnakeSIM; the message says what is wrong, and what to do next.
-
-    lines: usually one. Each is printed as one line, whatever it quotes from a file or from the network.
-    """
+    """Base of all errors of SnakeSIM; the message says what is wrong, and what to do next."""
 
     def __init__(self, *lines: str) -> None:
+        """Make an error with one line or more. Each is printed as one line, whatever it quotes from file or network."""
         super().__init__("\n".join(lines))
         self.lines = lines
 
@@ -21,17 +19,18 @@ class ConfigError(SnakesimError, ValueError):
 class WireError(SnakesimError, ValueError):
     """A sample from the network is rejected: malformed, out of bounds, or of an unknown version.
 
-    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`; of what does not fit the
-    robot `wrong_length`, `no_rotation`, `no_path`. `detail` says the rest.
+    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`; or, if the sample does not
+    fit the robot, `wrong_length`, `no_rotation`, `no_path`. `detail` has the values.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
-        self.reason, self.detail = reason, detail
+        self.reason = reason
+        self.detail = detail
 
 
 class NotConnectedError(SnakesimError, ConnectionError):
-    """No robot answers at the endpoint and namespace asked for."""
+    """No robot answers at the requested endpoint and namespace."""
 
 
 class StalledError(SnakesimError, TimeoutError):
@@ -43,11 +42,11 @@ class ControllerError(SnakesimError, RuntimeError):
 
 
 class ServiceError(SnakesimError, RuntimeError):
-    """A service raised, or said what no reader accepts: names service, key, tick, field, value, what is allowed."""
+    """A service raised, or published what no reader accepts: names service, key, tick, field, value and range."""
 
 
 class BackendError(SnakesimError, RuntimeError):
-    """A backend cannot go on: a diverged simulation, a dead bus. The host reports it and goes safe."""
+    """A backend cannot go on: a diverged simulation, a dead bus. The host reports it and stops the robot."""
 
 
 class RefusedError(SnakesimError, PermissionError):
@@ -75,7 +74,9 @@ def raised(error: BaseException, plugin: str = "") -> str:
         error: The exception, as caught.
         plugin: Module of the plugin's class; its package is where the line is looked for if the plugin is installed.
     """
-    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    what = type(error).__name__
+    if str(error):
+        what = f"{what}: {error}"
     file, line = _line_of_plugin(error, plugin.partition(".")[0])
     return f"raised {what} ({file.rpartition('/')[2]} line {line})"
 
@@ -86,34 +87,37 @@ def _line_of_plugin(error: BaseException, package: str) -> tuple[str, int]:
     import traceback
 
     standard = (f"{sysconfig.get_path('stdlib')}/", "<frozen ")
-    newest_first = [
-        (str(frame.f_globals.get("__name__", "")).partition(".")[0], frame.f_code.co_filename, line)
-        for frame, line in traceback.walk_tb(error.__traceback__)
-    ][::-1]
-    for name, file, line in newest_first:
+    newest_first: list[tuple[str, str, int]] = []  # package, file, line
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__", ""))
+        newest_first.insert(0, (module.partition(".")[0], frame.f_code.co_filename, line))
+    for frame_package, file, line in newest_first:
         installed = any(f"/{folder}/" in file for folder in INSTALLED_IN)
-        if name not in OUR_PACKAGES and not installed and not file.startswith(standard):
+        if frame_package not in OUR_PACKAGES and not installed and not file.startswith(standard):
             return file, line
-    for name, file, line in newest_first:
-        if name == package:
+    for frame_package, file, line in newest_first:
+        if frame_package == package:
             return file, line
     _, file, line = newest_first[0]
     return file, line
 
 
 def short(text: str, most: int = 120) -> str:
-    """User text for quoting in a message: its beginning, if it is long."""
-    return text if len(text) <= most else text[: most - 3] + "..."
+    """Return a text of a user for quoting in a message: at most `most` characters."""
+    if len(text) <= most:
+        return text
+    return text[: most - 3] + "..."
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """What a mistyped word may have meant."""
-    import difflib  # only a mistake pays for it: `snakesim estop` must start at once
+    """Return the known word that a mistyped one may mean; None if no word is near."""
+    import difflib  # imported only for a mistake: `snakesim estop` must start at once
 
-    return next(iter(difflib.get_close_matches(word, list(known), 1, 0.6)), None)
+    matches = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return matches[0] if matches else None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The question for a message, with a space behind it; empty if nothing is near."""
+    """Return the question for a message, with a space behind it; empty if no known word is near."""
     close = nearest(word, known)
     return f"did you mean `{close}`? " if close else ""

@@ -17,22 +17,28 @@ from typing import NoReturn
 from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.base.terminal import print_stderr
 
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
+# SIGHUP means that the terminal or the ssh session was closed.
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SEARCH_PATH = "PYTHONPATH"
 SAFE_PATH = "PYTHONSAFEPATH"  # the variable that stands for Python's option -P
+# Numbers of the Linux kernel, from <linux/prctl.h>, <linux/capability.h> and <bits/mman-linux.h>.
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
-MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+MCL_CURRENT = 1
+MCL_FUTURE = 2
+MCL_ONFAULT = 4
 MIN_MEMORY_LIMIT = 2**30  # bytes: four times what a run allocates
-SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
+SWITCH_INTERVAL_S = 0.0005  # of the interpreter; its default of 5 ms is half a control period
 # Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs does not delay the host.
-HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
+HOST_PRIORITY = 20
+SERVICE_PRIORITY = 19
+MAX_USER_NAME_LENGTH = 64  # characters, as `quantities.Name` allows
 
 
 def user_name() -> str:
-    """The user's name."""
+    """Return the name of the user who runs this process, for status and logs."""
     try:
-        return getpass.getuser()[:64]
+        return getpass.getuser()[:MAX_USER_NAME_LENGTH]
     except (KeyError, OSError):
         return "operator"
 
@@ -71,7 +77,8 @@ def protect_children() -> None:
 def die_with_parent(parent_pid: int | None = None) -> None:
     """Have the kernel kill this process the moment its parent dies, however it dies.
 
-    parent_pid: the parent's process id, passed by the parent; if it is gone already, exit at once.
+    Args:
+        parent_pid: the parent's process id, passed by the parent. If that process has ended already, exit at once.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
@@ -81,13 +88,13 @@ def die_with_parent(parent_pid: int | None = None) -> None:
 
 
 def stop_signals() -> tuple[signal.Signals, ...]:
-    """The stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
+    """Return the stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return tuple(number for number in STOPS if not (ignored and number == signal.SIGHUP))
 
 
 def accept_interrupts() -> None:
-    """From here on every stop counts: children start with Ctrl-C blocked, until they can handle it."""
+    """Receive stop signals from now on. Children start with these signals blocked, until they can handle them."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
 
 
@@ -148,7 +155,8 @@ def enter_realtime(priority: int) -> list[str]:
     Best effort: measures that the system refuses are printed to stderr, and returned as short reasons.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    refused = [reason for reason in (set_realtime_priority(priority), lock_memory()) if reason is not None]
+    results = [set_realtime_priority(priority), lock_memory()]
+    refused = [reason for reason in results if reason is not None]
     for reason in refused:
         print_stderr(f"real time: {reason}")
     return refused
@@ -178,8 +186,8 @@ def drop_priority_after(longest_s: float) -> None:
         print_stderr(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
 
     signal.signal(signal.SIGXCPU, drop_priority)
-    _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
-    resource.setrlimit(resource.RLIMIT_RTTIME, (round(longest_s * 1e6), most))
+    _, hard_limit_us = resource.getrlimit(resource.RLIMIT_RTTIME)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (round(longest_s * 1e6), hard_limit_us))
 
 
 def lock_memory() -> str | None:
@@ -220,7 +228,9 @@ def available_memory() -> int:
 def raise_open_files(most: int) -> None:
     """Raise this process's limit of open files and connections, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    allowed = most
+    if hard != resource.RLIM_INFINITY:
+        allowed = min(most, hard)
     if soft != resource.RLIM_INFINITY and soft < allowed:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 
@@ -236,7 +246,10 @@ def step_wall_clock(by_s: float) -> None:
 
 
 def _has_capability(number: int) -> bool:
-    for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+    """Return whether this process has a capability of the Linux kernel, such as CAP_IPC_LOCK."""
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    for line in status.splitlines():
         if line.startswith("CapEff:"):
-            return bool(int(line.split()[1], 16) >> number & 1)
+            effective = int(line.split()[1], 16)
+            return bool(effective >> number & 1)
     return False

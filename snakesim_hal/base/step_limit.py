@@ -1,8 +1,8 @@
 """A limit on how long one step may take, for code that could compute without end, such as a controller.
 
 A thread watches the steps of another one, and raises StepTooLongError in it. That reaches Python code, also an endless
-loop. Compiled code that does not return is not reached: only another process can end that, and a `Pulse` shows it what
-to end.
+loop. It does not reach compiled code that does not return: only another process can end that. A `Pulse` shows that
+process which step is too long.
 """
 
 import ctypes
@@ -13,9 +13,9 @@ import time
 import traceback
 from typing import Self
 
-WATCH_S = 0.25  # between two looks at the step
+WATCH_PERIOD_S = 0.25  # between two checks of the present step
+INTERRUPT_AGAIN_S = 2.0  # until a step that has caught the error is interrupted again
 TWO_TIMES = struct.Struct("dd")
-AGAIN_S = 2.0  # until a step that has caught the error is interrupted again
 
 
 class StepTooLongError(BaseException):
@@ -42,7 +42,9 @@ class Pulse:
     def step_s(self) -> tuple[float, float] | None:
         """Return when the present step began and when it is due; None between steps."""
         began_s, due_s = TWO_TIMES.unpack_from(self._memory, 0)
-        return (began_s, due_s) if began_s else None
+        if not began_s:
+            return None
+        return began_s, due_s
 
 
 class StepLimit:
@@ -57,12 +59,12 @@ class StepLimit:
     def __init__(
         self, limit_s: float, pulse: Pulse | None = None, error: type[BaseException] = StepTooLongError
     ) -> None:
-        """Limit steps to so long.
+        """Limit steps to `limit_s` each.
 
         Args:
-            limit_s: wall time of a step.
+            limit_s: maximum wall time of a step.
             pulse: shows another process when the present step began.
-            error: what is raised; one of its own for each of two limits that are nested.
+            error: the class of what is raised. Two limits that are nested need different classes.
         """
         self.limit_s = limit_s
         self._pulse = pulse
@@ -74,7 +76,7 @@ class StepLimit:
         self._began_s: float | None = None
         self._thread = 0
         self._interrupted_s: float | None = None
-        # A hurry, until the steps are over.
+        # After `hurry`: when it was called, and how long steps may take from then on.
         self._hurried_s = 0.0
         self._grace_s: float | None = None
 
@@ -108,31 +110,33 @@ class StepLimit:
             self._pulse.end()
 
     def hurry(self, grace_s: float) -> None:
-        """Give the present step and later ones only so long from now on. May be called by a signal handler."""
+        """Give the present step and each later one only `grace_s` from now on. A signal handler may call this."""
         self._hurried_s = time.monotonic()
         self._grace_s = grace_s
 
     @property
     def is_hurried(self) -> bool:
-        """Whether steps get no more than a grace period."""
+        """Return whether steps get no more than a grace period."""
         return self._grace_s is not None
 
     def close(self) -> None:
-        """Watch no longer."""
+        """End the thread that watches the steps."""
         self._closed.set()
         if self._watcher is not None:
             self._watcher.join()
 
     def _watch(self) -> None:
-        while not self._closed.wait(WATCH_S):
+        """Interrupt steps that take too long, until `close`."""
+        while not self._closed.wait(WATCH_PERIOD_S):
             with self._lock:
                 if self._began_s is not None and self._is_due(self._began_s, time.monotonic()):
                     self._interrupted_s = time.monotonic()
                     _raise_in(self._thread, self._error)
 
     def _is_due(self, began_s: float, now_s: float) -> bool:
+        """Return whether the present step is to be interrupted now."""
         if self._interrupted_s is not None:
-            return now_s >= self._interrupted_s + AGAIN_S
+            return now_s >= self._interrupted_s + INTERRUPT_AGAIN_S
         if now_s >= began_s + self.limit_s:
             return True
         return self._grace_s is not None and now_s >= max(began_s, self._hurried_s) + self._grace_s
@@ -145,6 +149,6 @@ def place_of(error: StepTooLongError) -> str:
 
 
 def _raise_in(thread: int, error: type[BaseException] | None) -> None:
-    """Raise an error in a thread as soon as it runs Python code; None takes back one that was not raised yet."""
-    raised = None if error is None else ctypes.py_object(error)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), raised)
+    """Raise an error in a thread as soon as it runs Python code; None withdraws one that was not raised yet."""
+    pending = None if error is None else ctypes.py_object(error)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), pending)

@@ -17,13 +17,18 @@ Say = Callable[[str], None]
 
 
 def printable(text: str, keep: str = "") -> str:
-    """The text with every invisible character escaped as `\\u001b`; except spaces, and characters in `keep`."""
+    """Return the text with every invisible character escaped as `\\u001b`; except spaces, and characters in `keep`."""
     if text.isprintable():
         return text
-    return "".join(char if char.isprintable() or char in keep else _escaped(char) for char in text)
+    characters: list[str] = []
+    for char in text:
+        visible = char.isprintable() or char in keep
+        characters.append(char if visible else _escape(char))
+    return "".join(characters)
 
 
-def _escaped(char: str) -> str:
+def _escape(char: str) -> str:
+    """Return a character as JSON escapes, one for each of its UTF-16 units."""
     units = char.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))
 
@@ -35,12 +40,14 @@ def say(line: str) -> None:
 
 @contextmanager
 def output_may_fail() -> Iterator[None]:
-    """Inside, a failed write ends nothing, because a robot moves: a closed pipe or terminal, a full disk."""
+    """Make failed writes harmless within, because a robot moves: a closed pipe or terminal, a full disk."""
     with redirect_stdout(_FailSafeStream(sys.stdout)), redirect_stderr(_FailSafeStream(sys.stderr)):
         yield
 
 
 class _FailSafeStream(io.TextIOBase):
+    """A text stream whose writes never fail: after the first failure its output is discarded."""
+
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
@@ -67,7 +74,7 @@ class _FailSafeStream(io.TextIOBase):
 
 
 def discard(stream: TextIO) -> None:
-    """From here on what is printed is thrown away, what is still in the buffer, too."""
+    """Throw away what is printed to a stream from now on, and what is still in its buffer."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
@@ -86,12 +93,20 @@ def print_stderr(line: str) -> None:
 
 
 def exit_code(tool: str, act: Callable[[], int]) -> int:
-    """Of a program: what it returns; else the error is told, 2 for wrong input, 1 for any other."""
+    """Run a program and return its exit code. An error is printed: 2 means wrong input, 1 any other error.
+
+    Args:
+        tool: name of the program, which its errors begin with.
+        act: the program.
+    """
     try:
         return act()
+    except ConfigError as error:
+        report_error(error, tool)
+        return 2
     except SnakesimError as error:
         report_error(error, tool)
-        return 2 if isinstance(error, ConfigError) else 1
+        return 1
 
 
 def report_error(error: SnakesimError, tool: str) -> None:
@@ -102,29 +117,42 @@ def report_error(error: SnakesimError, tool: str) -> None:
 
 
 def aligned(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> Iterator[str]:
-    """Rows, which are texts by column, as lines with a heading."""
-    every = [dict(zip(columns, columns, strict=True)), *rows]
-    widths = [max(len(row[column]) for row in every) for column in columns]
-    for row in every:
-        yield "  ".join(f"{row[name]:<{width}}" for name, width in zip(columns, widths, strict=True)).rstrip()
+    """Yield the lines of a table with a heading. Each row has a text for each column."""
+    heading = {column: column for column in columns}
+    lines = [heading, *rows]
+    widths = {column: max(len(line[column]) for line in lines) for column in columns}
+    for line in lines:
+        cells = [line[column].ljust(widths[column]) for column in columns]
+        yield "  ".join(cells).rstrip()
 
 
 def overwrite_line(line: str, most: int, before: int) -> int:
-    """Print a line, cut to `most` characters, over the previous one of `before` characters; returns its length."""
+    """Print a line over the previous one, and return its length.
+
+    Args:
+        line: the line.
+        most: maximum number of characters; the rest is cut off.
+        before: length of the previous line.
+    """
     shown = printable(line)[:most]
     print("\r" + shown.ljust(before), end="", flush=True)
     return len(shown)
 
 
 def overwrite_lines(lines: list[str], before: int) -> int:
-    """Print lines over the `before` lines printed last, cut to the terminal's size; returns how many they are.
+    """Print lines over the `before` lines printed last, cut to the terminal's size, and return their number.
 
-    Also where the terminal is in raw mode, as for single keys.
+    It works in raw mode too, as for single keys.
     """
     import shutil
 
     size = shutil.get_terminal_size()
     shown = [printable(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
-    up = f"\x1b[{before}A" if before else ""
-    print(up + "".join(f"\r\x1b[K{line}\r\n" for line in shown) + "\x1b[J", end="", flush=True)
+    text = ""
+    if before:
+        text = f"\x1b[{before}A"  # moves the cursor up
+    for line in shown:
+        text += f"\r\x1b[K{line}\r\n"  # clears the line and writes it
+    text += "\x1b[J"  # clears what is below
+    print(text, end="", flush=True)
     return len(shown)

@@ -1,8 +1,8 @@
 """Worker threads that do not die unnoticed: an unexpected error is reported, and the work goes on.
 
-A thread that ends by an exception takes nothing else with it. Whoever waits for its work then waits for ever: an
-emergency stop that nobody serves, a log that nobody reads. So every thread that serves others begins again after an
-error of any kind, and says so on stderr.
+A thread that ends by an exception ends nothing else, so its failure is easily missed, and other threads wait for its
+work for ever: an emergency stop is not served, or a log is not read. So every thread that serves others begins again
+after an error of any kind, and prints the error to stderr.
 """
 
 import contextlib
@@ -16,10 +16,14 @@ from typing import Any, TypeVar
 
 from snakesim_hal.base.terminal import print_stderr
 
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 2.0  # between an error and the next attempt; doubled after each in a row
+# The pause between an error and the next attempt. It doubles with each error in a row.
+FIRST_PAUSE_S = 0.05
+MAX_PAUSE_S = 2.0
 CALM_S = 10.0  # a worker that ran this long without an error begins again with the first pause
 REPORT_EVERY_S = 60.0  # the same error of one worker is printed once in this time
 LINES_REPORTED = 6  # of a traceback: the last ones name the error and where it was raised
+MAX_KIND_LENGTH = 200  # characters of an error, by which it is recognized
+MAX_KINDS = 100  # remembered; more means that all errors differ
 ResultT = TypeVar("ResultT")
 
 
@@ -35,7 +39,7 @@ def start_worker(
     Args:
         name: Name of the thread, which its reports begin with.
         work: The loop of the thread. It keeps its state outside, because it may be called again.
-        is_over: Whether the work is to end; asked after an error.
+        is_over: Returns whether the work is to end. It is called after an error.
         on_error: Called after an error, to drop what caused it. What it raises is reported, too.
     """
     worker = threading.Thread(target=_work_on, args=(name, work, is_over, on_error), name=name, daemon=True)
@@ -46,6 +50,7 @@ def start_worker(
 def _work_on(
     name: str, work: Callable[[], None], is_over: Callable[[], bool], on_error: Callable[[Exception], None] | None
 ) -> None:
+    """Call `work` until it returns, with a pause after each unexpected error."""
     report = ErrorReport(name)
     pause_s = FIRST_PAUSE_S
     while True:
@@ -62,7 +67,7 @@ def _work_on(
         if time.monotonic() - began_s > CALM_S:
             pause_s = FIRST_PAUSE_S
         time.sleep(pause_s)
-        pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+        pause_s = min(2 * pause_s, MAX_PAUSE_S)
 
 
 def _clean_up(error: Exception, on_error: Callable[[Exception], None], report: "ErrorReport") -> None:
@@ -82,10 +87,10 @@ class ErrorReport:
     def write(self, error: BaseException) -> None:
         """Print an error, and where it was raised."""
         now_s = time.monotonic()
-        kind = f"{type(error).__name__}: {error}"[:200]
+        kind = f"{type(error).__name__}: {error}"[:MAX_KIND_LENGTH]
         if now_s - self._printed_s.get(kind, -REPORT_EVERY_S) < REPORT_EVERY_S:
             return
-        if len(self._printed_s) > 100:  # errors that all differ
+        if len(self._printed_s) > MAX_KINDS:
             self._printed_s.clear()
         self._printed_s[kind] = now_s
         lines = "".join(traceback.format_exception(error)).rstrip().splitlines()
@@ -124,7 +129,7 @@ class Worker:
                 continue
             try:
                 result = job()
-            except Exception as error:  # noqa: BLE001 - this thread's outermost loop: whoever waits gets the error
+            except Exception as error:  # noqa: BLE001 - this thread's outermost loop: the future has the error
                 future.set_exception(error)
             else:
                 future.set_result(result)

@@ -11,15 +11,18 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.backend import SafeSetpoints
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import Derating
 from snakesim_hal.safety.fault_log import FaultLog
-from snakesim_hal.safety.isolation import Isolation, Mask
+from snakesim_hal.safety.isolation import Isolation
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask
 from snakesim_hal.safety.lease import Lease, freed, renewed, rule
-from snakesim_hal.safety.limiter import Applied, JointLimits
-from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityCheck, readable
-from snakesim_hal.safety.stop_ramp import StopRamp
+from snakesim_hal.safety.lifecycle import UnmetCondition
+from snakesim_hal.safety.limit_names import name_active_limits
+from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityCheck, replace_unreadable
+from snakesim_hal.safety.stop_ramp import StopReaction, uniform_setpoints
 from snakesim_hal.wire.messages import (
     Answer,
     Description,
@@ -34,7 +37,8 @@ from snakesim_hal.wire.messages import (
     Power,
 )
 
-COMMANDS_KEPT = 1024
+COMMANDS_KEPT = 1024  # in lockstep a tick may name an older command than the newest
+MAX_REASON_LENGTH = 500  # characters, as `quantities.Reason` allows
 
 
 @dataclass(frozen=True)
@@ -58,69 +62,91 @@ class Authority:
         unchecked: str = "",
         cables: Cables | None = None,
     ) -> None:
-        """first_epoch: different from that of any earlier host, so that commands for another host are rejected.
+        """Start disarmed, without a holder of the lease.
 
-        awaits_reports: whether arming waits until every module has reported its supply.
-        unchecked: why its joints count as not checked, so that only an explicit word arms it; empty: they were.
-        cables: of joints without end stops; whoever passes them follows them.
+        Args:
+            description: the robot.
+            first_epoch: epoch of the lease before its first holder. It must differ from that of any earlier host, so
+                that commands for another host are rejected.
+            awaits_reports: whether arming waits until every joint module has reported its supply.
+            unchecked: why the joints count as not checked, so that only a request that says `unchecked` arms the
+                robot; empty if they were checked.
+            cables: cables of joints without end stops. The caller updates them.
         """
         self._cables = cables or Cables((), {}, {})
         self.description = description
         self.unchecked = unchecked
-        self.limits = JointLimits.of(description)
+        self.limits = JointLimits.from_description(description)
+        count = len(description.joints)
+
+        # Lifecycle and lease.
         self.state: LifecycleState = "disarmed"
         self.why = "not armed yet"
         self.arm_session = 0
         self.lease = Lease(epoch=first_epoch)
+        self._state_tick = 0  # of the newest joint state
+        self._armed_tick = -1  # of the state that was the newest at the last arming
+        self._stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
+
+        # Faults and counters.
         self.since_clear = FaultLog()
         self.since_start = FaultLog()
         self.accepted = 0
         self.standby = 0
         self.rejected: Counter[str] = Counter()
         self.limited: Counter[str] = Counter()
-        count = len(description.joints)
-        self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
-        self._watch = PlausibilityCheck(self.limits)
-        self._measured = self._watch.measured
-        self._state_tick = 0  # of the newest joint state
-        self._armed_tick = -1  # of the state that was the newest at the last arming
+
+        # Checks of what is measured.
+        self._plausibility = PlausibilityCheck(self.limits)
+        self._measured = self._plausibility.measured
+        self._implausible: ImplausibleState | None = self._unknown_state("no joint state yet")
         self._isolation = Isolation(description)
-        self._implausible: ImplausibleState | None = self._unknown("no joint state yet")
         self._derating = Derating(description, awaits_reports=awaits_reports)
+
+        # Commands.
         self._command: JointCommand | None = None
         self._command_ns = 0  # when it was received
-        self._counting: JointCommand | None = None  # command of the last decision since arming
+        self._decided_command: JointCommand | None = None  # of the last decision since arming
         self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # accepted ones since arming, oldest first
         self._last_sequence = -1
-        self._hold_at = np.zeros(count)
-        self._halt: StopRamp | None = None  # set if the robot was armed when the present fault came
-        self._stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
 
-    # --- inputs --------------------------------------------------------------------------------------------
+        # Setpoints.
+        self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
+        self._angle_at_arming_rad = np.zeros(count)
+        self._stop_reaction = StopReaction(self.limits, description.stop_mode)
+
+    # --- inputs: measured values -----------------------------------------------------------------------------
 
     def observe(self, joints: JointState, now_ns: int | None = None) -> None:
-        """Take the newest joint state. Implausible values are rejected: the last good ones stay.
+        """Process the newest joint state. Implausible values are rejected: the last good ones stay.
 
-        now_ns: safety time; None: that of the state's stamp.
+        Args:
+            joints: the joint state.
+            now_ns: safety time; None means the timestamp of the state.
         """
-        applied = self._applied if self.state == "armed" else None
-        now_ns = joints.timestamp_ns if now_ns is None else now_ns
+        if now_ns is None:
+            now_ns = joints.timestamp_ns
+        applied = None
+        if self.state == "armed":
+            applied = self._applied
         self._state_tick = joints.tick
-        self._implausible = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
-        self._measured = self._watch.measured
+        self._implausible = self._plausibility.check(
+            joints, now_ns=now_ns, applied=applied, isolated=self._isolation.joints
+        )
+        self._measured = self._plausibility.measured
 
     def observe_power(self, power: Power, now_ns: int) -> None:
-        """Take the newest power sample: supply, heat and leaks; `expire` acts on it."""
-        self._derating.take(power, now_ns)
+        """Process the newest power sample: supply, heat and leaks. `expire` acts on it."""
+        self._derating.update(power, now_ns)
 
     def readable(self, joints: JointState) -> JointState:
-        """A joint state for publishing: without NaN or infinity."""
-        return readable(joints, self._measured)
+        """Return a joint state for publishing: without NaN or infinity."""
+        return replace_unreadable(joints, self._measured)
 
     @property
     def derated(self) -> dict[str, float]:
-        """Derated joints, and the share of their torque that is left."""
-        return self._derating.derated()
+        """The names of derated joints, with the fraction of their torque that is left."""
+        return self._derating.derated_joints()
 
     @property
     def faults(self) -> list[Fault]:
@@ -129,12 +155,21 @@ class Authority:
 
     @property
     def isolated(self) -> list[str]:
-        """Joints that failed, and are passive until a clear."""
+        """The names of joints that failed, and are passive until a clear."""
         return self._isolation.names
 
+    # --- inputs: commands and requests -----------------------------------------------------------------------
+
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
-        """Take a command, or return why it is rejected. `age_ns`: age of the state that it answers."""
-        refusal = limiter.refuse(
+        """Accept a command, or return why it is rejected.
+
+        Args:
+            command: the command as it was received.
+            now_ns: safety time.
+            tick: the newest tick that the host has published.
+            age_ns: age of the state that the command answers.
+        """
+        refusal = limiter.find_refusal(
             command,
             lease=self.lease,
             now_ns=now_ns,
@@ -146,15 +181,15 @@ class Authority:
         if refusal is not None:
             self.rejected[refusal] += 1
             return refusal
-        if not self.answers_arm_session(command):  # nor does it renew the lease, which takes commands of this arming
-            if command.tick <= self._armed_tick:  # sent before the robot was armed: not an error
-                self.standby += 1
-            else:
-                self.rejected["before_arming"] += 1
+        if not self.answers_arm_session(command):
+            # It does not renew the lease either: that takes commands of the present arm session.
+            self._count_command_before_arming(command)
             return "before_arming"
-        self._last_sequence = command.sequence  # only now: a rejected command must not make the next good one a replay
+        # Only now: a rejected command must not make the next good one a replay.
+        self._last_sequence = command.sequence
         self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
-        self._command, self._command_ns = command, now_ns
+        self._command = command
+        self._command_ns = now_ns
         if self.state == "armed":
             self.accepted += 1
             self._recent.append(command)
@@ -163,7 +198,7 @@ class Authority:
         return None
 
     def answers_arm_session(self, command: JointCommand) -> bool:
-        """Whether a command names the present arming, if the robot is armed."""
+        """Return whether a command names the present arm session, or the robot is not armed."""
         return self.state != "armed" or command.arm_session == self.arm_session
 
     def reject(self, reason: str) -> None:
@@ -171,239 +206,302 @@ class Authority:
         self.rejected[reason] += 1
 
     def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
-        """Decide a lease request; when the lease changes hands the robot is disarmed."""
-        ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
+        """Decide a lease request. If the lease changes hands, an armed robot is disarmed."""
+        decision = rule(self.lease, request, now_ns, self.description.lease_ns)
         if self.state == "armed" and request.action == "renew":
-            return self._answer(ruling.refusal, ruling.word)  # while armed only a command renews the lease
-        self.lease = ruling.lease
-        if ruling.changed_hands:
+            # While armed only a command renews the lease.
+            return self._answer(decision.refusal, decision.word)
+        self.lease = decision.lease
+        if decision.changed_hands:
             self._forget_commands()
             if self.state == "armed":
-                self._go("disarm", f"lease passed to {ruling.lease.holder or 'nobody'}")
-        return self._answer(ruling.refusal, ruling.word)
+                self._transition("disarm", f"lease passed to {decision.lease.holder or 'nobody'}")
+        return self._answer(decision.refusal, decision.word)
 
     def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
-        """Arm, disarm or clear. A refused arming lists every condition that is not met."""
+        """Arm, disarm, clear or finish. A refused arming lists every condition that is not met."""
         match request.action:
             case "arm":
-                against = self._refusals(now_ns) + lifecycle.address_mismatches(request, self.description)
-                if self.unchecked and not request.unchecked:
-                    against.append(("not_checked", f"{self.unchecked}; to arm it as it is, say --unchecked"))
-                if against:
-                    words = {word for word, _ in against}
-                    return self._answer("; ".join(why for _, why in against), min(words, key=lifecycle.ORDER.index))
-                as_it_is = ", unchecked" if self.unchecked else ""
-                self._go("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
-                self.arm_session += 1
-                self._armed_tick = self._state_tick
-                self._command = self._counting = None
-                self._recent.clear()
-                self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+                return self._arm(request, now_ns)
             case "disarm":
-                if not self._go("disarm", f"disarmed by {request.who}"):
-                    return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
+                return self._disarm(request)
             case "clear":
-                if not self._go("clear", f"cleared by {request.who}; arm to move again"):
-                    lost = ", ".join(self.isolated)
-                    hint = f"; disarm first, then a clear ends the isolation of {lost}" if lost else ""
-                    return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
-                self._take_back()
-                self.since_clear = FaultLog()
-            case _:  # finish
+                return self._clear(request)
+            case "finish":
                 if self.state == "armed":
-                    self._go("disarm", f"finished by {request.who}")
-        return self._answer(None)
+                    self._transition("disarm", f"finished by {request.who}")
+                return self._answer(None)
 
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
         """Stop now, for any requester."""
-        stopping = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
-        self._record(stopping, stops=self.state != "estop")
-        self._go("estop", f"emergency stop by {request.who}; clear it to go on")
+        fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
+        self._record(fault, stops=self.state != "estop")
+        self._transition("estop", f"emergency stop by {request.who}; clear it to go on")
         return self._answer(None)
 
-    def fault(self, fault: Fault, joints: Mask | None = None) -> None:
-        """Latch a fault: the joints take the stop mode until a clear. One that reaches nothing is only noted.
+    # --- inputs: faults --------------------------------------------------------------------------------------
 
-        A fault that concerns only some joints isolates them instead, if the robot file allows that. joints: which;
-        None: the one that the fault names.
+    def fault(self, fault: Fault, joints: Mask | None = None) -> None:
+        """Latch a fault: the joints take the stop mode until a clear.
+
+        A fault with the reach "none" is only recorded. A fault of only some joints isolates them instead of stopping
+        the robot, if the robot file allows that.
+
+        Args:
+            fault: what happened.
+            joints: (n_joints,), the joints concerned; None means the joint that the fault names.
         """
         if fault.reach == "none":
             self._record(fault, stops=False)
             return
-        joints = self._isolation.mask(fault.joint) if joints is None else joints
-        if fault.reach == "joint" and self._set_aside(fault, joints):
+        if joints is None:
+            joints = self._isolation.find_joint(fault.joint)
+        if fault.reach == "joint" and self._isolate(fault, joints):
             return
         fault = msgspec.structs.replace(fault, reach="robot")
         stops = self.state not in ("fault", "estop")  # later faults are usually consequences of the first
         self._record(fault, stops=stops)
         if stops:
-            self._go("fault", fault.cause[:500] or fault.what)
+            self._transition("fault", fault.cause[:MAX_REASON_LENGTH] or fault.what)
         self._drop_lease()
 
     def note(self, fault: Fault, *, precedes_stop: bool = False) -> None:
         """Record a fault for people that stops nothing by itself.
 
-        precedes_stop: what it leads to stops the robot, as the loss of the process that holds the lease does.
+        Args:
+            fault: what happened.
+            precedes_stop: whether its consequence stops the robot, as when the process that holds the lease ends.
         """
         reach = "robot" if precedes_stop else "none"
         self._record(msgspec.structs.replace(fault, reach=reach), stops=False)
 
     def holder_gone(self, cause: str) -> None:
-        """The lease holder's process has ended: while disarmed, free the lease at once."""
+        """React to the end of the lease holder's process: unless the robot is armed, free the lease at once."""
         if self.state != "armed":
             self._drop_lease()
         if self.state == "disarmed":
             self.why = cause
 
-    # --- outputs -------------------------------------------------------------------------------------------
+    # --- outputs ---------------------------------------------------------------------------------------------
 
     def against_arming(self, now_ns: int) -> list[str]:
-        """Every condition for arming that is not met; empty when ready."""
-        return [why for _, why in self._refusals(now_ns)]
+        """Return every condition for arming that is not met; empty if the robot is ready."""
+        return [condition.reason for condition in self._find_unmet_conditions(now_ns)]
 
     def expire(self, now_ns: int, tick: int) -> None:
-        """Check the lease for expiry: while armed, that is a fault; while disarmed, the lease becomes free.
+        """Latch the faults that follow from the measured values and from the time.
 
-        An armed robot without plausible joint states goes to fault too, and so does one, armed or not, whose
-        modules are too hot, leak or lack voltage.
+        These are: an armed robot without plausible joint states; a robot, armed or not, whose modules are too hot,
+        leak or lack voltage; and an expired lease of an armed robot. If the robot is not armed, an expired lease
+        only becomes free.
         """
         if self.state == "armed" and self._implausible is not None:
             self.fault(msgspec.structs.replace(self._implausible.fault, tick=tick), self._implausible.joints)
-        wrong, silent = self._derating.look(now_ns, tick)
-        for fault in wrong:
+        new_faults, silent = self._derating.evaluate(now_ns, tick)
+        for fault in new_faults:
             self.fault(fault)
-        if silent is not None and not self._isolation.has(silent.joint):
+        if silent is not None and not self._isolation.is_isolated(silent.joint):
             self.note(silent)
         if self.lease.live(now_ns):
             return
-        holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
         if self.state == "armed":
-            cause = f"lease of {holder} expired: no accepted command for {term_ms:.0f} ms"
+            term_ms = self.description.lease_ns / 1e6
+            cause = f"lease of {self.lease.holder} expired: no accepted command for {term_ms:.0f} ms"
             self.fault(Fault(tick=tick, what="lease_expired", cause=cause))
         else:
             self._drop_lease()
 
     def decide(self, up_to: int | None = None) -> Decision:
-        """The setpoints for the next period. Call `expire` first.
+        """Return the setpoints for the next period. Call `expire` first.
 
-        up_to: in lockstep, the newest tick whose command is used; None: the newest command.
+        Args:
+            up_to: in lockstep, the newest tick whose command is used; None means the newest command.
         """
-        command = self._command
-        if up_to is not None:
-            command = next((c for c in reversed(self._recent) if c.tick <= up_to), self._counting)
+        command = self._find_command(up_to)
         sequence: int | None = None
         limited: dict[int, str] = {}
         if self.state != "armed":
-            applied = self._safe()
+            applied = self._stop_reaction.make_setpoints(self.state, self._derated_torque_nm())
             self._stop_sent = True
-        elif command is None:  # just armed: hold the pose until the first command
-            applied = self._uniform(Mode.POSITION, self.limits.inside(self._hold_at))
+        elif command is None:
+            # Just armed: hold the pose until the first command.
+            pose_rad = self.limits.clip_angles(self._angle_at_arming_rad)
+            applied = uniform_setpoints(Mode.POSITION, pose_rad, self._derated_torque_nm())
         else:
-            measured, share = self._measured, self._derating.share
-            applied = limiter.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
-            sequence, self._counting = command.sequence, command
-            if applied.target.tolist() != command.target or min(share.tolist()) < 1.0:
-                limited = limiter.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
-            limited |= self._isolation.overruled(command)
-            self.limited.update(limited.values())
-        self._applied = applied = self._isolation.without(applied)
-        return Decision(limiter.as_setpoints(applied, self._isolation.indices), sequence, limited)
+            applied = limiter.limit_command(
+                command,
+                measured=self._measured,
+                last=self._applied,
+                limits=self.limits,
+                torque_fraction=self._derating.torque_fraction,
+            )
+            sequence = command.sequence
+            limited = self._name_limits(command, applied)
+            self._decided_command = command
+        applied = self._isolation.make_passive(applied)
+        self._applied = applied
+        return Decision(limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited)
 
-    # --- inside --------------------------------------------------------------------------------------------
+    # --- commands and setpoints ------------------------------------------------------------------------------
 
-    def _refusals(self, now_ns: int) -> list[tuple[str, str]]:
-        found: list[tuple[str, str]] = []
-        if self.state != "disarmed":
-            first = "; first `snakesim clear`" if self.state in ("fault", "estop") else ""
-            found.append(("wrong_state", f"state is {self.state}, must be disarmed{first}"))
-        found += [("cable", why) for why in self._cables.against_arming()]
-        return found + [("not_ready", why) for why in self._unready(now_ns)]
-
-    def _unready(self, now_ns: int) -> list[str]:
-        against = [] if self._implausible is None else [self._implausible.fault.cause]
-        wrong = [fault for fault in self._derating.wrong if not self._is_aside(fault)]
-        against += [fault.cause for fault in wrong if fault.what != "undervoltage"]
-        against += self._derating.against_arming(now_ns)
-        if self.arm_session and not self._stop_sent:
-            against.append("the motors have not received the stop yet; ask again in a period")
-        if not self.lease.live(now_ns):
-            against.append("nothing commands the robot: the lease is free")
-        elif self._command is None:
-            against.append(f"no commands from {self.lease.holder} yet")
-        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may also be renewed by requests
-            against.append(f"no commands from {self.lease.holder} any more")
+    def _count_command_before_arming(self, command: JointCommand) -> None:
+        """Count a command of another arm session: it is an error only if it was sent after the last arming."""
+        if command.tick <= self._armed_tick:
+            self.standby += 1
         else:
-            at, aside = self._measured.angle_rad, self._isolation.joints
-            against.extend(lifecycle.far_targets(self._command, at, self.description, aside))
-        return against
+            self.rejected["before_arming"] += 1
 
-    def _unknown(self, cause: str) -> ImplausibleState:
-        fault = Fault(tick=0, what="state_invalid", cause=cause)
-        return ImplausibleState(fault, np.ones(len(self.description.joints), dtype=np.bool_))
+    def _find_command(self, up_to: int | None) -> JointCommand | None:
+        """Return the newest command, or in lockstep the newest one that does not answer a later tick than `up_to`."""
+        if up_to is None:
+            return self._command
+        for command in reversed(self._recent):
+            if command.tick <= up_to:
+                return command
+        return self._decided_command
 
-    def _is_aside(self, fault: Fault) -> bool:
-        return fault.reach == "joint" and self._isolation.has(fault.joint)
+    def _name_limits(self, command: JointCommand, applied: Applied) -> dict[int, str]:
+        """Return the index of each joint whose command was changed, with the name of the limit, and count them."""
+        limited: dict[int, str] = {}
+        torque_fraction = self._derating.torque_fraction
+        if applied.target.tolist() != command.target or min(torque_fraction.tolist()) < 1.0:
+            limited = name_active_limits(
+                command, applied, measured=self._measured, limits=self.limits, torque_fraction=torque_fraction
+            )
+        limited |= self._isolation.name_overruled(command)
+        self.limited.update(limited.values())
+        return limited
 
-    def _record(self, fault: Fault, *, stops: bool) -> None:
-        """stops: it is why the robot is in `fault` or `estop` now."""
-        fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
-        for log in (self.since_clear, self.since_start):
-            log.add(fault, stops=stops)
+    def _derated_torque_nm(self) -> Floats:
+        """Return the torque limits that derating leaves, (n_joints,)."""
+        return self.limits.torque_nm * self._derating.torque_fraction
 
-    def _set_aside(self, fault: Fault, joints: Mask) -> bool:
-        """Isolate failed joints, if allowed; later faults of isolated joints are ignored."""
-        if self._isolation.covers(joints):
-            return True
-        if self.state != "armed" or not self._isolation.add(joints):
-            return False
-        self._record(fault, stops=False)
-        self.why = f"armed, without {', '.join(self.isolated)}: {fault.cause}"[:500]
-        return True
+    # --- lifecycle -------------------------------------------------------------------------------------------
 
-    def _take_back(self) -> None:
-        """End the isolation of joints; first a new joint state must arrive."""
-        if self.isolated:
-            self._isolation.clear()
-            self._implausible = self._unknown("no joint state since the clear")
+    def _arm(self, request: LifecycleRequest, now_ns: int) -> Answer:
+        unmet = self._find_unmet_conditions(now_ns)
+        unmet += lifecycle.find_address_mismatches(request, self.description)
+        if self.unchecked and not request.unchecked:
+            reason = f"{self.unchecked}; to arm it as it is, say --unchecked"
+            unmet.append(UnmetCondition("not_checked", reason))
+        if unmet:
+            reasons = "; ".join(condition.reason for condition in unmet)
+            refusals = {condition.refusal for condition in unmet}
+            return self._answer(reasons, min(refusals, key=lifecycle.ORDER.index))
+        as_it_is = ", unchecked" if self.unchecked else ""
+        self._transition("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
+        self.arm_session += 1
+        self._armed_tick = self._state_tick
+        self._command = None
+        self._decided_command = None
+        self._recent.clear()
+        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        return self._answer(None)
 
-    def _safe(self) -> Applied:
-        zeros = np.zeros_like(self._measured.angle_rad)
-        if self.state != "fault" or self._halt is None or self.description.stop_mode == "passive":
-            return self._uniform(Mode.PASSIVE, zeros)
-        damps = self.limits.damps
-        if self.description.stop_mode == "damp" and damps.all():
-            return self._uniform(Mode.VELOCITY, zeros)
-        self._halt = self._halt.after_a_period(self.limits)
-        if self.description.stop_mode == "damp":
-            return self._damped(self._halt)
-        return self._uniform(Mode.POSITION, self._halt.target_rad)
+    def _disarm(self, request: LifecycleRequest) -> Answer:
+        if not self._transition("disarm", f"disarmed by {request.who}"):
+            return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
+        return self._answer(None)
 
-    def _damped(self, halt: StopRamp) -> Applied:
-        """A joint that has no velocity mode is brought to rest by its position, and then let go."""
-        damps, rests = self.limits.damps, halt.velocity_rad_s == 0.0
-        modes = np.select([damps, rests], [int(Mode.VELOCITY), int(Mode.PASSIVE)], int(Mode.POSITION))
-        target = np.where(modes == int(Mode.POSITION), halt.target_rad, 0.0)
-        return Applied(modes.astype(np.int64), target, self.limits.torque_nm * self._derating.share)
+    def _clear(self, request: LifecycleRequest) -> Answer:
+        if not self._transition("clear", f"cleared by {request.who}; arm to move again"):
+            hint = ""
+            if self.isolated:
+                hint = f"; disarm first, then a clear ends the isolation of {', '.join(self.isolated)}"
+            return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
+        self._end_isolation()
+        self.since_clear = FaultLog()
+        return self._answer(None)
 
-    def _uniform(self, mode: Mode, target: limiter.Floats) -> Applied:
-        limit_nm = self.limits.torque_nm * self._derating.share
-        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, limit_nm)
-
-    def _go(self, event: lifecycle.Event, why: str) -> bool:
-        """Make a transition; False when the event is not allowed in this state."""
-        following = lifecycle.after(self.state, event)
+    def _transition(self, event: lifecycle.Event, why: str) -> bool:
+        """Change the lifecycle state. Returns False if the event is not allowed in this state."""
+        following = lifecycle.next_state(self.state, event)
         if following is None:
             return False
+        was_armed = self.state == "armed"
         if following != self.state:
-            self._hold_at = self._measured.angle_rad
-            was_armed = self.state == "armed"
-            self._halt = StopRamp.begin(self._measured, self._applied, self.limits) if was_armed else None
-            self._stop_sent &= following != "disarmed"
-        if self.state == "armed":
+            self._angle_at_arming_rad = self._measured.angle_rad
+            if was_armed:
+                self._stop_reaction.begin(self._measured, self._applied)
+            else:
+                self._stop_reaction.end()
+            if following == "disarmed":
+                self._stop_sent = False
+        if was_armed:
             self._command = None
         self.state = following
         self.why = why
         return True
+
+    def _find_unmet_conditions(self, now_ns: int) -> list[UnmetCondition]:
+        """Return every condition for arming that is not met, apart from those of the request."""
+        unmet: list[UnmetCondition] = []
+        if self.state != "disarmed":
+            clear_first = "; first `snakesim clear`" if self.state in ("fault", "estop") else ""
+            unmet.append(UnmetCondition("wrong_state", f"state is {self.state}, must be disarmed{clear_first}"))
+        unmet += [UnmetCondition("cable", reason) for reason in self._cables.against_arming()]
+        not_ready = self._find_unready_robot(now_ns) + self._find_unready_commands(now_ns)
+        unmet += [UnmetCondition("not_ready", reason) for reason in not_ready]
+        return unmet
+
+    def _find_unready_robot(self, now_ns: int) -> list[str]:
+        """Return what is wrong with the joint state, heat, supply, and the last stop."""
+        reasons: list[str] = []
+        if self._implausible is not None:
+            reasons.append(self._implausible.fault.cause)
+        for fault in self._derating.present_faults:
+            # The supply has a reason of its own, which says what to do about it.
+            if fault.what != "undervoltage" and not self._is_of_isolated_joint(fault):
+                reasons.append(fault.cause)
+        reasons += self._derating.find_supply_problems(now_ns)
+        if self.arm_session and not self._stop_sent:
+            reasons.append("the motors have not received the stop yet; ask again in a period")
+        return reasons
+
+    def _find_unready_commands(self, now_ns: int) -> list[str]:
+        """Return what is wrong with the lease and with the stream of commands."""
+        if not self.lease.live(now_ns):
+            return ["nothing commands the robot: the lease is free"]
+        if self._command is None:
+            return [f"no commands from {self.lease.holder} yet"]
+        if now_ns - self._command_ns > self.description.lease_ns:  # the lease may also be renewed by requests
+            return [f"no commands from {self.lease.holder} any more"]
+        return lifecycle.find_far_targets(
+            self._command, self._measured.angle_rad, self.description, self._isolation.joints
+        )
+
+    # --- faults and isolation --------------------------------------------------------------------------------
+
+    def _record(self, fault: Fault, *, stops: bool) -> None:
+        """Log a fault. `stops` means that the robot is in `fault` or `estop` now because of it."""
+        fault = msgspec.structs.replace(fault, cause=fault.cause[:MAX_REASON_LENGTH])
+        self.since_clear.add(fault, stops=stops)
+        self.since_start.add(fault, stops=stops)
+
+    def _isolate(self, fault: Fault, joints: Mask) -> bool:
+        """Isolate failed joints, and return whether that is allowed. Later faults of isolated joints are ignored."""
+        if self._isolation.covers(joints):
+            return True
+        if self.state != "armed" or not self._isolation.isolate(joints):
+            return False
+        self._record(fault, stops=False)
+        self.why = f"armed, without {', '.join(self.isolated)}: {fault.cause}"[:MAX_REASON_LENGTH]
+        return True
+
+    def _end_isolation(self) -> None:
+        """End the isolation of joints. Before the next arming, a new joint state must arrive."""
+        if self.isolated:
+            self._isolation.clear()
+            self._implausible = self._unknown_state("no joint state since the clear")
+
+    def _is_of_isolated_joint(self, fault: Fault) -> bool:
+        return fault.reach == "joint" and self._isolation.is_isolated(fault.joint)
+
+    def _unknown_state(self, cause: str) -> ImplausibleState:
+        fault = Fault(tick=0, what="state_invalid", cause=cause)
+        return ImplausibleState(fault, np.ones(len(self.description.joints), dtype=np.bool_))
+
+    # --- lease and answers -----------------------------------------------------------------------------------
 
     def _drop_lease(self) -> None:
         self.lease = freed(self.lease)
@@ -414,9 +512,10 @@ class Authority:
         self._last_sequence = -1
 
     def _answer(self, reason: str | None, refusal: str | None = None) -> Answer:
+        """Answer a request. `reason` is None if it was granted; `refusal` is the reason as one word."""
         return Answer(
             ok=reason is None,
-            reason=(reason or self.why)[:500],
+            reason=(reason or self.why)[:MAX_REASON_LENGTH],
             refusal=refusal,
             epoch=self.lease.epoch,
             lifecycle=self.state,

@@ -13,96 +13,113 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.physics.thermal import HeatLimits
-from snakesim_hal.safety.limiter import Floats
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointDescription, Power
 
-LOW_FOR_NS = 50_000_000
-KNOWN_FOR_NS = 3_000_000_000
-LONGEST_CAUSE = 400
-FIELD = "`min_voltage_v` under [limits] in the robot file"
+UNDERVOLTAGE_DELAY_NS = 50_000_000  # shorter dips, as when motors start, stop nothing
+REPORT_TIMEOUT_NS = 3_000_000_000  # values of an older report are unknown; modules report about twice a second
+MAX_CAUSE_LENGTH = 400  # characters; a fault's cause has at most 500
+MIN_VOLTAGE_FIELD = "`min_voltage_v` under [limits] in the robot file"
 
 
 class Derating:
-    """Torque share and health of every joint, from power samples."""
+    """What is left of each joint's torque limit, and the faults of heat, supply and leaks, from power samples."""
 
     def __init__(self, description: Description, *, awaits_reports: bool) -> None:
-        """awaits_reports: before an arming; False where time may stand until then."""
-        self._robot, self._awaits_reports = description.robot, awaits_reports
-        self._healths = [_Health(joint) for joint in description.joints]
-        self._expected = any(sensor.key == keys.POWER for sensor in description.sensors)
-        self._began_ns: int | None = None
-        self._due_ns = -math.inf  # before that nothing changes without a sample
-        self._reported: set[tuple[str, str | None]] = set()
-        self._silent: set[str] = set()
-        self.share: Floats = np.ones(len(self._healths))  # of its torque limit, left to each joint
-        self.wrong: list[Fault] = []  # present faults
+        """Start with all torque and without a report.
 
-    def take(self, power: Power, now_ns: int) -> None:
-        """Take a sample; invalid entries are ignored, and so is a sample of another number of joints."""
+        Args:
+            description: the robot.
+            awaits_reports: whether arming waits until every module has reported its supply. It must not where time
+                is paused until the arming.
+        """
+        self._robot = description.robot
+        self._awaits_reports = awaits_reports
+        self._has_power_sensor = any(sensor.key == keys.POWER for sensor in description.sensors)
+        self._healths = [_Health(joint) for joint in description.joints]
+        self._began_ns: int | None = None  # time of the first evaluation
+        self._due_ns = -math.inf  # before that nothing changes without a sample
+        self._reported: set[tuple[str, str | None]] = set()  # present faults, by word and joint
+        self._silent: set[str] = set()  # names of joints whose reports are overdue
+        self.torque_fraction: Floats = np.ones(len(self._healths))  # (n_joints,), what is left of each torque limit
+        self.present_faults: list[Fault] = []
+
+    def update(self, power: Power, now_ns: int) -> None:
+        """Process a sample. Invalid entries are ignored, and so is a sample of another number of joints."""
         lists = (power.voltage_v, power.motor_c, power.leak, power.valid)
         if {len(values) for values in lists} != {len(self._healths)}:
             return
-        for health, volts, winding_c, leak, valid in zip(self._healths, *lists, strict=True):
-            if valid and math.isfinite(volts) and math.isfinite(winding_c):
-                health.take(volts, winding_c, leak, now_ns)
+        for health, voltage_v, winding_c, leak, valid in zip(self._healths, *lists, strict=True):
+            if valid and math.isfinite(voltage_v) and math.isfinite(winding_c):
+                health.update(voltage_v, winding_c, leak, now_ns)
         self._due_ns = -math.inf
 
-    def look(self, now_ns: int, tick: int) -> tuple[list[Fault], Fault | None]:
-        """Evaluate at `now_ns`. Returns new faults, and a note of the joints that have fallen silent."""
+    def evaluate(self, now_ns: int, tick: int) -> tuple[list[Fault], Fault | None]:
+        """Update `torque_fraction` and `present_faults`.
+
+        Returns:
+            The faults that are new, and a note of the joints that have just become silent.
+        """
         if now_ns < self._due_ns:
             return [], None
-        began_ns = self._began_ns = now_ns if self._began_ns is None else self._began_ns
-        self._due_ns = min(min(health.due_ns(now_ns, began_ns) for health in self._healths), now_ns + KNOWN_FOR_NS)
-        self.share = np.array([health.share(now_ns) for health in self._healths])
-        self.wrong = [
-            Fault(
-                tick=tick,
-                what=what,
-                cause=cause,
-                joint=health.joint.name,
-                reach="joint" if what == "overheated" else "robot",
-            )
-            for health in self._healths
-            for what, cause in health.failures(now_ns)
-        ]
-        before, self._reported = self._reported, {(fault.what, fault.joint) for fault in self.wrong}
-        fresh = [fault for fault in self.wrong if (fault.what, fault.joint) not in before]
-        return fresh, self._newly_silent(now_ns, tick)
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        began_ns = self._began_ns
+        next_change_ns = min(health.next_change_ns(now_ns, began_ns) for health in self._healths)
+        self._due_ns = min(next_change_ns, now_ns + REPORT_TIMEOUT_NS)
+        self.torque_fraction = np.array([health.torque_fraction(now_ns) for health in self._healths])
+        self.present_faults = []
+        for health in self._healths:
+            self.present_faults += health.find_faults(now_ns, tick)
+        reported_before = self._reported
+        self._reported = {(fault.what, fault.joint) for fault in self.present_faults}
+        new_faults = [fault for fault in self.present_faults if (fault.what, fault.joint) not in reported_before]
+        return new_faults, self._note_newly_silent(now_ns, tick, began_ns)
 
-    def against_arming(self, now_ns: int) -> list[str]:
-        """What is to be done about the supply before the robot is armed; empty when nothing."""
-        against: list[str] = []
-        if low := [health for health in self._healths if health.known(now_ns) and health.low_since_ns is not None]:
+    def find_supply_problems(self, now_ns: int) -> list[str]:
+        """Return what to do about the supply before the robot can be armed; empty if there is nothing to do."""
+        problems: list[str] = []
+        low = [health for health in self._healths if health.is_known(now_ns) and health.low_since_ns is not None]
+        if low:
             weakest = min(low, key=lambda health: health.voltage_v)
-            against.append(
+            problems.append(
                 f"the supply is at {weakest.voltage_v:.1f} V at {weakest.joint.name}, which needs "
-                f"{weakest.joint.min_voltage_v:g} V{_and_others(len(low) - 1)}: check the supply, or set {FIELD} "
-                f"of {self._robot!r}"
+                f"{weakest.joint.min_voltage_v:g} V{_and_others(len(low) - 1)}: check the supply, or set "
+                f"{MIN_VOLTAGE_FIELD} of {self._robot!r}"
             )
-        if self._awaits_reports and self._expected:
-            unheard = [
-                one.joint.name for one in self._healths if one.heard_ns is None and one.joint.name not in self._silent
-            ]
-            if unheard:
-                against.append(f"{unheard[0]} has not reported its supply yet{_and_others(len(unheard) - 1)}")
-        return against
+        if self._awaits_reports and self._has_power_sensor:
+            missing = self._find_unreported_joints()
+            if missing:
+                problems.append(f"{missing[0]} has not reported its supply yet{_and_others(len(missing) - 1)}")
+        return problems
 
-    def derated(self) -> dict[str, float]:
-        """Derated joints, and the share of their torque that is left."""
-        shares = zip(self._healths, self.share.tolist(), strict=True)
-        return {health.joint.name: share for health, share in shares if share < 1.0}
+    def derated_joints(self) -> dict[str, float]:
+        """Return the names of derated joints, with the fraction of their torque that is left."""
+        fractions = zip(self._healths, self.torque_fraction.tolist(), strict=True)
+        return {health.joint.name: fraction for health, fraction in fractions if fraction < 1.0}
 
-    def _newly_silent(self, now_ns: int, tick: int) -> Fault | None:
-        before, began_ns = self._silent, self._began_ns if self._expected else None
-        silent = [health.joint.name for health in self._healths if health.silent(now_ns, began_ns)]
+    def _find_unreported_joints(self) -> list[str]:
+        """Return the names of joints that have never reported, unless their silence has been noted already."""
+        names = [health.joint.name for health in self._healths if health.reported_ns is None]
+        return [name for name in names if name not in self._silent]
+
+    def _note_newly_silent(self, now_ns: int, tick: int, began_ns: int) -> Fault | None:
+        """Return a note that names the joints whose reports have become overdue since the last evaluation."""
+        expected_since_ns = None
+        if self._has_power_sensor:
+            expected_since_ns = began_ns
+        silent = [health.joint.name for health in self._healths if health.is_silent(now_ns, expected_since_ns)]
+        silent_before = self._silent
         self._silent = set(silent)
-        fresh = [name for name in silent if name not in before]
-        if not fresh:
+        new = [name for name in silent if name not in silent_before]
+        if not new:
             return None
-        cause = f"supply and heat are unknown, and ignored, for {', '.join(fresh)}"[:LONGEST_CAUSE]
-        joint = fresh[0] if len(fresh) == 1 else None
+        cause = f"supply and heat are unknown, and ignored, for {', '.join(new)}"[:MAX_CAUSE_LENGTH]
+        joint = None
+        if len(new) == 1:
+            joint = new[0]
         return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint)
 
 
@@ -112,58 +129,72 @@ def _and_others(count: int) -> str:
 
 @dataclass
 class _Health:
-    """The last report of one module."""
+    """The last report of one joint module."""
 
     joint: JointDescription
-    heard_ns: int | None = None
+    reported_ns: int | None = None
     winding_c: float = 0.0
     voltage_v: float = 0.0
     leak: bool = False
-    low_since_ns: int | None = None
+    low_since_ns: int | None = None  # since when the voltage has been too low; None: it is not
     hot: bool = False  # it was too hot, and has not cooled down yet
 
-    def take(self, voltage_v: float, winding_c: float, leak: bool, now_ns: int) -> None:
-        """A valid entry of a sample."""
-        self.heard_ns, self.voltage_v, self.winding_c, self.leak = now_ns, voltage_v, winding_c, leak
+    def update(self, voltage_v: float, winding_c: float, leak: bool, now_ns: int) -> None:
+        """Process a valid entry of a sample."""
         if "temperature" not in self.joint.measures:
-            self.winding_c = winding_c = -math.inf
-        self.hot = winding_c >= (self.joint.derate_from_c if self.hot else self.joint.stop_at_c)
-        low = "voltage" in self.joint.measures and voltage_v < self.joint.min_voltage_v
-        self.low_since_ns = (now_ns if self.low_since_ns is None else self.low_since_ns) if low else None
+            winding_c = -math.inf
+        self.reported_ns = now_ns
+        self.voltage_v = voltage_v
+        self.winding_c = winding_c
+        self.leak = leak
+        # Hysteresis: what was too hot stays so until it has cooled below `derate_from_c`.
+        threshold_c = self.joint.derate_from_c if self.hot else self.joint.stop_at_c
+        self.hot = winding_c >= threshold_c
+        if "voltage" not in self.joint.measures or voltage_v >= self.joint.min_voltage_v:
+            self.low_since_ns = None
+        elif self.low_since_ns is None:
+            self.low_since_ns = now_ns
 
-    def known(self, now_ns: int) -> bool:
-        """Whether its last report is recent."""
-        return self.heard_ns is not None and now_ns - self.heard_ns <= KNOWN_FOR_NS
+    def is_known(self, now_ns: int) -> bool:
+        """Return whether the last report is recent."""
+        return self.reported_ns is not None and now_ns - self.reported_ns <= REPORT_TIMEOUT_NS
 
-    def silent(self, now_ns: int, expected_since_ns: int | None) -> bool:
-        """Whether its report is overdue; expected_since_ns: None when there may be no such sensor."""
-        since_ns = expected_since_ns if self.heard_ns is None else self.heard_ns
-        return since_ns is not None and now_ns - since_ns > KNOWN_FOR_NS
+    def is_silent(self, now_ns: int, expected_since_ns: int | None) -> bool:
+        """Return whether a report is overdue. `expected_since_ns` is None for a robot without a power sensor."""
+        since_ns = self.reported_ns
+        if since_ns is None:
+            since_ns = expected_since_ns
+        return since_ns is not None and now_ns - since_ns > REPORT_TIMEOUT_NS
 
-    def due_ns(self, now_ns: int, began_ns: int) -> float:
-        """When its state next changes without a new report."""
-        silent_ns = (began_ns if self.heard_ns is None else self.heard_ns) + KNOWN_FOR_NS + 1
-        low_ns = math.inf if self.low_since_ns is None else self.low_since_ns + LOW_FOR_NS
-        return min((at_ns for at_ns in (silent_ns, low_ns) if at_ns > now_ns), default=math.inf)
+    def next_change_ns(self, now_ns: int, began_ns: int) -> float:
+        """Return when the state next changes without a new report; infinity if it does not."""
+        since_ns = began_ns if self.reported_ns is None else self.reported_ns
+        changes_ns = [since_ns + REPORT_TIMEOUT_NS + 1]
+        if self.low_since_ns is not None:
+            changes_ns.append(self.low_since_ns + UNDERVOLTAGE_DELAY_NS)
+        return min((change_ns for change_ns in changes_ns if change_ns > now_ns), default=math.inf)
 
-    def share(self, now_ns: int) -> float:
-        """The share of the torque limit that is left after derating."""
-        if not self.known(now_ns):
+    def torque_fraction(self, now_ns: int) -> float:
+        """Return the fraction of the torque limit that is left after derating, from 0 to 1."""
+        if not self.is_known(now_ns):
             return 1.0
         return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).remaining_fraction(self.winding_c)
 
-    def failures(self, now_ns: int) -> list[tuple[str, str]]:
-        """Reasons to stop the robot: a word, and the full cause."""
-        joint, found = self.joint, list[tuple[str, str]]()
+    def find_faults(self, now_ns: int, tick: int) -> list[Fault]:
+        """Return the reasons to stop the robot, or only this joint if it is too hot."""
+        joint = self.joint
+        faults: list[Fault] = []
         if self.hot:
             limits = f"the limit is {joint.stop_at_c:g} °C, and it must cool below {joint.derate_from_c:g} °C"
-            found.append(("overheated", f"the winding of {joint.name} is at {self.winding_c:.1f} °C; {limits}"))
-        if not self.known(now_ns):
-            return found
+            cause = f"the winding of {joint.name} is at {self.winding_c:.1f} °C; {limits}"
+            faults.append(Fault(tick=tick, what="overheated", cause=cause, joint=joint.name, reach="joint"))
+        if not self.is_known(now_ns):
+            return faults
         if self.leak:
-            found.append(("leak", f"{joint.name} reports water inside"))
-        if self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS:
-            needs = f"it needs {joint.min_voltage_v:g} V: {FIELD}"
+            cause = f"{joint.name} reports water inside"
+            faults.append(Fault(tick=tick, what="leak", cause=cause, joint=joint.name, reach="robot"))
+        if self.low_since_ns is not None and now_ns - self.low_since_ns >= UNDERVOLTAGE_DELAY_NS:
+            needs = f"it needs {joint.min_voltage_v:g} V: {MIN_VOLTAGE_FIELD}"
             cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, {needs}"
-            found.append(("undervoltage", cause))
-        return found
+            faults.append(Fault(tick=tick, what="undervoltage", cause=cause, joint=joint.name, reach="robot"))
+        return faults

@@ -3,22 +3,23 @@
 from snakesim_hal.wire.messages import Fault
 
 MAX_FAULTS_KEPT = 32
-FIRST_KEPT = MAX_FAULTS_KEPT // 2  # as the report takes it
+FIRST_KEPT = MAX_FAULTS_KEPT // 2  # the first faults usually show the cause, so the report lists as many
 
 
 class FaultLog:
-    """The dropped ones came between the first and the newest."""
+    """The faults since some event. A full log drops faults between the first and the newest ones."""
 
     def __init__(self) -> None:
-        self.kept: list[Fault] = []  # in order of time
+        self.kept: list[Fault] = []  # oldest first
         self.left_out = 0
         self._stop: Fault | None = None  # the newest that stopped the robot
 
     def add(self, fault: Fault, *, stops: bool) -> None:
-        """Add one. stops: it is why the robot is in `fault` or `estop` now."""
+        """Add a fault. `stops` means that the robot is in `fault` or `estop` now because of it."""
         if stops:
             self._stop = fault
         self.kept.append(fault)
         if len(self.kept) > MAX_FAULTS_KEPT:
+            # The fault that stopped the robot stays: then the one behind it is dropped.
             del self.kept[FIRST_KEPT + (self.kept[FIRST_KEPT] is self._stop)]
             self.left_out += 1

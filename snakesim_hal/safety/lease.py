@@ -15,23 +15,30 @@ class Lease:
     expires_ns: int = 0
 
     def live(self, now_ns: int) -> bool:
-        """Whether it is held at this time."""
+        """Return whether the lease is held at this time."""
         return self.holder is not None and now_ns <= self.expires_ns
 
 
 @dataclass(frozen=True)
 class LeaseDecision:
-    """The result of a request: the lease after it, and why it was refused (None: granted)."""
+    """The decision about a request."""
 
-    lease: Lease
-    refusal: str | None = None
+    lease: Lease  # after the request
+    refusal: str | None = None  # why it was refused; None: it was granted
     changed_hands: bool = False
     word: str | None = None  # the refusal as one word
 
 
 def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> LeaseDecision:
-    """Decide a request. A live lease is granted only to its holder, or to a higher priority."""
-    mine = lease.live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
+    """Decide a request. While a lease is live, it is granted only to its holder, or to a higher priority.
+
+    Args:
+        lease: the lease before the request.
+        request: acquire, renew or release.
+        now_ns: safety time.
+        term_ns: how long a lease lasts without a renewal.
+    """
+    is_holder = lease.live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
     match request.action:
         case "acquire":
             if lease.live(now_ns) and request.priority <= lease.priority:
@@ -42,27 +49,28 @@ def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Leas
                     f"{left_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
                     word="lease_held",
                 )
-            taken = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
-            return LeaseDecision(taken, changed_hands=True)
+            acquired = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
+            return LeaseDecision(acquired, changed_hands=True)
         case "renew":
-            if not mine:
-                return _not_holder(lease, request, "acquire the lease first")
+            if not is_holder:
+                return _refuse_other_holder(lease, request, "acquire the lease first")
             return LeaseDecision(renewed(lease, now_ns, term_ns))
-        case _:  # release
-            if not mine:
-                return _not_holder(lease, request, "nothing to release")
+        case "release":
+            if not is_holder:
+                return _refuse_other_holder(lease, request, "nothing to release")
             return LeaseDecision(freed(lease), changed_hands=True)
 
 
-def _not_holder(lease: Lease, request: LeaseRequest, then: str) -> LeaseDecision:
-    return LeaseDecision(lease, f"{request.holder} does not hold epoch {request.epoch}; {then}", word="not_holder")
+def _refuse_other_holder(lease: Lease, request: LeaseRequest, advice: str) -> LeaseDecision:
+    """Refuse a request of a client that does not hold the lease."""
+    return LeaseDecision(lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", word="not_holder")
 
 
 def renewed(lease: Lease, now_ns: int, term_ns: int) -> Lease:
-    """The lease, extended by a term."""
+    """Return the lease, extended by a term from now on."""
     return replace(lease, expires_ns=now_ns + term_ns)
 
 
 def freed(lease: Lease) -> Lease:
-    """The free lease; the epoch stays, so that later commands of the last holder are rejected."""
+    """Return the free lease. The epoch stays, so that later commands of the last holder are rejected."""
     return Lease(epoch=lease.epoch)

@@ -8,13 +8,10 @@ Fault and estop are latched: only an explicit clear ends them, and leads to disa
 Each unmet condition for arming has a reason as text and as one word.
 """
 
-from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from snakesim_hal.safety.limiter import Floats
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.safety.joint_limits import Mask
 from snakesim_hal.wire.messages import Description, JointCommand, LifecycleRequest, LifecycleState, Mode
 
 Event = Literal["arm", "disarm", "fault", "estop", "clear"]
@@ -37,13 +34,14 @@ _TRANSITIONS: dict[tuple[LifecycleState, Event], LifecycleState] = {
 }
 
 
-def after(state: LifecycleState, event: Event) -> LifecycleState | None:
-    """The state that follows, or None when the event is not allowed in this state."""
+def next_state(state: LifecycleState, event: Event) -> LifecycleState | None:
+    """Return the state that follows, or None if the event is not allowed in this state."""
     return _TRANSITIONS.get((state, event))
 
 
 # --- arming --------------------------------------------------------------------------------------------------
 
+# The refusals of a request to arm, the most important first.
 ORDER = (
     "wrong_robot",
     "wrong_backend",
@@ -52,49 +50,64 @@ ORDER = (
     "not_checked",
     "cable",
     "not_ready",
-)  # the most important first
+)
 
 
-def address_mismatches(request: LifecycleRequest, description: Description) -> list[tuple[str, str]]:
-    """Names in a request to arm that do not match this robot: (refusal, reason)."""
-    found: list[tuple[str, str]] = []
+class UnmetCondition(NamedTuple):
+    """A condition for arming that is not met."""
+
+    refusal: str  # one of ORDER
+    reason: str  # for people
+
+
+def find_address_mismatches(request: LifecycleRequest, description: Description) -> list[UnmetCondition]:
+    """Return the names in a request to arm that do not match this robot."""
+    unmet: list[UnmetCondition] = []
     if request.robot != description.robot:
-        found.append(
-            ("wrong_robot", f"this robot is {description.robot!r}, the request names {request.robot!r}"),
-        )
+        reason = f"this robot is {description.robot!r}, the request names {request.robot!r}"
+        unmet.append(UnmetCondition("wrong_robot", reason))
     if request.backend != description.backend:
-        found.append(
-            ("wrong_backend", f"this backend is {description.backend!r}, the request names {request.backend!r}"),
-        )
+        reason = f"this backend is {description.backend!r}, the request names {request.backend!r}"
+        unmet.append(UnmetCondition("wrong_backend", reason))
     if request.config_hash != description.config_hash:
-        asked = "none" if request.config_hash is None else repr(request.config_hash)
-        found.append(
-            (
-                "wrong_config",
-                f"the configuration is {description.config_hash!r}, the request names {asked}: read hal/description, "
-                f"and arm with its config_hash",
-            )
+        requested = "none"
+        if request.config_hash is not None:
+            requested = repr(request.config_hash)
+        reason = (
+            f"the configuration is {description.config_hash!r}, the request names {requested}: read hal/description, "
+            f"and arm with its config_hash"
         )
-    return found
+        unmet.append(UnmetCondition("wrong_config", reason))
+    return unmet
 
 
-def far_targets(
-    command: JointCommand, angle_rad: Floats, description: Description, aside: NDArray[np.bool_]
-) -> Sequence[str]:
-    """Joints that a command would move at once: it must hold the pose at arming. aside: joints that stay passive."""
-    far: list[str] = []
-    most = description.max_step_rad
-    for joint, mode, target, angle, passive in zip(
-        description.joints, command.mode, command.target, angle_rad.tolist(), aside.tolist(), strict=True
+def find_far_targets(command: JointCommand, angle_rad: Floats, description: Description, isolated: Mask) -> list[str]:
+    """Return a reason for each joint that a command would move at once: it must hold the pose at arming.
+
+    Args:
+        command: the newest command before the arming.
+        angle_rad: (n_joints,), the measured angles.
+        description: the robot.
+        isolated: (n_joints,), joints that stay passive and are not checked.
+    """
+    reasons: list[str] = []
+    max_step_rad = description.max_step_rad
+    for joint, mode, target, angle, is_isolated in zip(
+        description.joints, command.mode, command.target, angle_rad.tolist(), isolated.tolist(), strict=True
     ):
-        if passive:
+        if is_isolated:
             continue
-        if mode not in (Mode.POSITION, Mode.PASSIVE):
-            far.append(
-                f"{joint.name} is commanded in mode {mode.name.lower()}; it must hold its position at arm_session"
-            )
-        if mode is Mode.POSITION and abs(target - angle) > most:
-            far.append(
-                f"{joint.name} has a target {target - angle:+.2f} rad from its angle; at most {most} rad at arm_session"
-            )
-    return far
+        match mode:
+            case Mode.PASSIVE:
+                continue
+            case Mode.POSITION:
+                if abs(target - angle) > max_step_rad:
+                    reasons.append(
+                        f"{joint.name} has a target {target - angle:+.2f} rad from its angle; at most "
+                        f"{max_step_rad} rad at arming"
+                    )
+            case _:
+                reasons.append(
+                    f"{joint.name} is commanded in mode {mode.name.lower()}; it must hold its position at arming"
+                )
+    return reasons

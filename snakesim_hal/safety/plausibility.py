@@ -15,20 +15,20 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from snakesim_hal.safety.limiter import Applied, Floats, JointLimits, Measured
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask, Measured
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 
-Mask = NDArray[np.bool_]
 Columns = tuple[list[float], list[float], list[float]]  # angle, velocity, torque
 
 SPEED_MARGIN = 2.0  # an external load may turn a joint faster than its motor
-SLACK_RAD = 0.05  # for noise
-AGREEING = 5  # samples in a row at a new place, until it is accepted
-FROZEN_SHARE = 0.25  # of max_step_rad: a target that moves this far changes the torque of a joint that does not follow
-AT_LIMIT = 0.95  # of the torque limit
-LONGEST_CAUSE = 400
+SLACK_RAD = 0.05  # noise of an angle
+SETTLED_SAMPLES = 5  # samples in a row at a new place, until it is accepted
+# Fraction of max_step_rad: a target that moves this far changes the torque of a joint that does not follow.
+FROZEN_TARGET_FRACTION = 0.25
+SATURATED_TORQUE_FRACTION = 0.95  # of the torque limit: from there on a constant torque proves nothing
+MAX_CAUSE_LENGTH = 400  # characters; a fault's cause has at most 500
 
 
 @dataclass(frozen=True)
@@ -40,198 +40,267 @@ class ImplausibleState:
 
 
 class PlausibilityCheck:
-    """The last good state of every joint, and the checks of the newest."""
+    """The last good state of every joint, and the checks of the newest one."""
 
     def __init__(self, limits: JointLimits) -> None:
         self._limits = limits
         count = len(limits.joints)
-        self._columns = np.zeros((3, count))  # angle, velocity, torque: the last good ones
-        self._good_s = np.zeros((2, count))  # when they were taken, by both clocks
-        self._known: Mask = np.zeros(count, dtype=np.bool_)  # whether there ever were any
+
+        # The last good state of every joint.
+        self._columns = np.zeros((3, count))  # angle, velocity, torque
+        self._good_s = np.zeros((2, count))  # when they were measured, by both clocks
+        self._known: Mask = np.zeros(count, dtype=np.bool_)  # whether there ever was one
+
+        # The shortcut for ordinary states.
         self._ordinary: Columns | None = None  # the last state, if all of it was good and no joint had jumped
-        self._passed: tuple[JointState, int, Applied | None] | None = None  # it, if no check has looked at it
+        self._unchecked: tuple[JointState, int, Applied | None] | None = None  # it, if no check has processed it
+
         self._jumps = _JumpDetector(count, SPEED_MARGIN * limits.speed_rad_s)
         self._frozen = _FrozenDetector(limits)
 
     @property
     def measured(self) -> Measured:
-        """The last good state of every joint; zeros for one that never had any."""
+        """The last good state of every joint; zeros for a joint that never had one."""
         return Measured(*self._columns)
 
-    def take(self, joints: JointState, *, now_ns: int, applied: Applied | None, aside: Mask) -> ImplausibleState | None:
-        """Take a joint state; returns what is implausible, or None.
+    def check(
+        self, joints: JointState, *, now_ns: int, applied: Applied | None, isolated: Mask
+    ) -> ImplausibleState | None:
+        """Check a joint state, and keep its good values. Returns what is implausible, or None.
 
-        now_ns: safety time. After a delay of the host, more time has passed than its ticks show.
-        applied: the last setpoints of an armed robot; None: the robot is not armed.
-        aside: isolated joints.
+        Args:
+            joints: the newest joint state.
+            now_ns: safety time. After a delay of the host, more time has passed than its ticks show.
+            applied: the last setpoints of an armed robot; None if the robot is not armed.
+            isolated: (n_joints,), joints that are not checked.
         """
         count = len(self._known)
         if not joints.is_of(count):
-            cause = f"no joint state of {count} joints"
-            return ImplausibleState(
-                Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known)
-            )
+            fault = Fault(tick=joints.tick, what="state_invalid", cause=f"no joint state of {count} joints")
+            return ImplausibleState(fault, np.ones_like(self._known))
+        if self._is_ordinary(joints):
+            newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+            self._columns = np.array(newest)
+            self._ordinary = newest
+            self._unchecked = (joints, now_ns, applied)
+            return None
+        self._process_unchecked_state()
+        return self._check_each_joint(joints, now_ns=now_ns, applied=applied, isolated=isolated)
+
+    def _check_each_joint(
+        self, joints: JointState, *, now_ns: int, applied: Applied | None, isolated: Mask
+    ) -> ImplausibleState | None:
+        """Do the three checks for each joint of a state that is not ordinary. The arguments are those of `check`."""
         newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
         columns = np.array(newest)
-        if self._is_ordinary(joints):
-            self._columns, self._ordinary, self._passed = columns, newest, (joints, now_ns, applied)
-            return None
-        self._look_back()
-        taken_s = _taken_s(joints, now_ns)
-        fresh = np.array(joints.age_ns, dtype=np.float64) <= self._limits.oldest_state_ns
-        sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
-        elapsed_s = (taken_s - self._good_s).max(axis=0)
+        measured_s = _measurement_times_s(joints, now_ns)
+        sound = self._find_sound(joints, columns)
+
+        # Angles that are too far from the last good one.
+        elapsed_s = (measured_s - self._good_s).max(axis=0)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
-        jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.reach_rad(elapsed_s))
-        settled = self._jumps.settled(jumped, columns[0], taken_s)
-        self._ordinary = newest if sound.all() and not jumped.any() else None
+        jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.max_turn_rad(elapsed_s))
+        settled = self._jumps.find_settled(jumped, columns[0], measured_s)
+        self._ordinary = None
+        if sound.all() and not jumped.any():
+            self._ordinary = newest
         if applied is None:
-            jumped &= ~settled
+            jumped = jumped & ~settled
+
+        # Keep the good values.
         good = sound & ~jumped
         self._columns = np.where(good, columns, self._columns)
-        self._good_s = np.where(good, taken_s, self._good_s)
+        self._good_s = np.where(good, measured_s, self._good_s)
         self._known |= good
-        frozen = self._frozen.look(columns, taken_s[0], applied)
+
+        frozen = self._frozen.find_frozen(columns, measured_s[0], applied)
         if not np.count_nonzero(~good | frozen):
             return None
-        unknown, jumped, frozen = ~sound & ~aside, jumped & ~aside, frozen & ~aside
+        unknown = ~sound & ~isolated
         if unknown.any():
-            return self._implausible(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
+            return self._make_unknown(joints.tick, unknown)
+        jumped = jumped & ~isolated
         if jumped.any():
-            tails = [
-                f" by {by:+.2f} rad in {within * 1e3:.0f} ms" for by, within in zip(jump_rad, elapsed_s, strict=True)
-            ]
-            return self._implausible(
-                joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails
-            )
+            return self._make_jumped(joints.tick, jumped, jump_rad, elapsed_s)
+        frozen = frozen & ~isolated
         if frozen.any():
-            return self._implausible(
-                joints.tick, "joint_frozen", "the same state repeated while its target moves: ", frozen
-            )
+            return self._make_frozen(joints.tick, frozen)
         return None
 
-    def _look_back(self) -> None:
-        """Take what the checks need of the state before, if that was ordinary: only now does anything depend on it."""
-        if self._passed is None:
+    def _process_unchecked_state(self) -> None:
+        """Pass the ordinary state before to the detectors: only now does anything depend on it."""
+        if self._unchecked is None:
             return
-        joints, now_ns, applied = self._passed
-        self._passed = None
-        self._good_s = _taken_s(joints, now_ns)
-        self._frozen.moved(self._columns, applied)
+        joints, now_ns, applied = self._unchecked
+        self._unchecked = None
+        self._good_s = _measurement_times_s(joints, now_ns)
+        self._frozen.restart(self._columns, applied)
 
     def _is_ordinary(self, joints: JointState) -> bool:
-        """Whether every joint is fresh, near its last angle and new, as nearly always: then no check can fail.
+        """Return whether every joint is fresh, near its last angle and new, as nearly always: then no check can fail.
 
-        On plain numbers: for a dozen joints that is several times faster than on vectors.
+        The loop runs on plain floats: for a dozen joints that is several times faster than vectors.
         """
         if self._ordinary is None or not all(joints.valid) or max(joints.age_ns) > self._limits.oldest_state_ns:
             return False
-        for angle, velocity, torque, last, last_velocity, last_torque in zip(
+        for angle, velocity, torque, last_angle, last_velocity, last_torque in zip(
             joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, *self._ordinary, strict=True
         ):
-            if not (abs(angle - last) <= SLACK_RAD and math.isfinite(velocity) and math.isfinite(torque)):
+            # Written so that NaN is not ordinary.
+            if not (abs(angle - last_angle) <= SLACK_RAD and math.isfinite(velocity) and math.isfinite(torque)):
                 return False
-            if angle == last and velocity == last_velocity and torque == last_torque:
+            if angle == last_angle and velocity == last_velocity and torque == last_torque:
                 return False
         return True
 
-    def _implausible(
-        self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None
-    ) -> ImplausibleState:
-        found = np.flatnonzero(which).tolist()
-        names = [self._limits.joints[i].name for i in found]
-        labels = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]
-        cause = (words + ", ".join(labels))[:LONGEST_CAUSE]
-        joint = names[0] if len(names) == 1 else None
-        return ImplausibleState(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
+    def _find_sound(self, joints: JointState, columns: Floats) -> Mask:
+        """Return which joints have a valid, finite and fresh state, (n_joints,)."""
+        fresh = np.array(joints.age_ns, dtype=np.float64) <= self._limits.oldest_state_ns
+        finite = np.isfinite(columns).all(axis=0)
+        return finite & fresh & np.array(joints.valid)
+
+    def _make_unknown(self, tick: int, joints: Mask) -> ImplausibleState:
+        names = self._find_names(joints)
+        return _make_implausible(tick, "state_invalid", "no valid and fresh state of ", joints, names, names)
+
+    def _make_jumped(self, tick: int, joints: Mask, jump_rad: Floats, elapsed_s: Floats) -> ImplausibleState:
+        names = self._find_names(joints)
+        labels: list[str] = []
+        for name, i in zip(names, np.flatnonzero(joints).tolist(), strict=True):
+            labels.append(f"{name} by {jump_rad[i]:+.2f} rad in {elapsed_s[i] * 1e3:.0f} ms")
+        words = "faster than any joint turns: a jump of "
+        return _make_implausible(tick, "state_invalid", words, joints, names, labels)
+
+    def _make_frozen(self, tick: int, joints: Mask) -> ImplausibleState:
+        names = self._find_names(joints)
+        words = "the same state repeated while its target moves: "
+        return _make_implausible(tick, "joint_frozen", words, joints, names, names)
+
+    def _find_names(self, joints: Mask) -> list[str]:
+        return [self._limits.joints[i].name for i in np.flatnonzero(joints).tolist()]
 
 
-def _taken_s(joints: JointState, now_ns: int) -> Floats:
-    """When each joint's state was taken, by stamp and by safety time, (2, n_joints)."""
+def _make_implausible(
+    tick: int, what: str, words: str, joints: Mask, names: list[str], labels: list[str]
+) -> ImplausibleState:
+    """Return the fault of some joints. `labels` has one entry a joint for the text, `names` their plain names."""
+    cause = (words + ", ".join(labels))[:MAX_CAUSE_LENGTH]
+    joint = None
+    if len(names) == 1:
+        joint = names[0]
+    return ImplausibleState(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), joints)
+
+
+def _measurement_times_s(joints: JointState, now_ns: int) -> Floats:
+    """Return when each joint's state was measured, by its timestamp and by safety time, (2, n_joints)."""
     ages_ns = np.array(joints.age_ns, dtype=np.float64)
     return (np.array([[joints.timestamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
 
 
-def readable(joints: JointState, good: Measured) -> JointState:
-    """A joint state for publishing: NaN or infinity would make a reader reject the states of all joints.
+def replace_unreadable(joints: JointState, good: Measured) -> JointState:
+    """Return a joint state for publishing: NaN or infinity would make a reader reject the states of all joints.
 
-    The last good value replaces it, marked invalid. A state of another number of joints is unchanged.
+    The last good values of a joint replace it, marked invalid. A state of another number of joints is unchanged.
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
-    if all(all(map(math.isfinite, column)) for column in columns) or not joints.is_of(len(good.angle_rad)):
+    all_finite = all(all(map(math.isfinite, column)) for column in columns)
+    if all_finite or not joints.is_of(len(good.angle_rad)):
         return joints
-    kept = (good.angle_rad.tolist(), good.velocity_rad_s.tolist(), good.torque_nm.tolist())
-    sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=True)]
-    angle, velocity, torque = (
-        [value if fine else last for value, fine, last in zip(column, sound, before, strict=True)]
-        for column, before in zip(columns, kept, strict=True)
-    )
-    valid = [valid and fine for valid, fine in zip(joints.valid, sound, strict=True)]
+    angle = list(joints.angle_rad)
+    velocity = list(joints.velocity_rad_s)
+    torque = list(joints.torque_nm)
+    valid = list(joints.valid)
+    for i, values in enumerate(zip(*columns, strict=True)):
+        if not all(map(math.isfinite, values)):
+            angle[i] = float(good.angle_rad[i])
+            velocity[i] = float(good.velocity_rad_s[i])
+            torque[i] = float(good.torque_nm[i])
+            valid[i] = False
     return msgspec.structs.replace(joints, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, valid=valid)
 
 
 class _JumpDetector:
-    """Rejected angles: whether they agree with one another."""
+    """Decides whether rejected angles agree with one another."""
 
     def __init__(self, count: int, speed_rad_s: Floats) -> None:
         self._speed_rad_s = speed_rad_s
+        # The last rejected angles.
         self._angle_rad = np.zeros(count)
-        self._taken_s = np.zeros((2, count))
+        self._measured_s = np.zeros((2, count))
         self._in_a_row = np.zeros(count, dtype=np.int64)
 
-    def reach_rad(self, elapsed_s: Floats) -> Floats:
-        """Maximum turn of a joint in this time, (n_joints,)."""
+    def max_turn_rad(self, elapsed_s: Floats) -> Floats:
+        """Return the maximum turn of each joint in this time, (n_joints,)."""
         return SLACK_RAD + self._speed_rad_s * np.maximum(elapsed_s, 0.0)
 
-    def settled(self, strayed: Mask, angle_rad: Floats, taken_s: Floats) -> Mask:
-        """Take the newest angles, of which some have jumped; returns which of those have settled at a new place."""
-        if not np.count_nonzero(strayed):
+    def find_settled(self, jumped: Mask, angle_rad: Floats, measured_s: Floats) -> Mask:
+        """Process the newest angles, and return which of those that jumped have settled at a new place.
+
+        Args:
+            jumped: (n_joints,), joints whose newest angle is too far from the last good one.
+            angle_rad: (n_joints,), the newest angles; only those of joints that jumped are used.
+            measured_s: (2, n_joints), when they were measured, by both clocks.
+        """
+        if not np.count_nonzero(jumped):
             self._in_a_row[:] = 0
-            return strayed
-        elapsed_s = taken_s - self._taken_s
-        follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))
+            return jumped
+        newest_rad = np.where(jumped, angle_rad, 0.0)
+        elapsed_s = measured_s - self._measured_s
+        follows = np.abs(newest_rad - self._angle_rad) <= self.max_turn_rad(elapsed_s.max(axis=0))
         repeated = follows & (elapsed_s[0] <= 0)  # a repeated sample is not new information
         counted = np.where(follows, self._in_a_row + ~repeated, 1)
-        self._in_a_row = np.where(strayed, counted, 0)
-        self._angle_rad, self._taken_s = np.where(strayed, angle_rad, 0.0), taken_s
-        return strayed & (self._in_a_row >= AGREEING)
+        self._in_a_row = np.where(jumped, counted, 0)
+        self._angle_rad = newest_rad
+        self._measured_s = measured_s
+        return jumped & (self._in_a_row >= SETTLED_SAMPLES)
 
 
 class _FrozenDetector:
-    """For how long joints have repeated a state, and how far their targets have moved meanwhile."""
+    """Measures for how long joints have repeated a state, and how far their targets have moved meanwhile."""
 
     def __init__(self, limits: JointLimits) -> None:
-        self._lease_s = limits.lease_ns * 1e-9
-        self._far_rad = FROZEN_SHARE * limits.max_step_rad
         count = len(limits.joints)
+        self._lease_s = limits.lease_ns * 1e-9
+        self._far_rad = FROZEN_TARGET_FRACTION * limits.max_step_rad
         self._columns = np.full((3, count), np.nan)
         self._followed: Mask = np.zeros(count, dtype=np.bool_)  # whether the joint had a position target before
-        self._low_rad, self._high_rad = np.zeros(count), np.zeros(count)
+        # The range of the targets since the state has been the same.
+        self._low_rad = np.zeros(count)
+        self._high_rad = np.zeros(count)
         self._never_s = np.full(count, np.inf)
-        self._far_since_s = self._never_s  # since when a target has been far from where it was at the start
+        self._far_since_s = self._never_s  # since when that range has been wide
 
-    def moved(self, columns: Floats, applied: Applied | None) -> None:
-        """Take states of which none repeats the one before, (3, n_joints), and what was applied."""
+    def restart(self, columns: Floats, applied: Applied | None) -> None:
+        """Process states of which none repeats the one before, (3, n_joints), and the setpoints applied."""
         self._columns = columns
         if applied is None:
             self._followed = np.zeros_like(self._followed)
             return
         self._followed = applied.mode == Mode.POSITION
-        self._low_rad = self._high_rad = applied.target
+        self._low_rad = applied.target
+        self._high_rad = applied.target
         self._far_since_s = self._never_s
 
-    def look(self, columns: Floats, taken_s: Floats, applied: Applied | None) -> Mask:
-        """Take the newest states, (3, n_joints), and what was applied; returns which joints are frozen."""
+    def find_frozen(self, columns: Floats, measured_s: Floats, applied: Applied | None) -> Mask:
+        """Process the newest states, and return which joints are frozen, (n_joints,).
+
+        Args:
+            columns: (3, n_joints), angle, velocity and torque.
+            measured_s: (n_joints,), when they were measured, by their timestamp.
+            applied: the last setpoints of an armed robot; None if the robot is not armed.
+        """
         follows = np.zeros_like(self._followed) if applied is None else applied.mode == Mode.POSITION
         same = (columns == self._columns).all(axis=0) & follows & self._followed
         if applied is None or not np.count_nonzero(same):
-            self.moved(columns, applied)
+            self.restart(columns, applied)
             return same
-        self._columns, self._followed, target = columns, follows, applied.target
+        target = applied.target
+        self._columns = columns
+        self._followed = follows
         self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)
         self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)
         far = same & (self._high_rad - self._low_rad > self._far_rad)
-        self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), self._never_s)
-        long = taken_s - self._far_since_s > self._lease_s
-        free = np.abs(columns[2]) < AT_LIMIT * applied.torque_limit_nm
+        self._far_since_s = np.where(far, np.minimum(self._far_since_s, measured_s), self._never_s)
+        long = measured_s - self._far_since_s > self._lease_s
+        free = np.abs(columns[2]) < SATURATED_TORQUE_FRACTION * applied.torque_limit_nm
         return far & long & free

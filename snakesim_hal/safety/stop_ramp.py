@@ -1,45 +1,122 @@
-"""The stop mode `hold`: the joints are brought to rest, and held there. Pure.
+"""The setpoints of a robot that is not armed, and the ramp that brings an armed robot to rest after a fault. Pure.
 
-Also how `damp` brings a joint to rest that has no velocity mode; it is let go then.
+The robot file chooses the stop mode of a fault: `passive`, `damp` or `hold`. In every other state that is not armed,
+all joints are passive.
 
-A reference angle starts from the measured one at the measured velocity, and slows down by the acceleration limit. The
-position target follows it no faster than the speed limit, starting where the motor keeps its torque. Both
-stay inside the angle limits, which takes precedence over the rate of the target.
+For `hold`, the joints are brought to rest and held there. A reference angle starts from the measured angle at the
+measured velocity, and slows down by the acceleration limit. The position target follows it no faster than the speed
+limit, starting where the motor keeps its torque. Both stay inside the angle limits, which takes precedence over the
+rate of the target.
+
+For `damp`, a joint with a velocity mode gets the velocity target 0. A joint without one follows the ramp, and becomes
+passive when the ramp is at rest.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.safety.limiter import Applied, Floats, JointLimits, Measured, bumpless_target
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
+from snakesim_hal.safety.limiter import bumpless_target
+from snakesim_hal.wire.messages import LifecycleState, Mode, StopMode
 
 
 @dataclass(frozen=True)
 class StopRamp:
-    """A robot that is brought to rest, (n_joints,) each."""
+    """The state of the ramp that brings joints to rest, (n_joints,) each."""
 
-    wanted_rad: Floats
+    reference_rad: Floats
     velocity_rad_s: Floats  # of the reference angle
     target_rad: Floats
 
     @staticmethod
     def begin(measured: Measured, last: Applied, limits: JointLimits) -> "StopRamp":
-        """From the measured state, and the last setpoints."""
-        angle, velocity = measured.angle_rad, measured.velocity_rad_s
-        states = zip(limits.joints, angle.tolist(), velocity.tolist(), measured.torque_nm.tolist(), strict=True)
-        bumpless = [bumpless_target(joint, Mode.POSITION, *now) for joint, *now in states]
-        target = np.where(last.mode == Mode.POSITION, last.target, bumpless)
-        near = np.clip(target, angle - limits.max_step_rad, angle + limits.max_step_rad)
-        slowed = np.clip(velocity, -limits.speed_rad_s, limits.speed_rad_s)
-        return StopRamp(limits.inside(angle), slowed, limits.inside(near))
+        """Start a ramp from the measured state and the last setpoints."""
+        angle_rad = measured.angle_rad
+        states = zip(
+            limits.joints,
+            angle_rad.tolist(),
+            measured.velocity_rad_s.tolist(),
+            measured.torque_nm.tolist(),
+            strict=True,
+        )
+        bumpless_rad = [
+            bumpless_target(joint, Mode.POSITION, angle, velocity, torque) for joint, angle, velocity, torque in states
+        ]
+        target_rad = np.where(last.mode == Mode.POSITION, last.target, bumpless_rad)
+        near_rad = np.clip(target_rad, angle_rad - limits.max_step_rad, angle_rad + limits.max_step_rad)
+        velocity_rad_s = np.clip(measured.velocity_rad_s, -limits.speed_rad_s, limits.speed_rad_s)
+        return StopRamp(
+            reference_rad=limits.clip_angles(angle_rad),
+            velocity_rad_s=velocity_rad_s,
+            target_rad=limits.clip_angles(near_rad),
+        )
 
-    def after_a_period(self, limits: JointLimits) -> "StopRamp":
-        """One period later."""
+    def advance(self, limits: JointLimits) -> "StopRamp":
+        """Return the ramp one period T later.
+
+        The reference brakes from v0 to v1 = sign(v0) max(|v0| - a T, 0), and moves by (v0 + v1) T / 2.
+        """
         period_s = limits.period_s
         slower = np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0)
         slower *= np.sign(self.velocity_rad_s)
-        wanted = limits.inside(self.wanted_rad + 0.5 * (self.velocity_rad_s + slower) * period_s)
-        step = limits.speed_rad_s * period_s
-        target = np.clip(wanted, self.target_rad - step, self.target_rad + step)
-        return StopRamp(wanted, slower, target)
+        reference_rad = limits.clip_angles(self.reference_rad + 0.5 * (self.velocity_rad_s + slower) * period_s)
+        step_rad = limits.speed_rad_s * period_s
+        target_rad = np.clip(reference_rad, self.target_rad - step_rad, self.target_rad + step_rad)
+        return StopRamp(reference_rad, slower, target_rad)
+
+
+class StopReaction:
+    """The setpoints of a robot that is not armed, by its stop mode."""
+
+    def __init__(self, limits: JointLimits, stop_mode: StopMode) -> None:
+        self._limits = limits
+        self._stop_mode: StopMode = stop_mode
+        self._ramp: StopRamp | None = None  # only if the robot was armed when the present fault came
+
+    def begin(self, measured: Measured, last: Applied) -> None:
+        """Start to bring a moving robot to rest: its lifecycle leaves `armed`."""
+        self._ramp = StopRamp.begin(measured, last, self._limits)
+
+    def end(self) -> None:
+        """Forget the ramp: the next setpoints are passive."""
+        self._ramp = None
+
+    def make_setpoints(self, state: LifecycleState, torque_nm: Floats) -> Applied:
+        """Return the setpoints of the next period in a state other than `armed`.
+
+        Args:
+            state: the present lifecycle state.
+            torque_nm: (n_joints,), the torque limits after derating.
+        """
+        if state != "fault" or self._ramp is None:
+            return self._make_passive(torque_nm)
+        match self._stop_mode:
+            case "passive":
+                return self._make_passive(torque_nm)
+            case "damp":
+                return self._damp(self._ramp, torque_nm)
+            case "hold":
+                self._ramp = self._ramp.advance(self._limits)
+                return uniform_setpoints(Mode.POSITION, self._ramp.target_rad, torque_nm)
+
+    def _make_passive(self, torque_nm: Floats) -> Applied:
+        return uniform_setpoints(Mode.PASSIVE, np.zeros_like(torque_nm), torque_nm)
+
+    def _damp(self, ramp: StopRamp, torque_nm: Floats) -> Applied:
+        """Return velocity targets of 0, and position targets for joints without a velocity mode until they rest."""
+        has_velocity_mode = self._limits.has_velocity_mode
+        if has_velocity_mode.all():
+            return uniform_setpoints(Mode.VELOCITY, np.zeros_like(torque_nm), torque_nm)
+        ramp = ramp.advance(self._limits)
+        self._ramp = ramp
+        at_rest = ramp.velocity_rad_s == 0.0
+        modes = np.select([has_velocity_mode, at_rest], [int(Mode.VELOCITY), int(Mode.PASSIVE)], int(Mode.POSITION))
+        target = np.where(modes == int(Mode.POSITION), ramp.target_rad, 0.0)
+        return Applied(modes.astype(np.int64), target, torque_nm)
+
+
+def uniform_setpoints(mode: Mode, target: Floats, torque_nm: Floats) -> Applied:
+    """Return setpoints of one mode for all joints. `target` and `torque_nm` have the shape (n_joints,)."""
+    return Applied(np.full(len(target), int(mode), dtype=np.int64), target, torque_nm)

@@ -13,10 +13,11 @@ from snakesim_hal.wire.messages import VERSIONS, ColorImage, DepthImage, Message
 MessageT = TypeVar("MessageT", bound=Message)
 
 ENCODING_PREFIX = "application/msgpack;snakesim."
-MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; longer ones are dropped unread, unless images
-MAX_IMAGE_BYTES = 4 * 1024 * 1024  # a color image of the most pixels fits
+MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; a longer payload is rejected before it is decoded
+MAX_IMAGE_BYTES = 4 * 1024 * 1024  # a color image of MAX_PIXELS fits
 IMAGES: tuple[type[Message], ...] = (DepthImage, ColorImage)
-MAX_WHY = 300  # characters of the reason why a payload is malformed
+MAX_DETAIL_LENGTH = 300  # characters of the reason why a payload is malformed
+MAX_ENCODING_LENGTH = 80  # characters of a foreign encoding that an error quotes
 # Everything that a msgspec decoder raises for untrusted bytes: a payload may be nested too deeply, or not be UTF-8.
 UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError, ValueError)
 
@@ -25,8 +26,10 @@ encode = _encoder.encode
 
 
 def encoding_of(message: type[Message]) -> str:
-    """The Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
-    known = OwnSample if issubclass(message, OwnSample) else message  # its further fields are in the description
+    """Return the Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
+    known = message
+    if issubclass(message, OwnSample):
+        known = OwnSample  # the further fields of a custom message are in the robot's description
     return f"{ENCODING_PREFIX}{known.__name__}/{VERSIONS[known]}"
 
 
@@ -40,17 +43,28 @@ class Decoder(Generic[MessageT]):
         self._decoder = msgspec.msgpack.Decoder(message)
 
     def decode(self, payload: bytes, encoding: str) -> MessageT:
-        """Payload and encoding of a sample -> message. Raises WireError with a reason to count by."""
+        """Decode a sample.
+
+        Args:
+            payload: the bytes of the sample.
+            encoding: its Zenoh encoding.
+
+        Raises:
+            WireError: it is another message or malformed; has a reason to count by.
+        """
         if encoding != self.encoding:
-            raise WireError(_why_foreign(encoding, self.encoding), f"got {encoding[:80]!r}, want {self.encoding!r}")
+            detail = f"got {encoding[:MAX_ENCODING_LENGTH]!r}, want {self.encoding!r}"
+            raise WireError(_classify_foreign(encoding, self.encoding), detail)
         if len(payload) > self._max_bytes:
             raise WireError("malformed", f"{len(payload)} bytes, at most {self._max_bytes}")
         try:
             return self._decoder.decode(payload)
         except UNDECODABLE as error:
-            why = str(error)[:MAX_WHY]  # it may quote what the sender wrote
-            raise WireError("malformed", f"{self.message.__name__}: {why}") from None
+            detail = str(error)[:MAX_DETAIL_LENGTH]  # it may quote what the sender wrote
+            raise WireError("malformed", f"{self.message.__name__}: {detail}") from None
 
 
-def _why_foreign(got: str, want: str) -> str:
-    return "unknown_version" if got.rpartition("/")[0] == want.rpartition("/")[0] else "unknown_message"
+def _classify_foreign(received: str, expected: str) -> str:
+    """Return the word to count a foreign encoding by: another version of the same message, or another message."""
+    same_message = received.rpartition("/")[0] == expected.rpartition("/")[0]
+    return "unknown_version" if same_message else "unknown_message"

@@ -98,74 +98,79 @@ ROW_AT: dict[str, Row] = {row.key: row for row in SPACE if row.message is not No
 
 
 def depth(camera: str) -> str:
-    """Key of the depth images of a camera."""
+    """Return the key of the depth images of a camera."""
     return f"sensor/depth/{camera}"
 
 
 def color(camera: str) -> str:
-    """Key of the color images of a camera."""
+    """Return the key of the color images of a camera."""
     return f"sensor/color/{camera}"
 
 
 def ranges(sensor: str) -> str:
-    """Key of a lidar or a range finder."""
+    """Return the key of a lidar or a range finder."""
     return f"sensor/range/{sensor}"
 
 
 def own(sensor: str) -> str:
-    """Key of a sensor with a message of its own."""
+    """Return the key of a sensor with a message of its own."""
     return f"sensor/own/{sensor}"
 
 
 def preview(image_key: str) -> str:
-    """Key of the preview of an image: `sensor/depth/head` -> `preview/depth/head`."""
+    """Return the key of the preview of an image: `sensor/depth/head` -> `preview/depth/head`."""
     return f"preview/{image_key.partition('/')[2]}"
 
 
 def done(service: str) -> str:
-    """Key on which `service` reports a lockstep tick as done."""
+    """Return the key on which `service` reports a lockstep tick as done."""
     return f"hal/done/{service}"
 
 
 def fault(part: str) -> str:
-    """Key on which a part of a run takes requests for fault injection."""
+    """Return the key on which a part of a run receives requests for fault injection."""
     return f"fault/{part}"
 
 
 def alive(service: str) -> str:
-    """Liveliness key of `service`."""
+    """Return the liveliness key of `service`."""
     return f"alive/{service}"
 
 
 def host(host_id: str) -> str:
-    """Liveliness key of one host process."""
+    """Return the liveliness key of one host process."""
     return f"hal/host/{host_id}"
 
 
 def process(name: str, process_id: str) -> str:
-    """Key of one process, and of its liveliness token."""
+    """Return the key of one process, and of its liveliness token."""
     return f"process/{name}-{process_id}"
 
 
 def service_of(key: str) -> str:
-    """The service that a done or alive key names."""
+    """Return the service that a done or alive key names."""
     return key.rpartition("/")[2]
 
 
 def row_at(key: str) -> Row | None:
-    """The line of the key space that a key with a message belongs to; None for other keys."""
+    """Return the line of the key space that a key with a message belongs to; None for other keys."""
+    row = ROW_AT.get(key)
+    if row is not None:
+        return row
     start, _, name = key.rpartition("/")
-    return ROW_AT.get(key) or (ROW_AT.get(f"{start}/*") if name else None)
+    if not name:
+        return None
+    return ROW_AT.get(f"{start}/*")
 
 
 def row_key(key: str) -> str:
-    """The key or pattern of its line in the key space; empty for other keys."""
+    """Return the key or pattern of the line of the key space that a key belongs to; empty for other keys."""
     row = row_at(key)
     return "" if row is None else row.key
 
 
 def message_at(key: str) -> type[m.Message] | None:
-    """The message at `key`, or None when the key space has no such key."""
+    """Return the message at `key`, or None when the key space has no such key."""
     row = row_at(key)
     return None if row is None else row.message
 
@@ -175,7 +180,7 @@ def split_namespace(full_key: str) -> tuple[str, str] | None:
     parts = full_key.split("/")
     for cut in range(1, len(parts)):
         relative = "/".join(parts[cut:])
-        token = parts[cut:-1] in (["alive"], ["hal", "host"])
-        if message_at(relative) is not None or token:
+        is_token = parts[cut:-1] in (["alive"], ["hal", "host"])
+        if is_token or message_at(relative) is not None:
             return "/".join(parts[:cut]), relative
     return None

@@ -26,7 +26,7 @@ Measurement = Literal["torque", "temperature", "voltage"]
 
 A_JOINT = "one entry a joint"
 MAX_CONFIG = 500_000  # characters
-RANGE_SHARE = 0.05  # of the stated range of a camera or lidar: room for noise at its ends
+RANGE_SLACK_FRACTION = 0.05  # of the stated range of a camera or lidar: room for noise at its ends
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
 LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
 HOST = about("random id of the host process, new at each start; null: unknown")
@@ -72,7 +72,7 @@ class JointState(Message, frozen=True, kw_only=True):
     age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]
 
     def is_of(self, joints: int) -> bool:
-        """Whether it has this many joints, in every list."""
+        """Return whether every list has an entry for each of so many joints."""
         return (
             len(self.angle_rad) == joints
             and len(self.velocity_rad_s) == joints
@@ -146,7 +146,7 @@ class Power(Message, frozen=True, kw_only=True):
 
 
 class MountedSample(Message, frozen=True, kw_only=True):
-    """What every sensor says that sits at a place of its own on a link."""
+    """Base of the samples of sensors that are mounted on a link."""
 
     tick: q.Tick
     timestamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
@@ -155,12 +155,15 @@ class MountedSample(Message, frozen=True, kw_only=True):
     orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
 
     def contradiction(self) -> str:
-        """What in it cannot be, though each number is within its bounds; empty: nothing. The contract suite asks."""
+        """Describe what is impossible although each number is within its bounds; empty if nothing is.
+
+        The contract suite of backends calls it.
+        """
         return ""
 
 
 class CameraImage(MountedSample, frozen=True, kw_only=True):
-    """What every image says of its camera, a pinhole: see DepthImage."""
+    """Base of the images of a pinhole camera. DepthImage describes its frame."""
 
     width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
     height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
@@ -190,9 +193,10 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
     ]
 
     def contradiction(self) -> str:
-        """Distances beyond the range that it states."""
-        counts = set(memoryview(self.depth[: len(self.depth) // 2 * 2]).cast("H")) - {0}
-        return _beyond_range(self.range_min_m, self.range_max_m, [count * self.scale_m for count in counts])
+        whole_pixels = self.depth[: len(self.depth) // 2 * 2]
+        counts = set(memoryview(whole_pixels).cast("H")) - {0}
+        distances_m = [count * self.scale_m for count in counts]
+        return _describe_beyond_range(self.range_min_m, self.range_max_m, distances_m)
 
 
 class ColorImage(CameraImage, frozen=True, kw_only=True):
@@ -221,17 +225,19 @@ class Ranges(MountedSample, frozen=True, kw_only=True):
     ]
 
     def contradiction(self) -> str:
-        """Distances beyond the range that it states."""
-        found_m = [distance_m for distance_m in self.range_m if distance_m is not None]
-        return _beyond_range(self.range_min_m, self.range_max_m, found_m)
+        distances_m = [distance_m for distance_m in self.range_m if distance_m is not None]
+        return _describe_beyond_range(self.range_min_m, self.range_max_m, distances_m)
 
 
-def _beyond_range(min_m: float, max_m: float, found_m: list[float]) -> str:
-    slack_m = RANGE_SHARE * max_m
-    if min_m < max_m and all(min_m - slack_m <= distance_m <= max_m + slack_m for distance_m in found_m):
+def _describe_beyond_range(min_m: float, max_m: float, distances_m: list[float]) -> str:
+    """Describe distances that are beyond the range of their sensor; empty if all are within it."""
+    slack_m = RANGE_SLACK_FRACTION * max_m
+    if min_m < max_m and all(min_m - slack_m <= distance_m <= max_m + slack_m for distance_m in distances_m):
         return ""
-    found = f"{min(found_m)} to {max(found_m)} m" if found_m else "nothing"
-    return f"{found} was measured, and its range is {min_m} to {max_m} m"
+    measured = "nothing"
+    if distances_m:
+        measured = f"{min(distances_m)} to {max(distances_m)} m"
+    return f"{measured} was measured, and its range is {min_m} to {max_m} m"
 
 
 class OwnSample(MountedSample, frozen=True, kw_only=True):
@@ -359,7 +365,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
     firmware: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
 
     def has(self, mode: Mode) -> bool:
-        """Whether it may be commanded in a mode."""
+        """Return whether the joint may be commanded in a mode. It can always be passive."""
         return mode is Mode.PASSIVE or mode in self.modes
 
 
@@ -559,7 +565,13 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
 
 
 def request_to_arm(robot: Description, who: str, *, unchecked: bool = False) -> LifecycleRequest:
-    """For exactly the robot, backend, configuration and host process that are described."""
+    """Make a request to arm exactly the robot, backend, configuration and host process that are described.
+
+    Args:
+        robot: the description that the host publishes.
+        who: name of the requester, for status, log and summary.
+        unchecked: arm also a robot whose joints were not checked as they are now.
+    """
     return LifecycleRequest(
         action="arm",
         who=who,

@@ -1,6 +1,7 @@
-"""Judges a message before it is sent, as every reader will: a wrong one is its author's error, with field and value.
+"""Checks a message before it is sent, as every reader will: a wrong one is its author's error, with field and value.
 
-Without this it would be counted by its readers, far from where it was made, and its stream would stop without a word.
+Without this check, each reader would count the message as malformed, far from where it was made, and its stream would
+stop without an error.
 """
 
 import re
@@ -16,35 +17,49 @@ from snakesim_hal.wire.messages import VERSIONS, Message, OwnSample
 from snakesim_hal.wire.own_sample import OwnKind
 
 NOT_PLAIN = (TypeError, ValueError, OverflowError, RecursionError)  # what the encoder raises
-LONGEST_VALUE = 100
-STEP = re.compile(r"\.(\w+)|\[(\d+)\]")  # of the path in an error of msgspec
+MAX_VALUE_LENGTH = 100  # characters of a value that an error quotes
+# One step of the path in an error of msgspec, such as `.angle_rad` or `[3]`.
+PATH_STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
+ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 
 _decoder = cache(Decoder[Any])
 
 
 def checked(key: str, message: Message, own: OwnKind | None = None) -> bytes:
-    """The bytes of a message that readers of `key` accept. Raises WireError: field, value, and what is allowed.
+    """Encode a message, after a check that readers of its key accept it.
 
-    own: what the robot's description says of the message, if that is a sensor's own; None: its class says it.
+    Args:
+        key: where it is sent, relative to the robot's namespace.
+        message: the message.
+        own: what the robot's description says of the message of a custom sensor; None means that its class says it.
+
+    Raises:
+        WireError: readers would reject it; names field, value, and what is allowed.
     """
-    wanted = keys.message_at(key)
-    if wanted is None:
-        known = did_you_mean(key, keys.ROW_AT)
-        raise WireError("unknown_key", f"there is no such key; {known}`snakesim echo` lists them")
-    if wanted is OwnSample and isinstance(message, OwnSample):
-        wanted = type(message) if own is None else own.message
-    elif type(message) is not wanted:
-        raise WireError("unknown_message", f"a {type(message).__name__}, must be a {wanted.__name__}")
+    expected = _find_message_type(key, message, own)
     payload = packed(message)
     try:
-        _decoder(wanted).decode(payload, encoding_of(wanted))
+        _decoder(expected).decode(payload, encoding_of(expected))
     except WireError as error:
         raise WireError(error.reason, what_is_wrong(message) or error.detail) from None
     return payload
 
 
+def _find_message_type(key: str, message: Message, own: OwnKind | None) -> type[Message]:
+    """Return the type that readers of a key expect. Raises WireError if the message is of another one."""
+    expected = keys.message_at(key)
+    if expected is None:
+        known = did_you_mean(key, keys.ROW_AT)
+        raise WireError("unknown_key", f"there is no such key; {known}`snakesim echo` lists them")
+    if expected is OwnSample and isinstance(message, OwnSample):
+        return type(message) if own is None else own.message
+    if type(message) is not expected:
+        raise WireError("unknown_message", f"a {type(message).__name__}, must be a {expected.__name__}")
+    return expected
+
+
 def packed(message: Message) -> bytes:
-    """The bytes of a message, within bounds or not. Raises WireError for values that no message can carry."""
+    """Encode a message, within bounds or not. Raises WireError for values that no message can carry."""
     if type(message) not in VERSIONS and not isinstance(message, OwnSample):
         raise WireError("unknown_message", f"a {type(message).__name__} is no message")
     try:
@@ -54,21 +69,40 @@ def packed(message: Message) -> bytes:
 
 
 def what_is_wrong(message: Message, called: str = "") -> str:
-    """The first value that no reader accepts, and what is allowed; empty: none is wrong by itself."""
+    """Describe the first value that no reader accepts, and what is allowed; empty if each is right by itself.
+
+    Args:
+        message: the message.
+        called: its name in the text; empty means the name of its class.
+    """
+    name = called or type(message).__name__
     for field in msgspec.structs.fields(type(message)):
-        value, where = getattr(message, field.name), f"{called or type(message).__name__}.{field.name}"
+        value = getattr(message, field.name)
+        where = f"{name}.{field.name}"
         try:
             msgspec.msgpack.decode(encode(value), type=field.type)
-            continue
         except msgspec.ValidationError as error:
-            expected, _, place = str(error).removeprefix("Expected ").partition(" - at ")
-            for name, index in STEP.findall(place.partition("[...]")[0]):  # `[...]`: in a table, with whatever key
-                if index:
-                    value, where = value[int(index)], f"{where}[{index}]"
-                else:
-                    value = value[name] if isinstance(value, dict) else getattr(value, name)
-                    where = f"{where}.{name}"
+            expected, _, path = str(error).removeprefix("Expected ").partition(" - at ")
+            value, where = _follow_path(value, where, path)
+            return _describe_wrong_value(where, value, expected)
         except NOT_PLAIN:
-            expected = "plain Python numbers, texts and lists: use float() or .tolist()"
-        return f"{where} is {short(repr(value), LONGEST_VALUE)}, must be {expected}"
+            return _describe_wrong_value(
+                where, value, "plain Python numbers, texts and lists: use float() or .tolist()"
+            )
     return ""
+
+
+def _follow_path(value: Any, where: str, path: str) -> tuple[Any, str]:
+    """Return the inner value that a path in an error of msgspec leads to, and its name."""
+    for name, index in PATH_STEP.findall(path.partition(ANY_KEY)[0]):
+        if index:
+            value = value[int(index)]
+            where = f"{where}[{index}]"
+        else:
+            value = value[name] if isinstance(value, dict) else getattr(value, name)
+            where = f"{where}.{name}"
+    return value, where
+
+
+def _describe_wrong_value(where: str, value: object, expected: str) -> str:
+    return f"{where} is {short(repr(value), MAX_VALUE_LENGTH)}, must be {expected}"

@@ -1,8 +1,8 @@
-"""The message of a sensor of one's own: a Struct that its author writes, and the same one made from its JSON Schema.
+"""The message of a custom sensor: a Struct that its author writes, and the same one made from its JSON Schema.
 
-Whoever has the author's class uses that. Everybody else (host, recorder, console, bridges, tables) has the schema in
-`Description.own`, so that nobody runs code because a robot or a recording names it. Fields are flat: numbers, flags,
-words, texts, and lists of the first two; each with bounds, and numbers that are no counts with a unit.
+A process that has the author's class uses that. All others (host, recorder, console, bridges, tables) have the schema
+in `Description.own`, so that no process runs code because a robot or a recording names it. Fields are flat: numbers,
+flags, words, texts, and lists of the first two; each with bounds, and numbers that are no counts with a unit.
 """
 
 import math
@@ -21,39 +21,60 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Message, OwnSample
 from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_OWN_SCHEMA
 
-MOST_FIELDS, LONGEST_TEXT = 32, 200
-SHARED = frozenset(OwnSample.__struct_fields__)
+MAX_FIELDS = 32
+MAX_TEXT_LENGTH = 200  # characters of a text field, and of the description of a message
+MAX_UNIT_LENGTH = 20  # characters
+SCHEMAS_CACHED = 128  # more than a robot may have custom sensors, for programs that watch several robots
+SHARED_FIELDS = frozenset(OwnSample.__struct_fields__)
+EXAMPLE = 'Annotated[float, bounded(-1.6, 1.6, "rad")], or q.Angle, of snakesim_hal.wire.quantities'
+# What msgspec raises for a schema or a class that cannot be a message.
 UNBUILDABLE = (TypeError, ValueError, OverflowError, RecursionError)
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
+_FIELD_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
+# The bounds of a number: as JSON Schema calls them, and as msgspec does.
 _BOUNDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiveMaximum": "lt"}
 
 
 @dataclass(frozen=True)
 class OwnKind:
-    """What is known of such a message from its schema alone."""
+    """What is known of a custom message from its schema alone."""
 
     message: type[OwnSample]
-    units: dict[str, str]  # of each field that is a number or has some; "1": a count, a flag or a ratio
+    units: dict[str, str]  # unit of each numeric field; "1": a count, a flag or a ratio
     schema: str
 
     def numbers(self, sample: OwnSample) -> dict[str, float]:
-        """By field, a list as `field.0`, `field.1` ...; NaN: null. Words and texts are left out."""
-        found: dict[str, float] = {}
+        """Return the numbers of a sample by field, those of a list as `field.0`, `field.1` ...
+
+        A null becomes NaN. Words and texts are left out.
+        """
+        numbers: dict[str, float] = {}
         for name in self.units:
             value = getattr(sample, name)
             if isinstance(value, list | tuple):
-                found |= {f"{name}.{i}": _number(one) for i, one in enumerate(value)}
+                for i, entry in enumerate(value):
+                    numbers[f"{name}.{i}"] = _to_number(entry)
             else:
-                found[name] = _number(value)
-        return found
+                numbers[name] = _to_number(value)
+        return numbers
 
 
-def _number(value: float | None) -> float:
+def _to_number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
+# --- from a class to a schema, and back ------------------------------------------------------------------------
+
+
 def schema_of(message: Any, whose: str) -> str:
-    """The JSON Schema of an author's message. whose: named in the error. Raises ConfigError for what cannot be one."""
+    """Return the JSON Schema of an author's message.
+
+    Args:
+        message: the class, as the author's plugin gives it.
+        whose: name of the sensor, which errors begin with.
+
+    Raises:
+        ConfigError: it is not a class that can be a message.
+    """
     if not (isinstance(message, type) and issubclass(message, OwnSample) and message is not OwnSample):
         raise ConfigError(
             f"{whose}: `message` is {short(repr(message))}, must be a class derived from OwnSample of "
@@ -61,7 +82,7 @@ def schema_of(message: Any, whose: str) -> str:
         )
     try:
         schema = msgspec.json.schema(message)["$defs"][message.__name__]
-        schema["description"] = cleandoc(schema.get("description", ""))[:LONGEST_TEXT]
+        schema["description"] = cleandoc(schema.get("description", ""))[:MAX_TEXT_LENGTH]
         text = msgspec.json.encode(schema).decode()
         own_kind(text)
     except WireError as error:
@@ -71,80 +92,122 @@ def schema_of(message: Any, whose: str) -> str:
     return text
 
 
-@lru_cache(128)
+@lru_cache(SCHEMAS_CACHED)
 def own_kind(schema: str) -> OwnKind:
-    """The message that a schema describes. Raises WireError, whose detail begins with the field."""
+    """Make the message that a schema describes.
+
+    Raises:
+        WireError: the schema is of no use; the error's detail begins with the field.
+    """
     if len(schema) > MAX_OWN_SCHEMA:
         raise WireError("malformed", f" has a schema of {len(schema)} characters, at most {MAX_OWN_SCHEMA}")
     try:
-        about = msgspec.json.decode(schema, type=dict[str, Any])
-        fields = {name: one for name, one in about["properties"].items() if name not in SHARED}
-        if not 0 < len(fields) <= MOST_FIELDS or not str(about["title"]).isidentifier():
-            raise WireError("malformed", f" has {len(fields)} fields of its own, must have 1 to {MOST_FIELDS}")
-        made: list[Any] = []
-        units: dict[str, str] = {}
-        for name, one in fields.items():
-            if not _NAME.fullmatch(name) or hasattr(OwnSample, name):
-                raise WireError("malformed", f".{short(name)} is no name of a field: lower case, at most 40 characters")
-            kind = _type(one, f".{name}", units, name)
-            made.append((name, kind) if name in about.get("required", ()) else (name, kind | None, None))
-        message: Any = msgspec.defstruct(about["title"], made, bases=(OwnSample,), frozen=True, kw_only=True)
-        msgspec.msgpack.Decoder(message)  # refuses bounds that it cannot check
+        return _make_kind(schema)
+    except WireError:
+        raise
     except (*UNBUILDABLE, KeyError, AttributeError, msgspec.DecodeError) as error:
-        if isinstance(error, WireError):
-            raise
         raise WireError("malformed", f" has a schema that cannot be used: {short(str(error))}") from None
+
+
+def _make_kind(schema: str) -> OwnKind:
+    """Make the message of a schema. Raises any of UNBUILDABLE and more for a schema that is not one of a message."""
+    content = msgspec.json.decode(schema, type=dict[str, Any])
+    fields = {name: field for name, field in content["properties"].items() if name not in SHARED_FIELDS}
+    if not 0 < len(fields) <= MAX_FIELDS or not str(content["title"]).isidentifier():
+        raise WireError("malformed", f" has {len(fields)} fields of its own, must have 1 to {MAX_FIELDS}")
+    required = content.get("required", ())
+    definitions: list[Any] = []  # as `msgspec.defstruct` wants them
+    units: dict[str, str] = {}
+    for name, field in fields.items():
+        if not _FIELD_NAME.fullmatch(name) or hasattr(OwnSample, name):
+            raise WireError("malformed", f".{short(name)} is no name of a field: lower case, at most 40 characters")
+        field_type = _make_type(field, name, units)
+        if name in required:
+            definitions.append((name, field_type))
+        else:
+            definitions.append((name, field_type | None, None))
+    message: Any = msgspec.defstruct(content["title"], definitions, bases=(OwnSample,), frozen=True, kw_only=True)
+    msgspec.msgpack.Decoder(message)  # refuses bounds that it cannot check
     return OwnKind(message, units, schema)
 
 
-def _type(about: dict[str, Any], where: str, units: dict[str, str], name: str, *, inside: bool = False) -> Any:
-    """The type of a field. Notes its unit."""
-    match about:
+def _make_type(field: dict[str, Any], name: str, units: dict[str, str], *, in_list: bool = False) -> Any:
+    """Return the Python type of a field.
+
+    Args:
+        field: the schema of the field, or of the entries of a list.
+        name: name of the field.
+        units: gets the unit of a numeric field, by its name.
+        in_list: whether `field` describes the entries of a list.
+
+    Raises:
+        WireError: the type is not allowed.
+    """
+    match field:
         case {"anyOf": [inner, {"type": "null"}]}:
-            return _type(inner, where, units, name, inside=inside) | None
+            return _make_type(inner, name, units, in_list=in_list) | None
         case {"type": "number" | "integer"}:
-            bounds = {ours: about[theirs] for theirs, ours in _BOUNDS.items() if theirs in about}
-            if len(bounds) != 2 or not bounds.keys() & {"ge", "gt"}:
-                raise WireError("malformed", f"{where} has no bounds on both sides; give it a type such as {EXAMPLE}")
-            if about["type"] == "number" and not isinstance(about.get("unit"), str):
-                raise WireError("malformed", f'{where} has no unit ("1" for a ratio); give it a type such as {EXAMPLE}')
-            units[name] = about.get("unit", "1")[:20]
-            plain = float if about["type"] == "number" else int
-            return Annotated[plain, Meta(**bounds)]
+            return _make_number_type(field, name, units)
         case {"type": "boolean"}:
             units[name] = "1"
             return bool
-        case {"type": "array", "items": {} as each, "maxItems": int(most)} if not inside and most <= MAX_BEAMS:
-            return Annotated[list[_type(each, where, units, name, inside=True)], Meta(max_length=most)]
-        case {"type": "array", "prefixItems": [*each]} if not inside and 0 < len(each) <= MAX_BEAMS:
-            return tuple[tuple(_type(one, where, units, name, inside=True) for one in each)]
-        case {"type": "string", "maxLength": int(most)} if not inside:
-            return Annotated[str, Meta(max_length=min(most, LONGEST_TEXT))]
-        case {"enum": [*words]} if not inside and all(isinstance(word, str) for word in words):
+        case {"type": "array", "items": {} as entry, "maxItems": int(max_length)} if (
+            not in_list and max_length <= MAX_BEAMS
+        ):
+            entry_type: Any = _make_type(entry, name, units, in_list=True)
+            return Annotated[list[entry_type], Meta(max_length=max_length)]
+        case {"type": "array", "prefixItems": [*entries]} if not in_list and 0 < len(entries) <= MAX_BEAMS:
+            entry_types = [_make_type(entry, name, units, in_list=True) for entry in entries]
+            return tuple[tuple(entry_types)]
+        case {"type": "string", "maxLength": int(max_length)} if not in_list:
+            return Annotated[str, Meta(max_length=min(max_length, MAX_TEXT_LENGTH))]
+        case {"enum": [*words]} if not in_list and all(isinstance(word, str) for word in words):
             return Literal[tuple(words)]
         case _:
             raise WireError(
                 "malformed",
-                f"{where} is none of: a number, a flag, a list of either or a text with `max_length`, a Literal",
+                f".{name} is none of: a number, a flag, a list of either or a text with `max_length`, a Literal",
             )
 
 
-EXAMPLE = 'Annotated[float, bounded(-1.6, 1.6, "rad")], or q.Angle, of snakesim_hal.wire.quantities'
+def _make_number_type(field: dict[str, Any], name: str, units: dict[str, str]) -> Any:
+    """Return the type of a number with its bounds, and add its unit to `units`."""
+    bounds = {msgspec_name: field[json_name] for json_name, msgspec_name in _BOUNDS.items() if json_name in field}
+    if len(bounds) != 2 or not bounds.keys() & {"ge", "gt"}:
+        raise WireError("malformed", f".{name} has no bounds on both sides; give it a type such as {EXAMPLE}")
+    is_float = field["type"] == "number"
+    if is_float and not isinstance(field.get("unit"), str):
+        raise WireError("malformed", f'.{name} has no unit ("1" for a ratio); give it a type such as {EXAMPLE}')
+    units[name] = field.get("unit", "1")[:MAX_UNIT_LENGTH]
+    plain = float if is_float else int
+    return Annotated[plain, Meta(**bounds)]
+
+
+# --- of a robot ------------------------------------------------------------------------------------------------
 
 
 def own_kind_at(key: str, robot: Description) -> OwnKind | None:
-    """The message of a robot's own sensor; None: there is none at this key, or its schema is of no use."""
+    """Return the message of a robot's custom sensor; None if this key has none, or its schema is of no use."""
+    if key not in robot.own:
+        return None
     with suppress(WireError):
-        return own_kind(robot.own[key]) if key in robot.own else None
+        return own_kind(robot.own[key])
     return None
 
 
 def own_kinds(robot: Description) -> dict[str, OwnKind]:
-    """All of them, by key."""
-    return {key: kind for key in robot.own if (kind := own_kind_at(key, robot)) is not None}
+    """Return the messages of all custom sensors of a robot, by key."""
+    kinds: dict[str, OwnKind] = {}
+    for key in robot.own:
+        kind = own_kind_at(key, robot)
+        if kind is not None:
+            kinds[key] = kind
+    return kinds
 
 
 def message_of(key: str, robot: Description | None) -> type[Message] | None:
-    """The message at a key: as the robot describes it, else that of the key space, as far as it is known."""
-    own = None if robot is None else own_kind_at(key, robot)
-    return keys.message_at(key) if own is None else own.message
+    """Return the message at a key: as the robot describes it if it is known, else that of the key space."""
+    kind = None if robot is None else own_kind_at(key, robot)
+    if kind is None:
+        return keys.message_at(key)
+    return kind.message

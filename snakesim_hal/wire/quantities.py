@@ -11,37 +11,44 @@ from msgspec import Meta
 MAX_COUNT = 2**62
 MAX_JOINTS = 256
 MAX_CONTACTS = 512
-MAX_IMAGE_WIDTH, MAX_IMAGE_HEIGHT = 1280, 960
+MAX_IMAGE_WIDTH = 1280
+MAX_IMAGE_HEIGHT = 960
 MAX_PIXELS = MAX_IMAGE_WIDTH * MAX_IMAGE_HEIGHT
 MAX_BEAMS = 4096
-MAX_SETTINGS, MAX_SCHEMA = 8192, 65536  # characters
-MAX_OWN_SENSORS, MAX_OWN_SCHEMA = 16, 8192  # of sensors with a message of their own; characters
+MAX_SETTINGS = 8192  # characters
+MAX_SCHEMA = 65536  # characters
+MAX_OWN_SENSORS = 16  # sensors with a message of their own
+MAX_OWN_SCHEMA = 8192  # characters of the schema of each
 MAX_PREVIEW_BYTES = 128 * 1024
 MAX_TARGET = 1e5  # of a setpoint or a torque limit, in the unit of its mode
 
 
 def bounded(low: float, high: float, unit: str) -> Meta:
-    """Of a number with a unit."""
-    return Meta(ge=_same(low), le=_same(high), extra_json_schema={"unit": unit})
+    """Return the bounds of a number with a unit: from `low` to `high`."""
+    return Meta(ge=_normalize(low), le=_normalize(high), extra_json_schema={"unit": unit})
 
 
 def above(high: float, unit: str) -> Meta:
-    """For a setting: more than zero, at most `high`."""
-    return Meta(gt=0, le=_same(high), extra_json_schema={"unit": unit})
+    """Return the bounds of a setting with a unit: more than zero, at most `high`."""
+    return Meta(gt=0, le=_normalize(high), extra_json_schema={"unit": unit})
 
 
 def from_zero(high: float, unit: str) -> Meta:
-    """For a setting: from zero to `high`."""
-    return Meta(ge=0, le=_same(high), extra_json_schema={"unit": unit})
+    """Return the bounds of a setting with a unit: from zero to `high`."""
+    return Meta(ge=0, le=_normalize(high), extra_json_schema={"unit": unit})
 
 
-def _same(number: float) -> float:
-    """2 and 2.0 as one: types that are equal are made once, by whoever is imported first, and schemas show which."""
+def _normalize(number: float) -> float:
+    """Return a whole number as `int`.
+
+    Python keeps one of two equal types such as `Annotated[float, ge=2]` and `Annotated[float, ge=2.0]`: that of the
+    module imported first. So the schemas would depend on the order of imports.
+    """
     return int(number) if number == int(number) else number
 
 
 def about(text: str) -> Meta:
-    """The meaning of a field, for readers of the schema."""
+    """Return the meaning of a field, for readers of the schema."""
     return Meta(description=text)
 
 

@@ -1,4 +1,4 @@
-"""Who may do what at which key. The one table from which the access rules of routers and `schemas/roles.md` are made.
+"""The roles at each key: the one table from which the access rules of routers and `schemas/roles.md` are made.
 
 A role belongs to one robot: the operator of one robot has no rights on another. Reading is open to every role of the
 robot, because nothing on its keys is a secret; whatever moves, stops or describes the robot has a named writer. What
@@ -34,7 +34,8 @@ ABOUT: dict[Role, str] = {
 }
 
 _PERSONS = (Role.OPERATOR, Role.ADMINISTRATOR)
-# By the writer that the key space names. A writer that is missing here may write nothing, and a test fails.
+# The roles that publish, by the writer that the key space names. A writer that is missing here may write nothing, and
+# a test fails.
 _WRITERS: dict[str, tuple[Role, ...]] = {
     "HAL": (Role.ROBOT,),
     "preview": (Role.ROBOT,),
@@ -46,6 +47,7 @@ _WRITERS: dict[str, tuple[Role, ...]] = {
     "each process": (Role.ROBOT, Role.GNC, Role.RECORDER),
     "operator": _PERSONS,
 }
+# The roles that may send a query, by its key.
 _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.LEASE: (Role.GNC,),
     keys.LIFECYCLE: _PERSONS,
@@ -54,17 +56,18 @@ _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.FAULT_ALL: (Role.ADMINISTRATOR,),
     keys.SETTINGS: _PERSONS,
 }
+# The roles that answer a query, by its key. All other queries are answered by the robot alone.
 _ANSWERERS: dict[str, tuple[Role, ...]] = {
     keys.FAULT_ALL: (Role.ROBOT, Role.GNC),
     keys.SETTINGS: (Role.GNC,),
-}  # the others: the robot alone
-_NAMED = {keys.PROCESS_ALL: "-$*"}  # what follows the name of a service or a process at a key, if anything
+}
+# What follows the name of a service or a process at a key, if anything: here the process's random id.
+_SUFFIX_OF_NAME = {keys.PROCESS_ALL: "-$*"}
 _WITH_TOKEN = (keys.PROCESS_ALL,)  # keys of samples that have a liveliness token, too
 RECORDER = "recorder"  # the name of its process
 INJECTION = (keys.FAULT_ALL,)  # granted only for a robot whose lab file allows it
-
-
-OWN_NAME_ONLY = ("publish", "declare", "answer")  # at `*`, for a gnc and a recorder
+# What a gnc and a recorder may do only under their own names, at keys that end with `*`.
+OWN_NAME_ONLY = ("publish", "declare", "answer")
 
 
 class Permission(NamedTuple):
@@ -77,20 +80,38 @@ class Permission(NamedTuple):
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table."""
+    """What the roles may do at one key of the key space."""
 
     key: str
     kind: str  # stream, latched, query, liveliness
-    writers: tuple[Role, ...]  # publish; of a query: ask; of liveliness: declare the token
-    answerers: tuple[Role, ...]  # of a query
+    writers: tuple[Role, ...]  # they publish, send the query, or declare the token
+    answerers: tuple[Role, ...]  # they answer the query; empty for other kinds
 
     def acts(self, role: Role) -> tuple[str, ...]:
-        """What a role may do here, in words: publish, read, ask, answer, declare, watch."""
-        if self.kind == "query":
-            return ("ask",) * (role in self.writers) + ("answer",) * (role in self.answerers)
-        write = ("publish",) * (self.kind != "liveliness") + ("declare",) * self.has_token
-        read = ("read",) * (self.kind != "liveliness") + ("watch",) * self.has_token
-        return (*write, *read) if role in self.writers else read
+        """Return what a role may do here, in words: publish, read, ask, answer, declare, watch."""
+        match self.kind:
+            case "query":
+                return self._query_acts(role)
+            case "liveliness":
+                write_acts = ["declare"]
+                read_acts = ["watch"]
+            case _:
+                write_acts = ["publish"]
+                read_acts = ["read"]
+                if self.has_token:
+                    write_acts.append("declare")
+                    read_acts.append("watch")
+        if role in self.writers:
+            return (*write_acts, *read_acts)
+        return tuple(read_acts)
+
+    def _query_acts(self, role: Role) -> tuple[str, ...]:
+        acts: list[str] = []
+        if role in self.writers:
+            acts.append("ask")
+        if role in self.answerers:
+            acts.append("answer")
+        return tuple(acts)
 
     @property
     def has_token(self) -> bool:
@@ -98,13 +119,15 @@ class Line:
         return self.kind == "liveliness" or self.key in _WITH_TOKEN
 
 
-def _line(row: keys.Row) -> Line:
+def _make_line(row: keys.Row) -> Line:
     if row.kind == "query":
-        return Line(row.key, row.kind, _ASKERS.get(row.key, ()), _ANSWERERS.get(row.key, (Role.ROBOT,)))
-    return Line(row.key, row.kind, _WRITERS.get(row.writer, ()), ())
+        writers = _ASKERS.get(row.key, ())
+        answerers = _ANSWERERS.get(row.key, (Role.ROBOT,))
+        return Line(row.key, row.kind, writers, answerers)
+    return Line(row.key, row.kind, _WRITERS.get(row.writer, ()), answerers=())
 
 
-TABLE: tuple[Line, ...] = tuple(_line(row) for row in keys.SPACE)
+TABLE: tuple[Line, ...] = tuple(_make_line(row) for row in keys.SPACE)
 
 _CACHE = "/@adv/**"  # where a latched key keeps its last value, and has the token of its publisher
 # Zenoh's messages for each act, as (flow, message, what follows the key).
@@ -120,7 +143,8 @@ MESSAGES: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("egress", "liveliness_token", ""),
     ),
 }
-# Of a latched key in addition. The cache is asked at its own key, and answers at that of the value.
+# Further messages for each act at a latched key. A process queries the cache at the cache's own key, and the cache
+# replies at the key of the value.
 MESSAGES_OF_LATCHED: dict[str, tuple[tuple[str, str, str], ...]] = {
     "publish": (
         ("ingress", "declare_queryable", _CACHE),
@@ -140,24 +164,52 @@ MESSAGES_OF_LATCHED: dict[str, tuple[tuple[str, str, str], ...]] = {
 
 
 def permissions(role: Role, services: Iterable[str] = (), *, faults: bool = False) -> Iterator[Permission]:
-    """Everything that a router lets pass for a role of a robot.
+    """Yield everything that a router lets pass for a role of a robot.
 
-    services: of a `gnc`, the names that it may take in `alive/*`, `hal/done/*`, `process/*` and `fault/*`.
-    faults: whether faults may be injected into the robot.
+    Args:
+        role: the role.
+        services: for a `gnc`, the names that it may take in `alive/*`, `hal/done/*`, `process/*` and `fault/*`.
+        faults: whether faults may be injected into the robot.
     """
-    names = {Role.GNC: list(services), Role.RECORDER: [RECORDER]}.get(role)
-    # A pattern may be wider than one key: what then is delivered is decided key by key.
+    names = _own_names(role, services)
+    # A pattern may be wider than one key: which samples pass is decided key by key.
     yield Permission("ingress", "declare_subscriber", "**")
     for line in TABLE:
         if line.key in INJECTION and not faults:
             continue
         for act in line.acts(role):
             places = [line.key]
-            if names is not None and line.key.endswith("/*") and act in OWN_NAME_ONLY:
-                places = [line.key[:-1] + name + _NAMED.get(line.key, "") for name in names]
-            more = MESSAGES_OF_LATCHED.get(act, ()) if line.kind == "latched" else ()
-            for flow, message, after in (*MESSAGES[act], *more):
+            if names is not None and act in OWN_NAME_ONLY:
+                places = _places_of_names(line.key, names)
+            for flow, message, suffix in _messages_of_act(line, act):
                 for place in places:
-                    yield Permission(flow, message, place + after)
-            if act == "publish":  # of what it writes, a process hears who subscribes to it
+                    yield Permission(flow, message, place + suffix)
+            if act == "publish":
+                # The router sends a publisher the subscriptions to its keys.
                 yield Permission("egress", "declare_subscriber", "**")
+
+
+def _own_names(role: Role, services: Iterable[str]) -> list[str] | None:
+    """Return the only names under which a role may act; None for a role that may act under any name."""
+    match role:
+        case Role.GNC:
+            return list(services)
+        case Role.RECORDER:
+            return [RECORDER]
+        case _:
+            return None
+
+
+def _places_of_names(key: str, names: list[str]) -> list[str]:
+    """Return the keys that a pattern stands for with each of some names; a key that is no pattern as it is."""
+    if not key.endswith("/*"):
+        return [key]
+    suffix = _SUFFIX_OF_NAME.get(key, "")
+    return [key[:-1] + name + suffix for name in names]
+
+
+def _messages_of_act(line: Line, act: str) -> tuple[tuple[str, str, str], ...]:
+    """Return Zenoh's messages for an act at a key, as in MESSAGES."""
+    if line.kind == "latched":
+        return (*MESSAGES[act], *MESSAGES_OF_LATCHED.get(act, ()))
+    return MESSAGES[act]

@@ -4,13 +4,15 @@ from typing import Any
 
 import numpy as np
 
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
 from snakesim_hal.safety.lease import Lease
-from snakesim_hal.safety.limiter import Applied, JointLimits, Measured, bumpless_target, limit, why_limited
+from snakesim_hal.safety.limit_names import name_active_limits
+from snakesim_hal.safety.limiter import bumpless_target, limit_command
 from snakesim_hal.wire.messages import JointCommand, Mode
 from tests.unit.hal.rig import description
 
 ROBOT = description()
-LIMITS = JointLimits.of(ROBOT)
+LIMITS = JointLimits.from_description(ROBOT)
 JOINTS = len(ROBOT.joints)
 COOL = np.ones(JOINTS)
 LEASE = Lease("control", 1, 100, 1000)
@@ -35,12 +37,12 @@ def before(mode: Mode, target: float = 0.0) -> Applied:
     return Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), LIMITS.torque_nm)
 
 
-def limited(asked: JointCommand, measured: Measured, last: Applied, share: Any = COOL) -> Applied:
-    return limit(asked, measured=measured, last=last, limits=LIMITS, share=share)
+def limited(asked: JointCommand, measured: Measured, last: Applied, torque_fraction: Any = COOL) -> Applied:
+    return limit_command(asked, measured=measured, last=last, limits=LIMITS, torque_fraction=torque_fraction)
 
 
-def words(asked: JointCommand, applied: Applied, measured: Measured, share: Any = COOL) -> dict[int, str]:
-    return why_limited(asked, applied, measured=measured, limits=LIMITS, share=share)
+def words(asked: JointCommand, applied: Applied, measured: Measured, torque_fraction: Any = COOL) -> dict[int, str]:
+    return name_active_limits(asked, applied, measured=measured, limits=LIMITS, torque_fraction=torque_fraction)
 
 
 def applied_for(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.lifecycle import far_targets
+from snakesim_hal.safety.lifecycle import find_far_targets
 from tests.unit.hal.rig import command, description
 
 ROBOT = description()
@@ -14,13 +14,13 @@ NONE = np.zeros(len(ROBOT.joints), dtype=np.bool_)
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_target_may_be_a_whole_step_away_and_no_further(side: float) -> None:
     here = np.zeros(len(ROBOT.joints))
-    assert far_targets(command(ROBOT, side * MAX), here, ROBOT, NONE) == []
+    assert find_far_targets(command(ROBOT, side * MAX), here, ROBOT, NONE) == []
     further = np.nextafter(MAX, np.inf)
-    assert len(far_targets(command(ROBOT, side * further), here, ROBOT, NONE)) == len(ROBOT.joints)
+    assert len(find_far_targets(command(ROBOT, side * further), here, ROBOT, NONE)) == len(ROBOT.joints)
 
 
 def test_a_joint_that_is_set_aside_may_be_anywhere() -> None:
     here, aside = np.zeros(len(ROBOT.joints)), NONE.copy()
     aside[1] = True
-    reported = far_targets(command(ROBOT, 2 * MAX), here, ROBOT, aside)
+    reported = find_far_targets(command(ROBOT, 2 * MAX), here, ROBOT, aside)
     assert [words.partition(" ")[0] for words in reported] == ["joint_1", "joint_3"]

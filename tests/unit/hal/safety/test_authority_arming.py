@@ -170,7 +170,7 @@ def test_arming_needs_commands_that_still_come() -> None:
 @pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
 def test_arming_is_refused_to_a_stream_that_moves(mode: Mode) -> None:
     rig = commanded([0.1, 0.0, 0.1], [Mode.POSITION, mode, Mode.PASSIVE])
-    reason = f"joint_2 is commanded in mode {mode.name.lower()}; it must hold its position at arm_session"
+    reason = f"joint_2 is commanded in mode {mode.name.lower()}; it must hold its position at arming"
     assert rig.arm().reason == reason and rig.authority.state == "disarmed"
 
 

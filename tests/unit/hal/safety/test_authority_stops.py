@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority
-from snakesim_hal.safety.derating import FIELD
+from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointCommand, LifecycleState, Mode, SensorDescription
@@ -297,7 +297,7 @@ def test_a_weak_supply_stands_against_arming_once_with_the_field_to_change() -> 
     rig.acquire()
     rig.tick_with(0.1)
     answer = rig.arm()
-    assert answer.refusal == "not_ready" and answer.reason.count("12.0 V") == 1 and FIELD in answer.reason
+    assert answer.refusal == "not_ready" and answer.reason.count("12.0 V") == 1 and MIN_VOLTAGE_FIELD in answer.reason
 
 
 def test_time_may_stand_still_until_a_robot_is_armed_so_no_report_is_awaited() -> None:

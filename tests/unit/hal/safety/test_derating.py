@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.derating import FIELD, KNOWN_FOR_NS, Derating
+from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD, REPORT_TIMEOUT_NS, Derating
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
 from tests.unit.hal.rig import description, power
@@ -29,28 +29,28 @@ class Bench:
     def receive(self, *values: Any, after_ns: int = 500 * MS, **other: Any) -> list[Fault]:
         """A sample, and what is newly wrong."""
         self.now_ns += after_ns
-        self.derating.take(power(*values, **other), self.now_ns)
+        self.derating.update(power(*values, **other), self.now_ns)
         return self.look(0)
 
     def look(self, after_ns: int) -> list[Fault]:
         self.now_ns += after_ns
-        wrong, note = self.derating.look(self.now_ns, 3)
+        wrong, note = self.derating.evaluate(self.now_ns, 3)
         self.notes += [] if note is None else [note]
         return wrong
 
     @property
     def against_arming(self) -> list[str]:
-        return self.derating.against_arming(self.now_ns)
+        return self.derating.find_supply_problems(self.now_ns)
 
     @property
     def shares(self) -> list[float]:
-        return self.derating.share.tolist()
+        return self.derating.torque_fraction.tolist()
 
 
 def test_nothing_is_derated_before_anything_is_known() -> None:
     bench = Bench()
-    assert bench.shares == [1.0] * JOINTS and bench.derating.wrong == []
-    assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated() == {}
+    assert bench.shares == [1.0] * JOINTS and bench.derating.present_faults == []
+    assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated_joints() == {}
 
 
 def test_a_joint_that_measures_neither_heat_nor_voltage_is_stopped_by_neither() -> None:
@@ -69,7 +69,7 @@ def test_torque_fades_linearly(celsius: float, share: float) -> None:
     bench = Bench()
     bench.receive([20.0, celsius, 20.0])
     assert bench.shares == pytest.approx([1.0, share, 1.0])
-    assert bench.derating.derated() == ({} if share == 1.0 else {"joint_2": pytest.approx(share)})
+    assert bench.derating.derated_joints() == ({} if share == 1.0 else {"joint_2": pytest.approx(share)})
 
 
 def test_the_robot_file_says_from_where_to_where() -> None:
@@ -84,16 +84,16 @@ def test_a_winding_that_is_too_hot_stops_the_robot_until_it_has_cooled() -> None
     (fault,) = bench.receive([20.0, 105.0, 20.0])
     assert (fault.what, fault.joint, fault.tick) == ("overheated", "joint_2", 3)
     assert fault.cause == ("the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C")
-    assert bench.receive([20.0, 104.0, 20.0]) == [] and len(bench.derating.wrong) == 1  # told once, and not over
-    assert bench.receive([20.0, 80.0, 20.0]) == [] and len(bench.derating.wrong) == 1
-    assert bench.receive([20.0, 79.9, 20.0]) == [] and bench.derating.wrong == []
+    assert bench.receive([20.0, 104.0, 20.0]) == [] and len(bench.derating.present_faults) == 1
+    assert bench.receive([20.0, 80.0, 20.0]) == [] and len(bench.derating.present_faults) == 1
+    assert bench.receive([20.0, 79.9, 20.0]) == [] and bench.derating.present_faults == []
     assert len(bench.receive([20.0, 110.0, 20.0])) == 1
 
 
 def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:
     bench = Bench()
     bench.receive([20.0, 110.0, 20.0])
-    assert bench.look(10 * S) == [] and [fault.what for fault in bench.derating.wrong] == ["overheated"]
+    assert bench.look(10 * S) == [] and [fault.what for fault in bench.derating.present_faults] == ["overheated"]
     assert bench.shares == [1.0] * JOINTS
 
 
@@ -101,7 +101,7 @@ def test_water_stops_the_robot() -> None:
     bench = Bench()
     (fault,) = bench.receive(leak=[False, False, True])
     assert (fault.what, fault.joint, fault.cause) == ("leak", "joint_3", "joint_3 reports water inside")
-    assert bench.receive() == [] and bench.derating.wrong == []
+    assert bench.receive() == [] and bench.derating.present_faults == []
 
 
 def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
@@ -110,9 +110,9 @@ def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     assert bench.look(50 * MS - 1) == []
     (fault,) = bench.look(1)
     assert (fault.what, fault.joint) == ("undervoltage", "joint_2")
-    assert fault.cause == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {FIELD}"
-    assert bench.look(1) == [] and len(bench.derating.wrong) == 1
-    assert bench.receive() == [] and bench.derating.wrong == []
+    assert fault.cause == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {MIN_VOLTAGE_FIELD}"
+    assert bench.look(1) == [] and len(bench.derating.present_faults) == 1
+    assert bench.receive() == [] and bench.derating.present_faults == []
 
 
 WAY_OUT = "check the supply, or set `min_voltage_v` under [limits] in the robot file of 'worm'"
@@ -124,7 +124,7 @@ def test_a_weak_supply_keeps_the_robot_from_arming_at_once() -> None:
     assert bench.against_arming == [f"the supply is at 17.9 V at joint_2, which needs 18 V: {WAY_OUT}"]
     bench.receive(voltage_v=[12.5, 17.9, 12.0])
     assert bench.against_arming == [f"the supply is at 12.0 V at joint_3, which needs 18 V, and 2 more: {WAY_OUT}"]
-    bench.look(KNOWN_FOR_NS)
+    bench.look(REPORT_TIMEOUT_NS)
     assert bench.against_arming != []
     bench.look(1)
     assert bench.against_arming == []  # what it was that long ago is not known to be so still
@@ -138,7 +138,7 @@ def test_a_robot_is_not_armed_before_its_supply_is_known() -> None:
     assert bench.against_arming == ["joint_1 has not reported its supply yet, and 2 more"]
     bench.receive(valid=[True, False, True])
     assert bench.against_arming == ["joint_2 has not reported its supply yet"]
-    bench.look(KNOWN_FOR_NS)
+    bench.look(REPORT_TIMEOUT_NS)
     assert bench.against_arming == ["joint_2 has not reported its supply yet"]
     bench.look(1)
     assert bench.against_arming == [] and bench.notes != []  # it is noted, and ignored from now on
@@ -193,9 +193,9 @@ def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(reported:
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert len(bench.derating.wrong) == JOINTS
+    assert len(bench.derating.present_faults) == JOINTS
     bench.look(3 * S)
-    assert bench.derating.wrong == []
+    assert bench.derating.present_faults == []
 
 
 def test_a_sensor_that_never_says_anything_is_told_where_there_should_be_one() -> None:
@@ -230,4 +230,4 @@ def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(reported: dict[st
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert [fault.reach for fault in bench.derating.wrong] == [reach] * JOINTS
+    assert [fault.reach for fault in bench.derating.present_faults] == [reach] * JOINTS

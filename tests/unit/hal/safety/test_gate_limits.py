@@ -9,15 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
+from snakesim_hal.safety.limit_names import name_active_limits
 from snakesim_hal.safety.limiter import (
-    Applied,
-    JointLimits,
-    Measured,
-    bounds_at_ends,
     bumpless_target,
-    limit,
+    limit_command,
     stoppable_speed,
-    why_limited,
+    torque_bounds_at_ends,
+    velocity_bounds_at_ends,
 )
 from snakesim_hal.wire.messages import JointCommand, Mode
 from tests.unit.hal.rig import command, description
@@ -41,7 +40,9 @@ from tests.unit.hal.safety.gate_rig import (
 
 def ends(mode: Mode, measured: Measured, i: int) -> tuple[float, float]:
     angle, velocity = float(measured.angle_rad[i]), float(measured.velocity_rad_s[i])
-    return bounds_at_ends(ROBOT.joints[i], mode, angle, velocity, LIMITS.period_s)
+    if mode is Mode.VELOCITY:
+        return velocity_bounds_at_ends(ROBOT.joints[i], angle, LIMITS.period_s)
+    return torque_bounds_at_ends(ROBOT.joints[i], angle, velocity, LIMITS.period_s)
 
 
 def at_a_bound(target: float, most: float, low: float, high: float) -> bool:
@@ -256,9 +257,9 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
     assert bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
-    soft = JointLimits.of(msgspec.structs.replace(ROBOT, joints=joints))
+    soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
     measured, last = every(torque=4.0), before(Mode.PASSIVE)
-    applied = limit(command(ROBOT, 0.0), measured=measured, last=last, limits=soft, share=COOL)
+    applied = limit_command(command(ROBOT, 0.0), measured=measured, last=last, limits=soft, torque_fraction=COOL)
     assert np.abs(applied.target).max() <= 0.3
 
 
@@ -313,13 +314,13 @@ def test_a_joint_that_comes_too_fast_is_braked_in_torque_mode(side: int) -> None
 
 def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
-    low, high = bounds_at_ends(weak, Mode.TORQUE, 0.0, 0.0, 0.01)
+    low, high = torque_bounds_at_ends(weak, 0.0, 0.0, 0.01)
     assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01)) and high > 4.0
     slow = msgspec.structs.replace(weak, speed_limit_rad_s=0.5)
-    low, high = bounds_at_ends(slow, Mode.TORQUE, 0.0, 0.0, 0.01)
+    low, high = torque_bounds_at_ends(slow, 0.0, 0.0, 0.01)
     assert high == -low == pytest.approx(4.0 / 0.5 * stoppable_speed(1.5, 100.0, 0.01))
     still = msgspec.structs.replace(weak, speed_limit_rad_s=0.0)
-    low, high = bounds_at_ends(still, Mode.TORQUE, 0.0, 0.0, 0.01)
+    low, high = torque_bounds_at_ends(still, 0.0, 0.0, 0.01)
     assert high == -low > 4.0
 
 
@@ -328,6 +329,13 @@ def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
     applied = limited(asked, every(1.45), before(Mode.VELOCITY, 5.0))
     assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
     assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
+
+
+def test_a_torque_far_from_the_ends_is_not_named_by_them() -> None:
+    asked = command(ROBOT, 5.0, Mode.TORQUE)
+    measured = every(0.0, 1.45)
+    applied = limited(asked, measured, before(Mode.TORQUE, 4.0))
+    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
 
 
 BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
@@ -348,8 +356,10 @@ def test_the_tightest_limit_is_the_one_that_is_named(
     side: int, angle: float, wanted: float, speed_limit: float, word: str
 ) -> None:
     robot = description(limits__speed_rad_s=speed_limit)
-    asked, limits = command(robot, side * wanted, Mode.VELOCITY), JointLimits.of(robot)
-    named = why_limited(asked, before(Mode.VELOCITY), measured=every(side * angle), limits=limits, share=COOL)
+    asked, limits = command(robot, side * wanted, Mode.VELOCITY), JointLimits.from_description(robot)
+    named = name_active_limits(
+        asked, before(Mode.VELOCITY), measured=every(side * angle), limits=limits, torque_fraction=COOL
+    )
     assert named == dict.fromkeys(range(JOINTS), word)
 
 
@@ -357,8 +367,8 @@ def test_the_tightest_limit_is_the_one_that_is_named(
 def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float) -> None:
     """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
     joint = ROBOT.joints[0]
-    _, most = bounds_at_ends(joint, Mode.TORQUE, joint.angle_max_rad, velocity, 0.01)
-    least, _ = bounds_at_ends(joint, Mode.TORQUE, joint.angle_min_rad, velocity, 0.01)
+    _, most = torque_bounds_at_ends(joint, joint.angle_max_rad, velocity, 0.01)
+    least, _ = torque_bounds_at_ends(joint, joint.angle_min_rad, velocity, 0.01)
     assert most == (0.0 if velocity <= 0.0 else -velocity)  # gain 1 N·m·s/rad
     assert least == (0.0 if velocity >= 0.0 else -velocity)
 
@@ -366,5 +376,5 @@ def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float)
 def test_a_range_without_width_leaves_no_torque() -> None:
     stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
     for velocity in (-3.0, 0.0, 3.0):
-        low, high = bounds_at_ends(stuck, Mode.TORQUE, 0.0, velocity, 0.01)
+        low, high = torque_bounds_at_ends(stuck, 0.0, velocity, 0.01)
         assert low <= 0.0 >= high and low <= high

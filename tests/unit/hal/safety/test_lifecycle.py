@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 
-from snakesim_hal.safety.lifecycle import Event, after
+from snakesim_hal.safety.lifecycle import Event, next_state
 from snakesim_hal.wire.messages import LifecycleState
 
 STATES, EVENTS = get_args(LifecycleState), get_args(Event)
@@ -19,4 +19,4 @@ TABLE: dict[str, dict[str, str | None]] = {
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("event", EVENTS)
 def test_transition(state: LifecycleState, event: Event) -> None:
-    assert after(state, event) == TABLE[state][event]
+    assert next_state(state, event) == TABLE[state][event]

@@ -6,8 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.lease import Lease
-from snakesim_hal.safety.limiter import JointLimits, Refusal, as_setpoints, refuse
+from snakesim_hal.safety.limiter import Refusal, find_refusal, make_safe_setpoints
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
 from tests.unit.hal.rig import LEASE_NS, command, description
@@ -17,12 +18,14 @@ from tests.unit.hal.safety.gate_rig import JOINTS, LEASE, LIMITS, ROBOT, applied
 def judge(given: JointCommand, **changes: Any) -> Refusal | None:
     values: dict[str, Any] = {"lease": LEASE, "now_ns": 900, "tick": 5, "last_sequence": 0, "age_ns": 0} | changes
     limits = values.pop("limits", LIMITS)
-    return refuse(given, limits=limits, **values)
+    return find_refusal(given, limits=limits, **values)
 
 
 # --- refusals --------------------------------------------------------------------------------------------------
 
-SERVOS = JointLimits.of(description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}}))
+SERVOS = JointLimits.from_description(
+    description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}})
+)
 NAN, INF = float("nan"), float("inf")
 REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
     "no_lease": [({}, {"lease": Lease(epoch=1)}), ({}, {"now_ns": 1001})],
@@ -147,7 +150,7 @@ def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word:
 
 def test_set_points_for_the_backend_are_plain_python() -> None:
     applied = applied_for(command(ROBOT, 0.01))
-    points = as_setpoints(applied, frozenset({1}))
+    points = make_safe_setpoints(applied, frozenset({1}))
     assert points.isolated == {1}
     assert points.mode == [Mode.POSITION] * JOINTS and all(type(m) is Mode for m in points.mode)
     assert all(type(value) is float for value in points.target + points.torque_limit_nm)
@@ -163,9 +166,9 @@ def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: 
     sensor = SensorDescription(key=keys.JOINTS, rate_hz=100.0, delay_s=delay_ms * 1e-3)
     lease_ns = min(max(5 * period_ns, 50_000_000), 100_000_000)
     robot = msgspec.structs.replace(ROBOT, period_ns=period_ns, lease_ns=lease_ns, sensors=[sensor])
-    assert JointLimits.of(robot).oldest_state_ns == oldest_ms * 1_000_000
+    assert JointLimits.from_description(robot).oldest_state_ns == oldest_ms * 1_000_000
 
 
 def test_a_robot_that_lists_no_joint_sensor_has_none_that_is_late() -> None:
     robot = msgspec.structs.replace(ROBOT, sensors=[])
-    assert JointLimits.of(robot).oldest_state_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns
+    assert JointLimits.from_description(robot).oldest_state_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns

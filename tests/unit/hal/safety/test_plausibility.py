@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.limiter import Applied, JointLimits
-from snakesim_hal.safety.plausibility import Mask, PlausibilityCheck, readable
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask
+from snakesim_hal.safety.plausibility import PlausibilityCheck, replace_unreadable
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
@@ -45,7 +45,7 @@ class Bench:
     ) -> Fault | None:
         self.timestamp_ns += round(periods * PERIOD_NS)
         seen = state(ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other)
-        doubt = self.watch.take(seen, now_ns=self.timestamp_ns + late_ns, applied=applied, aside=aside)
+        doubt = self.watch.check(seen, now_ns=self.timestamp_ns + late_ns, applied=applied, isolated=aside)
         self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
         return None if doubt is None else doubt.fault
 
@@ -173,10 +173,10 @@ def test_what_is_not_known_changes_nothing_else(bad: dict[str, Any]) -> None:
 
 def test_a_long_story_fits_into_a_message() -> None:
     robot = description(chain__modules=100)
-    watch = PlausibilityCheck(JointLimits.of(robot))
+    watch = PlausibilityCheck(JointLimits.from_description(robot))
     nobody = np.zeros(100, dtype=np.bool_)
-    watch.take(state(robot), now_ns=0, applied=None, aside=nobody)
-    doubt = watch.take(state(robot, 1.0), now_ns=0, applied=None, aside=nobody)
+    watch.check(state(robot), now_ns=0, applied=None, isolated=nobody)
+    doubt = watch.check(state(robot, 1.0), now_ns=0, applied=None, isolated=nobody)
     assert doubt is not None and len(doubt.fault.cause) == 400 and doubt.joints.all()
 
 
@@ -210,14 +210,16 @@ def test_as_far_as_a_joint_may_turn_is_not_too_far() -> None:
 def test_what_is_published_has_numbers_only(column: str) -> None:
     bench = Bench(angle=0.1)
     sound = state(ROBOT, 0.12, 0.2, 0.3)
-    assert readable(sound, bench.watch.measured) is sound
+    assert replace_unreadable(sound, bench.watch.measured) is sound
     corrupted = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
-    published = readable(corrupted, bench.watch.measured)
+    published = replace_unreadable(corrupted, bench.watch.measured)
     assert published.valid == [True, False, True]
     assert published.angle_rad[1] == 0.1 and published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
     assert getattr(published, column)[::2] == [0.5, 0.7] and published.age_ns == sound.age_ns
     assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [0.1, 0.0, 0.0]
-    assert readable(msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured).valid == [
+    assert replace_unreadable(
+        msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured
+    ).valid == [
         False,
         False,
         True,
@@ -227,7 +229,7 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm", "valid"])
 def test_a_state_of_another_number_of_joints_is_published_as_it_is(column: str) -> None:
     odd = msgspec.structs.replace(state(ROBOT, float("nan")), **{column: [float("nan")]})
-    assert readable(odd, Bench().watch.measured) is odd
+    assert replace_unreadable(odd, Bench().watch.measured) is odd
 
 
 # --- stuck sensors ---------------------------------------------------------------------------------------------
@@ -376,7 +378,9 @@ def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
     for _ in range(300):
         quick, whole = PlausibilityCheck(LIMITS), Whole(LIMITS)
         for seen, applied in walk(rng, 24):
-            taken = [one.take(seen, now_ns=seen.timestamp_ns, applied=applied, aside=NOBODY) for one in (quick, whole)]
+            taken = [
+                one.check(seen, now_ns=seen.timestamp_ns, applied=applied, isolated=NOBODY) for one in (quick, whole)
+            ]
             assert repr(taken[0]) == repr(taken[1])
             for good, expected in zip(vars(quick.measured).values(), vars(whole.measured).values(), strict=True):
                 assert good.tolist() == expected.tolist()
@@ -386,4 +390,4 @@ def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
 def test_an_angle_may_differ_by_the_noise_at_once(check: type[PlausibilityCheck]) -> None:
     watch = check(LIMITS)
     for angle in (0.0, 0.05):
-        assert watch.take(state(ROBOT, angle), now_ns=0, applied=targets(), aside=NOBODY) is None
+        assert watch.check(state(ROBOT, angle), now_ns=0, applied=targets(), isolated=NOBODY) is None

@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.limiter import JointLimits
+from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import description
 from tests.unit.hal.safety.gate_rig import ANGLE_STEP, JOINTS, TINY, before, every
 
 ROBOT = description(motor__damping_nm_s_per_rad=2.0)
-LIMITS = JointLimits.of(ROBOT)
+LIMITS = JointLimits.from_description(ROBOT)
 
 
 def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: float) -> StopRamp:
@@ -22,7 +22,7 @@ def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: 
 def targets(halt: StopRamp, periods: int) -> list[float]:
     found = [float(halt.target_rad[0])]
     for _ in range(periods):
-        halt = halt.after_a_period(LIMITS)
+        halt = halt.advance(LIMITS)
         found.append(float(halt.target_rad[0]))
     return found
 

@@ -1,0 +1,85 @@
+"""The values that the limiter works with: a robot's limits, its measured state, and the last setpoints.
+
+All arrays have the shape (n_joints,), tail to head, in the order of `Description.joints`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.freshness import oldest_state_ns
+from snakesim_hal.wire.messages import Description, JointDescription, Mode
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]  # (n_joints,): which joints
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """The limits of a robot, as its description states them."""
+
+    # Limits as vectors, (n_joints,) each.
+    angle_min_rad: Floats
+    angle_max_rad: Floats
+    speed_rad_s: Floats
+    acceleration_rad_s2: Floats
+    torque_nm: Floats
+    # Limits of the whole robot.
+    max_step_rad: float  # maximum distance of an angle target from the measured angle
+    period_s: float
+    lease_ns: int
+    oldest_state_ns: int  # an older joint state is rejected
+    layout: str
+    # The same limits joint by joint, for loops over plain floats.
+    joints: tuple[JointDescription, ...]
+    # Modes that the joints support.
+    has_velocity_mode: Mask
+    all_modes: bool  # whether every joint supports every mode
+
+    @staticmethod
+    def from_description(description: Description) -> "JointLimits":
+        """Collect the limits that a description states."""
+        joints = description.joints
+
+        def column(field: str) -> Floats:
+            return np.array([getattr(joint, field) for joint in joints], dtype=np.float64)
+
+        return JointLimits(
+            angle_min_rad=column("angle_min_rad"),
+            angle_max_rad=column("angle_max_rad"),
+            speed_rad_s=column("speed_limit_rad_s"),
+            acceleration_rad_s2=column("acceleration_limit_rad_s2"),
+            torque_nm=column("torque_limit_nm"),
+            max_step_rad=description.max_step_rad,
+            period_s=description.period_ns * 1e-9,
+            lease_ns=description.lease_ns,
+            oldest_state_ns=oldest_state_ns(description),
+            layout=description.layout,
+            joints=tuple(joints),
+            has_velocity_mode=np.array([joint.has(Mode.VELOCITY) for joint in joints]),
+            all_modes=all(joint.has(mode) for joint in joints for mode in Mode),
+        )
+
+    def clip_angles(self, angle_rad: Floats) -> Floats:
+        """Return the angles clamped to the angle limits, (n_joints,)."""
+        return np.clip(angle_rad, self.angle_min_rad, self.angle_max_rad)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The measured state of the joints, (n_joints,) each."""
+
+    angle_rad: Floats
+    velocity_rad_s: Floats
+    torque_nm: Floats
+
+
+@dataclass(frozen=True)
+class Applied:
+    """Limited setpoints of the joints, (n_joints,) each."""
+
+    mode: Ints  # values of `Mode`
+    target: Floats  # rad, rad/s or N·m, as the mode says
+    torque_limit_nm: Floats

@@ -1,0 +1,80 @@
+"""Names of the limits that changed a command, for counters and for people. Pure; nothing here moves a motor."""
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask, Measured
+from snakesim_hal.safety.limiter import torque_bounds_at_ends, velocity_bounds_at_ends
+from snakesim_hal.wire.messages import JointCommand, JointDescription, Mode
+
+
+def name_active_limits(
+    command: JointCommand, applied: Applied, *, measured: Measured, limits: JointLimits, torque_fraction: Floats
+) -> dict[int, str]:
+    """Return the index of each limited joint with a short name of the limit.
+
+    Call it only if `limit_command` has changed a target, or if a joint is derated.
+
+    Args:
+        command: the command before the limiter.
+        applied: the setpoints after it.
+        measured: the state that the limiter used.
+        limits: the limits of the robot.
+        torque_fraction: (n_joints,), from 0 to 1; what derating leaves of each torque limit.
+    """
+    names: dict[int, str] = {}
+    derated = find_derated_joints(command, limits, torque_fraction)
+    for i, (mode, requested) in enumerate(zip(command.mode, command.target, strict=True)):
+        if mode is Mode.PASSIVE:
+            continue
+        if applied.target[i] != requested:
+            angle = float(measured.angle_rad[i])
+            velocity = float(measured.velocity_rad_s[i])
+            torque_limit = float(applied.torque_limit_nm[i])
+            names[i] = _name_limit(limits.joints[i], mode, requested, angle, velocity, torque_limit, limits.period_s)
+        if derated[i] and names.get(i, "torque") == "torque":
+            names[i] = "thermal"
+    return names
+
+
+def find_derated_joints(command: JointCommand, limits: JointLimits, torque_fraction: Floats) -> Mask:
+    """Return which joints get a lower torque limit than commanded because they are hot, (n_joints,)."""
+    requested_nm = limits.torque_nm
+    if command.torque_limit_nm is not None:
+        requested_nm = np.minimum(command.torque_limit_nm, limits.torque_nm)
+    return requested_nm > limits.torque_nm * torque_fraction
+
+
+def _name_limit(
+    joint: JointDescription,
+    mode: Mode,
+    requested: float,
+    angle_rad: float,
+    velocity_rad_s: float,
+    torque_limit_nm: float,
+    period_s: float,
+) -> str:
+    """Return the name of the tightest limit that a requested target exceeds."""
+    match mode:
+        case Mode.VELOCITY:
+            bounds = velocity_bounds_at_ends(joint, angle_rad, period_s)
+            magnitude_limit = joint.speed_limit_rad_s
+            magnitude_name = "speed"
+            rate_name = "acceleration"
+        case Mode.TORQUE:
+            bounds = torque_bounds_at_ends(joint, angle_rad, velocity_rad_s, period_s)
+            magnitude_limit = torque_limit_nm
+            magnitude_name = "torque"
+            rate_name = "torque_rate"
+        case _:
+            if joint.angle_min_rad <= requested <= joint.angle_max_rad:
+                return "angle_rate"
+            return "angle"
+    low, high = bounds
+    above_end_bound = requested > high and high < magnitude_limit
+    below_end_bound = requested < low and low > -magnitude_limit
+    if above_end_bound or below_end_bound:
+        return "angle"
+    if abs(requested) > magnitude_limit:
+        return magnitude_name
+    return rate_name
