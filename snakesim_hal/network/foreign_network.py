@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.network.session import Link, open_zenoh
+from snakesim_hal.network.connection import Link, open_zenoh
 
 WAITING = 10  # queries at one key, as rmw's profile of services has it
 CONNECT_TIMEOUT_S = 5.0

@@ -91,7 +91,7 @@ class LocalReader(Reader[MessageT]):
         super().__init__(declared, message, rejected)
         self._kept = kept
 
-    def _arrived(self) -> list[Arrival]:
+    def _take_samples(self) -> list[Arrival]:
         arrived = list(self._kept)
         self._kept.clear()
         return arrived
@@ -147,7 +147,7 @@ class LocalSession(Session):
             for take in network.takers(key):
                 take(arrival)
 
-        return self._routed(key, Publisher(message, send, lambda: bool(network.takers(key))))
+        return self._register_publisher(key, Publisher(message, send, lambda: bool(network.takers(key))))
 
     def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
         """The newest `depth` samples of a stream."""
