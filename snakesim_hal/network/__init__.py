@@ -1,8 +1,8 @@
 """The network: the only package that imports Zenoh.
 
-`session`         publishers, readers and queries on Zenoh; with `connection`, `endpoint`, `image_connection`, `mailbox`, `run_key`
+`session`         publishers, readers and queries on Zenoh; `connection` opens it, `endpoint` checks addresses
 `local_network`   the same sessions within one process, without Zenoh
-`client`          the interface of guidance, navigation and control; independent of the backend
+`client`          the interface of guidance, navigation and control, independent of the backend; with `feed`, `run_key`
 `robot_mismatch`  rejects messages that do not fit the robot
 `stop_port`       emergency stops by UDP, without Zenoh; `local_registry` finds the robots of this machine
 `foreign_network` raw bytes on the network of another system, such as that of ROS 2 nodes

@@ -31,6 +31,7 @@ from snakesim_hal.network.connection import (
     limit_receiving_threads,
     open_zenoh,
 )
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT  # programs import it with `Link`
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.image_connection import configure_for_images
 from snakesim_hal.wire import keys
