@@ -183,9 +183,9 @@ class Injector:
             request = self._decoder.decode(question.payload, question.encoding)
             return self._carry_out_request(request, now_s)
         except WireError as error:
-            return _refuse(str(error), error.reason)
+            return _refuse(str(error), refusal=error.reason)
         except (ConfigError, BackendError) as error:
-            return _refuse(str(error), "cannot")
+            return _refuse(str(error), refusal="cannot")
 
     def _carry_out_request(self, request: FaultRequest, now_s: float) -> Answer:
         """Begin or end the requested fault.
@@ -198,7 +198,7 @@ class Injector:
         injection = checked(Injection(request.kind, request.target, start_s, start_s + duration_s, request.amount))
         name = f"{injection.kind} of {injection.target}"
         if injection.part != self.part:
-            return _refuse(f"{name} is carried out by {injection.part}", "wrong_part")
+            return _refuse(f"{name} is carried out by {injection.part}", refusal="wrong_part")
         if request.end:
             return self._end_on_request(injection, now_s)
         self._begin(injection, now_s)
@@ -211,7 +211,7 @@ class Injector:
         active = self._active.get((injection.kind, injection.target))
         if active is None:
             names = ", ".join(self.on) or "nothing"
-            return _refuse(f"{name} is not active; active: {names}", "wrong_state")
+            return _refuse(f"{name} is not active; active: {names}", refusal="wrong_state")
         self._end(active, now_s)
         return Answer(ok=True, reason=f"{name} has ended")
 
@@ -258,6 +258,6 @@ class Injector:
             self._apply_changes(now_s)
 
 
-def _refuse(reason: str, refusal: str) -> Answer:
+def _refuse(reason: str, *, refusal: str) -> Answer:
     """Return a refusal, with its text and its code."""
     return Answer(ok=False, reason=reason[:500], refusal=refusal)
