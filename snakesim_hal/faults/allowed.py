@@ -1,7 +1,7 @@
-"""Injected faults in one part of a robot: carried out where they are allowed, else refused.
+"""Chooses whether a part of a robot carries out injected faults, or refuses them.
 
 They are allowed where nothing real moves, or by the scenario. Anywhere else the code that carries them out is not even
-loaded: this module alone imports `snakesim_hal.faults`, and only when it is needed.
+loaded: this module alone imports the rest of `snakesim_hal.faults`, and only when it is needed.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,20 +20,29 @@ HOW_TO_ALLOW = "something real moves here; to allow it set `allow_fault_injectio
 
 
 class Faults(Protocol):
-    """The injected faults of one part."""
+    """The injected faults of one part. The part's own thread makes every call, once in each cycle of its loop."""
 
     @property
     def on(self) -> Sequence[str]:
-        """Active ones."""
+        """Return the active faults as texts."""
         ...
 
     @property
     def noted(self) -> Sequence[str]:
-        """Each begin and end, with its tick."""
+        """Return the begin and the end of each fault as texts, with the tick."""
         ...
 
     def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
-        """At a tick: begin and end due faults, answer requests, and hang if requested. Returns planned ones refused."""
+        """Begin and end the faults that are due at a tick, answer requests, and hang if a fault says so.
+
+        Args:
+            timestamp_ns: robot time of the tick.
+            arm_session: of the robot's clock; 0: never armed.
+            lifecycle: state of the robot.
+
+        Returns:
+            Planned faults that could not be carried out, with the reason.
+        """
         ...
 
     def idle(self) -> None:
@@ -52,30 +61,38 @@ class NoFaults:
     noted: Sequence[str] = ()
 
     def __init__(self, part: str, config: RunConfig, session: Session) -> None:
-        """Raises ConfigError when some are planned."""
+        """Declare the part's key for requests.
+
+        Raises:
+            ConfigError: the run plans a fault of this part.
+        """
         if any(injection.part == part for injection in planned(config)):
             raise ConfigError(f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out")
         self._lifecycle: LifecycleState = "disarmed"
         session.on_question(keys.fault(part), self._refuse)
 
     def turn(self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
-        """None is planned."""
         self._lifecycle = lifecycle
         return ()
 
     def idle(self) -> None:
-        """Requests are refused as they come."""
+        """Do nothing: Zenoh's thread refuses requests as they arrive."""
 
     def close(self) -> None:
-        """No message is late."""
+        """Do nothing: no message is delayed."""
 
     def _refuse(self, question: Question) -> None:
+        """Refuse a request, in Zenoh's thread."""
         why = f"fault injection is not allowed: {HOW_TO_ALLOW}"
         question.reply(Answer(ok=False, reason=why, refusal="not_allowed", lifecycle=self._lifecycle))
 
 
 def faults_of_host(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, Faults]:
-    """The backend to use instead, and its faults. Raises ConfigError for planned ones that are forbidden."""
+    """Return the backend that the host should use, and the faults of the host.
+
+    Raises:
+        ConfigError: the run plans a fault of the host, and faults are not allowed here.
+    """
     if not _allowed(config, backend.describe()):
         return backend, NoFaults(HAL, config, session)
     from snakesim_hal.faults.host_faults import HostFaults
@@ -87,7 +104,18 @@ def faults_of_host(config: RunConfig, backend: Backend, session: Session) -> tup
 def faults_of_service(
     name: str, config: RunConfig, session: Session, robot: Description, newest: Callable[[], Clock | None]
 ) -> Faults:
-    """The faults of a service. newest: the newest clock. Raises ConfigError for planned ones that are forbidden."""
+    """Return the faults of a service.
+
+    Args:
+        name: of the service.
+        config: of the run.
+        session: of the service.
+        robot: description of the robot.
+        newest: returns the newest clock, also while the service hangs.
+
+    Raises:
+        ConfigError: the run plans a fault of this service, and faults are not allowed here.
+    """
     if not _allowed(config, robot):
         return NoFaults(name, config, session)
     from snakesim_hal.faults.injector import Injector

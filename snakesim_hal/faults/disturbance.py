@@ -1,7 +1,7 @@
-"""Injected faults of the messages of one key: which are sent now, which later, and with which bytes.
+"""Decides about the messages of one key under injected faults: which are sent now or later, and with which bytes.
 
-Pure: payloads, the time and a seed in; payloads to send out. In this order messages are corrupted, dropped,
-duplicated, reordered, delayed; a flood repeats the newest. Delayed messages keep their order.
+Pure: it gets payloads, the time and a seed, and returns payloads to send. Each message is corrupted, dropped,
+duplicated, reordered and delayed, in this order; a flood repeats the newest. Delayed messages keep their order.
 """
 
 import random
@@ -12,120 +12,161 @@ from math import inf
 from snakesim_hal.model.fault_kinds import Injection
 
 MAX_AT_ONCE = 256  # repeats of a flood at once: after a delay of this process the others are skipped
-LONGEST_BURST = 64  # bytes that are inserted, or copied from elsewhere in the message
-DOUBLE = 0xCB  # MessagePack's mark of a float64
+MAX_BURST_BYTES = 64  # inserted, or copied from elsewhere in the message
+FLOAT64_MARK = 0xCB  # of MessagePack
+FLOAT64_BYTES = 8
 NASTY_DOUBLES = (float("nan"), inf, -inf, 1e308, -1e308, 5e-324, -0.0)
 
 
 class Disturbance:
-    """One key's faults. Times are of one clock, in seconds."""
+    """The faults of one key. Times are of one clock, in seconds. Not thread-safe; the caller holds a lock."""
 
     def __init__(self, seed: str) -> None:
+        """Draw all random numbers from a seed."""
         self._random = random.Random(seed)
-        self._on: dict[str, float] = {}  # kind -> amount
-        self._held: bytes | None = None  # held back until the next message has overtaken it
-        self._late: deque[tuple[float, bytes]] = deque()
-        self._newest: bytes | None = None
+        self._amounts: dict[str, float] = {}  # of active faults, by kind
+        self._overtaken: bytes | None = None  # held back until the next message has been sent
+        self._delayed: deque[tuple[float, bytes]] = deque()  # time at which to send it, payload
+        self._newest: bytes | None = None  # the writer's last message
         self._repeat_s = inf  # time of the next repeat of a flood
 
     def begin(self, injection: Injection, now_s: float) -> None:
-        """Begin a fault; for an active kind, the new amount replaces the old."""
+        """Begin a fault. If its kind is active already, the new amount replaces the old one."""
         assert injection.amount is not None, f"{injection} was not checked"
-        self._on[injection.kind] = injection.amount
+        self._amounts[injection.kind] = injection.amount
         if injection.kind == "flood":
             self._repeat_s = now_s
 
     def end(self, kind: str, now_s: float) -> list[bytes]:
-        """End a fault. Returns payloads to send now; delayed ones still come later."""
-        self._on.pop(kind, None)
+        """End a fault.
+
+        Returns:
+            Payloads to send now. Delayed payloads still become due later.
+        """
+        self._amounts.pop(kind, None)
         if kind == "flood":
             self._repeat_s = inf
-        if kind == "reorder" and self._held is not None:
-            held, self._held = self._held, None
-            return self._delayed([held], now_s)
+        if kind == "reorder" and self._overtaken is not None:
+            overtaken = self._overtaken
+            self._overtaken = None
+            return self._delay([overtaken], now_s)
         return []
 
     @property
     def over(self) -> bool:
-        """Whether no fault is active, and nothing is pending."""
-        return not self._on and not self._late
+        """Return whether no fault is active and no payload is delayed."""
+        return not self._amounts and not self._delayed
 
     def put(self, payload: bytes, now_s: float) -> list[bytes]:
-        """Take a message of the writer. Returns payloads to send now."""
+        """Apply the active faults to a message of the writer, and return the payloads to send now."""
         if self._newest is None:
             self._repeat_s = max(self._repeat_s, now_s)
         self._newest = payload
-        return self._passed(payload, now_s)
+        return self._apply_faults(payload, now_s)
 
     def due(self, now_s: float) -> list[bytes]:
-        """Delayed or repeated payloads that are due."""
-        out: list[bytes] = []
-        while self._late and self._late[0][0] <= now_s:
-            out.append(self._late.popleft()[1])
-        if self._repeat_s <= now_s and self._newest is not None:
-            every_s = 1.0 / self._on["flood"]
-            repeats = min(int((now_s - self._repeat_s) / every_s) + 1, MAX_AT_ONCE)
-            self._repeat_s += repeats * every_s
-            if self._repeat_s <= now_s:
-                self._repeat_s = now_s + every_s
-            for _ in range(repeats):
-                out += self._passed(self._newest, now_s)
-        return out
+        """Return the delayed and repeated payloads that are due."""
+        payloads: list[bytes] = []
+        while self._delayed and self._delayed[0][0] <= now_s:
+            _, payload = self._delayed.popleft()
+            payloads.append(payload)
+        if self._newest is not None:
+            for _ in range(self._count_repeats(now_s)):
+                payloads += self._apply_faults(self._newest, now_s)
+        return payloads
+
+    def _count_repeats(self, now_s: float) -> int:
+        """Return how often a flood repeats the newest message now, and set the time of its next repeat."""
+        if self._repeat_s > now_s:
+            return 0
+        interval_s = 1.0 / self._amounts["flood"]
+        repeats = min(int((now_s - self._repeat_s) / interval_s) + 1, MAX_AT_ONCE)
+        self._repeat_s += repeats * interval_s
+        if self._repeat_s <= now_s:
+            self._repeat_s = now_s + interval_s
+        return repeats
 
     def next_s(self) -> float:
-        """When `due` has something; inf for never."""
-        late_s = self._late[0][0] if self._late else inf
-        return late_s if self._newest is None else min(late_s, self._repeat_s)
+        """Return the time at which `due` has a payload next; inf if never."""
+        next_delayed_s = self._delayed[0][0] if self._delayed else inf
+        if self._newest is None:
+            return next_delayed_s
+        return min(next_delayed_s, self._repeat_s)
 
-    def _passed(self, payload: bytes, now_s: float) -> list[bytes]:
+    def _apply_faults(self, payload: bytes, now_s: float) -> list[bytes]:
+        # The order of the draws is part of what a seed repeats.
         if self._happens("corrupt"):
             payload = corrupted(payload, self._random)
         if self._happens("drop"):
             return []
-        out = [payload, payload] if self._happens("duplicate") else [payload]
-        if self._held is not None:
-            out.append(self._held)
-            self._held = None
+        payloads = [payload]
+        if self._happens("duplicate"):
+            payloads.append(payload)
+        if self._overtaken is not None:
+            payloads.append(self._overtaken)
+            self._overtaken = None
         elif self._happens("reorder"):
-            self._held = out.pop()
-        return self._delayed(out, now_s)
+            self._overtaken = payloads.pop()
+        return self._delay(payloads, now_s)
 
     def _happens(self, kind: str) -> bool:
-        share = self._on.get(kind, 0.0)
-        return share > 0.0 and self._random.random() < share
+        """Draw whether a fault applies to this message; its amount is the probability."""
+        probability = self._amounts.get(kind, 0.0)
+        return probability > 0.0 and self._random.random() < probability
 
-    def _delayed(self, payloads: list[bytes], now_s: float) -> list[bytes]:
-        """Queue payloads behind the delayed ones, so that the order is kept."""
-        delay_s = self._on.get("delay", 0.0)
-        if not delay_s and not self._late:
+    def _delay(self, payloads: list[bytes], now_s: float) -> list[bytes]:
+        """Queue payloads behind the delayed ones, so that the order is kept. Returns those to send now."""
+        delay_s = self._amounts.get("delay", 0.0)
+        if not delay_s and not self._delayed:
             return payloads
-        due_s = max(now_s + delay_s, self._late[-1][0] if self._late else 0.0)
-        self._late.extend((due_s, payload) for payload in payloads)
+        last_due_s = self._delayed[-1][0] if self._delayed else 0.0
+        due_s = max(now_s + delay_s, last_due_s)
+        self._delayed.extend((due_s, payload) for payload in payloads)
         return []
 
 
 def corrupted(payload: bytes, rng: random.Random) -> bytes:
-    """A corrupted payload: bytes flipped, cut off, inserted or copied, a NaN, or pure noise."""
+    """Return a corrupted copy of a payload, which always differs from it.
+
+    Bits are flipped, a byte is replaced, the end is cut off, bytes are inserted or copied, a number becomes NaN or
+    another nasty value, or everything becomes noise.
+    """
     data = bytearray(payload)
     match rng.randrange(7):
         case 0 if data:
-            for _ in range(rng.randint(1, 8)):
-                data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            _flip_bits(data, rng)
         case 1 if data:
             data[rng.randrange(len(data))] = rng.randrange(256)
         case 2:
             del data[rng.randint(0, len(data)) :]
         case 3:
-            at = rng.randint(0, len(data))
-            data[at:at] = rng.randbytes(rng.randint(1, LONGEST_BURST))
+            position = rng.randint(0, len(data))
+            data[position:position] = rng.randbytes(rng.randint(1, MAX_BURST_BYTES))
         case 4:
-            at, start = rng.randint(0, len(data)), rng.randint(0, len(data))
-            data[at : at + rng.randint(0, LONGEST_BURST)] = data[start : start + rng.randint(1, LONGEST_BURST)]
-        case 5 if places := [i for i, byte in enumerate(data[:-8]) if byte == DOUBLE]:
-            at = rng.choice(places)
-            data[at + 1 : at + 9] = struct.pack(">d", rng.choice(NASTY_DOUBLES))
+            _copy_burst(data, rng)
+        case 5 if positions := _find_doubles(data):
+            begin = rng.choice(positions) + 1
+            data[begin : begin + FLOAT64_BYTES] = struct.pack(">d", rng.choice(NASTY_DOUBLES))
         case _:
             data = bytearray(rng.randbytes(rng.randint(0, 2 * len(data) + 1)))
     if data == payload:
         return payload + rng.randbytes(1)
     return bytes(data)
+
+
+def _flip_bits(data: bytearray, rng: random.Random) -> None:
+    for _ in range(rng.randint(1, 8)):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+
+
+def _copy_burst(data: bytearray, rng: random.Random) -> None:
+    """Replace some bytes by a copy of others."""
+    target = rng.randint(0, len(data))
+    source = rng.randint(0, len(data))
+    copied = data[source : source + rng.randint(1, MAX_BURST_BYTES)]
+    data[target : target + rng.randint(0, MAX_BURST_BYTES)] = copied
+
+
+def _find_doubles(data: bytearray) -> list[int]:
+    """Return the positions of all bytes that may begin a MessagePack float64."""
+    return [i for i, byte in enumerate(data[:-FLOAT64_BYTES]) if byte == FLOAT64_MARK]

@@ -1,4 +1,4 @@
-"""Injected faults in the host: of its backend, and of its messages; recorded with their tick."""
+"""Carries out the injected faults of the host, in its backend and its messages, and records each with its tick."""
 
 from collections.abc import Sequence
 
@@ -10,22 +10,24 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import LifecycleState
 
-MAX_KEPT = 10_000
+MAX_NOTES = 10_000  # so that the memory stays bounded, however long the run
 
 
 class HostFaults(Injector):
-    """Injected faults of the host. Use `backend` instead of the original one."""
+    """Carries out the injected faults of the host, in the host's thread. Use `backend` instead of the original one."""
 
     def __init__(self, config: RunConfig, backend: Backend, session: Session) -> None:
+        """Wrap the host's backend. Declares the host's key for fault requests."""
         self.backend = FaultyBackend(backend)
-        self._period_ns, self._tick = config.period_ns, 0
+        self._period_ns = config.period_ns
+        self._tick = 0
         super().__init__(HAL, config, session, carry_out=self.backend.inject)
 
     def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
-        """As of any part, at a tick to be noted."""
+        """Keep the tick for the record, then do what every part does."""
         self._tick = timestamp_ns // self._period_ns
         return super().turn(timestamp_ns, arm_session, lifecycle)
 
     def _note(self, text: str, now_s: float) -> None:
-        if len(self.noted) < MAX_KEPT:
+        if len(self.noted) < MAX_NOTES:
             self.noted.append(f"tick {self._tick}: {text}")

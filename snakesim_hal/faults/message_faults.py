@@ -1,7 +1,10 @@
-"""Message faults of this process: applies `disturbance` between a publisher and Zenoh.
+"""Carries out message faults of this process: applies `disturbance` between a publisher and Zenoh.
 
 A publisher without a fault is not touched. A thread sends delayed messages; it exists only while messages are delayed
 or a flood is active.
+
+Threads: the part's own thread begins and ends faults, any publishing thread calls `put`, and the worker thread runs
+`_send_due`. All of them hold the lock of `_changed` while they use a disturbance.
 """
 
 import threading
@@ -15,12 +18,12 @@ from snakesim_hal.faults.disturbance import Disturbance
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.network.session import Session
 
-SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter
+MIN_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter
 
 
 @dataclass
-class Line:
-    """The outgoing messages of one key."""
+class DisturbedKey:
+    """A key whose outgoing messages have faults."""
 
     key: str
     disturbance: Disturbance
@@ -30,76 +33,87 @@ class MessageFaults:
     """All message faults of one session. Thread-safe."""
 
     def __init__(self, session: Session, seed: int) -> None:
-        self._session, self._seed = session, seed
-        self._lines: dict[str, Line] = {}
+        """Disturb messages of a session; seed: of the run."""
+        self._session = session
+        self._seed = seed
+        self._disturbed: dict[str, DisturbedKey] = {}  # by key
         self._changed = threading.Condition()
-        self._later: threading.Thread | None = None
+        self._worker: threading.Thread | None = None  # sends delayed messages; None: nothing is delayed
         self._closed = False
 
     def begin(self, injection: Injection) -> None:
-        """Begin a fault."""
+        """Begin a fault of the key that is its target."""
         with self._changed:
             key = injection.target
-            line = self._lines.get(key)
-            if line is None:
-                line = self._lines[key] = Line(key, Disturbance(f"{self._seed} {key}"))
-                self._session.reroute(key, partial(self.put, line))
-            line.disturbance.begin(injection, time.monotonic())
-            self._see_to(line)
+            disturbed = self._disturbed.get(key)
+            if disturbed is None:
+                disturbed = DisturbedKey(key, Disturbance(f"{self._seed} {key}"))
+                self._disturbed[key] = disturbed
+                self._session.reroute(key, partial(self.put, disturbed))
+            disturbed.disturbance.begin(injection, time.monotonic())
+            self._update(disturbed)
 
     def end(self, injection: Injection) -> None:
         """End a fault; pending messages are still sent."""
         with self._changed:
-            line = self._lines.get(injection.target)
-            if line is not None:
-                self._send(line, line.disturbance.end(injection.kind, time.monotonic()))
-                self._see_to(line)
+            disturbed = self._disturbed.get(injection.target)
+            if disturbed is not None:
+                payloads = disturbed.disturbance.end(injection.kind, time.monotonic())
+                self._send(disturbed, payloads)
+                self._update(disturbed)
 
-    def put(self, line: Line, payload: bytes) -> None:
-        """Take a message of the writer, in place of the publisher's own `put`."""
+    def put(self, disturbed: DisturbedKey, payload: bytes) -> None:
+        """Disturb a message of the writer, in place of the publisher's own `put`, in the writer's thread."""
         with self._changed:
-            self._send(line, line.disturbance.put(payload, time.monotonic()))
-            self._see_to(line)
+            payloads = disturbed.disturbance.put(payload, time.monotonic())
+            self._send(disturbed, payloads)
+            self._update(disturbed)
 
     def close(self) -> None:
-        """Drop delayed messages. Call it before the session is closed."""
+        """Drop delayed messages, and end the thread. Call it before the session is closed."""
         with self._changed:
             self._closed = True
             self._changed.notify()
-            later = self._later
-        if later is not None:
-            later.join()
+            worker = self._worker
+        if worker is not None:
+            worker.join()
 
     # --- with the lock held ----------------------------------------------------------------------------------
 
-    def _send(self, line: Line, payloads: list[bytes]) -> None:
+    def _send(self, disturbed: DisturbedKey, payloads: list[bytes]) -> None:
         for payload in payloads:
-            self._session.send(line.key, payload)
+            self._session.send(disturbed.key, payload)
 
-    def _see_to(self, line: Line) -> None:
-        """Release a line without faults; start the thread for delayed messages."""
-        if line.disturbance.over:
-            if self._lines.get(line.key) is line:
-                self._session.reroute(line.key, None)
-                del self._lines[line.key]
+    def _update(self, disturbed: DisturbedKey) -> None:
+        """Release a key whose faults are over; start or wake the thread for delayed messages."""
+        if disturbed.disturbance.over:
+            if self._disturbed.get(disturbed.key) is disturbed:
+                self._session.reroute(disturbed.key, None)
+                del self._disturbed[disturbed.key]
         elif self._next_s() < inf and not self._closed:
-            if self._later is None:
-                self._later = start_worker("late messages", self._send_later, is_over=lambda: self._closed)
+            if self._worker is None:
+                self._worker = start_worker("late messages", self._send_due, is_over=lambda: self._closed)
             self._changed.notify()
 
     def _next_s(self) -> float:
-        return min((line.disturbance.next_s() for line in self._lines.values()), default=inf)
+        """Return the monotonic time of the next delayed message; inf if there is none."""
+        return min((disturbed.disturbance.next_s() for disturbed in self._disturbed.values()), default=inf)
 
     # --- the thread ------------------------------------------------------------------------------------------
 
-    def _send_later(self) -> None:
+    def _send_due(self) -> None:
+        """Send delayed messages when they are due, in the worker thread, until none is left."""
         with self._changed:
-            while not self._closed and (next_s := self._next_s()) < inf:
-                pause_s = max(next_s - time.monotonic(), SHORTEST_PAUSE_S)
+            while not self._closed:
+                next_s = self._next_s()
+                if next_s == inf:
+                    break
+                pause_s = max(next_s - time.monotonic(), MIN_PAUSE_S)
                 self._changed.wait(pause_s)
                 now_s = time.monotonic()
-                for line in list(self._lines.values()):
-                    self._send(line, line.disturbance.due(now_s))
-                    if line.disturbance.over:
-                        self._see_to(line)
-            self._later = None
+                for disturbed in list(self._disturbed.values()):
+                    payloads = disturbed.disturbance.due(now_s)
+                    self._send(disturbed, payloads)
+                    if disturbed.disturbance.over:
+                        self._update(disturbed)
+            self._worker = None

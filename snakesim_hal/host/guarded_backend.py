@@ -1,10 +1,12 @@
 """Wraps any backend: every exception inside becomes a `BackendError` that names the call, or the sensor.
 
-Samples are encoded here, and what is encoded is decoded as a reader will: a message that no reader would accept is an
-error of its backend, not a stream that stops without a word. So is a sample of a sensor that was not described.
+An I/O error, or a defect in a third-party backend, therefore leads to a safe stop with a record, and never to an
+uncontrolled end of the host.
 
-So an I/O error, or a defect in a third-party backend, leads to a safe stop with a record, and never to an uncontrolled
-end of the host.
+Samples are encoded here, and decoded again as a reader will: a message that no reader would accept is an error of its
+backend, because otherwise a stream would stop without a message. So is a sample of a sensor that was not described.
+
+The host's thread makes every call.
 """
 
 import functools
@@ -25,6 +27,8 @@ MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
 
 def _guarded(method: MethodT) -> MethodT:
+    """Return a method that raises a BackendError for every exception that is not ours."""
+
     @functools.wraps(method)
     def call(self: "GuardedBackend", *arguments: Any, **named: Any) -> Any:
         try:
@@ -45,60 +49,58 @@ class GuardedBackend:
     """A `snakesim_hal.backend.Backend` around another."""
 
     def __init__(self, inner: Backend) -> None:
+        """Wrap a backend; nothing of it is called yet."""
         self._inner = inner
         self.name = type(inner).__name__
-        self._keys: list[str] | None = None
-        self._own: dict[str, OwnKind] = {}
+        self._sensor_keys: list[str] | None = None  # None: not read yet
+        self._own_kinds: dict[str, OwnKind] = {}  # custom messages, by key
 
     @_guarded
     def describe(self) -> Description:
-        """As the backend does."""
         return self._inner.describe()
 
     @_guarded
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """As the backend does, with the bytes of every message beside the joints."""
+        """Return the backend's samples, with the bytes of every message except the joint state."""
         samples = self._inner.sample(tick, timestamp_ns)
-        key, encoded = keys.JOINTS, dict[str, bytes]()
+        encoded: dict[str, bytes] = {}
+        key = keys.JOINTS  # of the message in work, for the error
         try:
-            packed(samples.joints)  # whether their values are plausible is judged joint by joint
+            packed(samples.joints)  # the host judges joint by joint whether the values are plausible
             for key, message in samples.others.items():
-                if key not in self._described():
-                    known = ", ".join(self._described())
+                if key not in self._find_sensor_keys():
+                    known = ", ".join(self._find_sensor_keys())
                     raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
-                encoded[key] = checked(key, message, self._own.get(key))
+                encoded[key] = checked(key, message, self._own_kinds.get(key))
         except WireError as error:
             raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
         return replace(samples, encoded=encoded)
 
     @_guarded
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """As the backend does."""
         self._inner.enact(setpoints, lifecycle)
 
     @_guarded
     def advance(self) -> None:
-        """As the backend does."""
         self._inner.advance()
 
     @_guarded
     def faults(self) -> list[Fault]:
-        """As the backend does."""
         return self._inner.faults()
 
     @_guarded
     def close(self) -> None:
-        """As the backend does."""
         self._inner.close()
 
     @_guarded
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """As the backend does, if it injects faults itself."""
+        """Begin or end a fault, if the backend injects faults itself. Returns whether it does this one."""
         return isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins)
 
-    def _described(self) -> list[str]:
-        """Keys of its sensors."""
-        if self._keys is None:
+    def _find_sensor_keys(self) -> list[str]:
+        """Return the keys of the described sensors. The description is read at the first call."""
+        if self._sensor_keys is None:
             robot = self._inner.describe()
-            self._keys, self._own = [sensor.key for sensor in robot.sensors], own_kinds(robot)
-        return self._keys
+            self._own_kinds = own_kinds(robot)
+            self._sensor_keys = [sensor.key for sensor in robot.sensors]
+        return self._sensor_keys

@@ -1,4 +1,4 @@
-"""The run statistics of the HAL host."""
+"""Collects the run statistics of the HAL host: histograms of durations, and counts of ticks."""
 
 import math
 from bisect import bisect_left
@@ -7,71 +7,91 @@ from itertools import accumulate
 
 from snakesim_hal.wire.messages import Timing
 
-SHOWN_BINS = 16
+SHOWN_BINS = 16  # at most, in a published histogram
+MAX_DURATION_US = 1e7
+FINE_BIN_RATIO = 0.01  # width of a bin, relative to the duration
+COARSE_BIN_RATIO = 0.05
 
 
 class Durations:
-    """A histogram of durations, 1 us to 10 s: in memory of fixed size, however long the run."""
+    """A histogram of durations from 1 us to 10 s. Its memory has a fixed size, however long the run.
 
-    def __init__(self, width: float = 0.01) -> None:
-        """width: of a bin, as a share of the duration."""
+    Bin i holds durations near exp(i * step) us, so that each bin is wider than the one before by the same ratio.
+    The host's thread adds durations; other threads may read percentiles meanwhile.
+    """
+
+    def __init__(self, width: float = FINE_BIN_RATIO) -> None:
+        """Start empty; width: of a bin, relative to the duration."""
         self.count = 0
         self._step = math.log1p(width)
-        self._bins = [0] * (1 + math.ceil(math.log(1e7) / self._step))
+        self._bins = [0] * (1 + math.ceil(math.log(MAX_DURATION_US) / self._step))
 
     def add(self, took_us: float) -> None:
-        """Add one."""
-        self._bins[min(max(round(math.log(max(took_us, 1.0)) / self._step), 0), len(self._bins) - 1)] += 1
+        """Count a duration."""
+        index = round(math.log(max(took_us, 1.0)) / self._step)
+        last = len(self._bins) - 1
+        self._bins[min(max(index, 0), last)] += 1
         self.count += 1
 
     def percentile_us(self, percent: float) -> float | None:
-        """None when nothing was counted."""
-        return self._percentile_us(list(accumulate(self._bins)), percent) if self.count else None
+        """Return a percentile of the durations; None if there are none."""
+        if not self.count:
+            return None
+        return self._find_percentile_us(list(accumulate(self._bins)), percent)
 
     def timing(self) -> Timing | None:
-        """Percentiles and a coarse histogram; None when nothing was counted."""
-        bins = self._bins.copy()
-        up_to = list(accumulate(bins))
-        if not up_to[-1]:
+        """Return percentiles and a coarse histogram; None if there are no durations."""
+        bins = self._bins.copy()  # the host's thread may add to it meanwhile
+        cumulative = list(accumulate(bins))
+        count = cumulative[-1]
+        if not count:
             return None
-        first, end = bisect_left(up_to, 1), bisect_left(up_to, up_to[-1]) + 1
-        width = -(-(end - first) // SHOWN_BINS)
+        first = bisect_left(cumulative, 1)  # the first bin that is not empty
+        end = bisect_left(cumulative, count) + 1  # behind the last bin that is not empty
+        width = -(-(end - first) // SHOWN_BINS)  # in bins, rounded up
         return Timing(
-            count=up_to[-1],
-            median_us=self._percentile_us(up_to, 50),
-            p99_us=self._percentile_us(up_to, 99),
+            count=count,
+            median_us=self._find_percentile_us(cumulative, 50),
+            p99_us=self._find_percentile_us(cumulative, 99),
             max_us=math.exp((end - 1) * self._step),
             low_us=math.exp((first - 0.5) * self._step),
             bin_decades=width * self._step / math.log(10),
             bins=[sum(bins[begin : begin + width]) for begin in range(first, end, width)],
         )
 
-    def _percentile_us(self, up_to: list[int], percent: float) -> float:
-        return math.exp(bisect_left(up_to, max(percent / 100 * up_to[-1], 1)) * self._step)
+    def _find_percentile_us(self, cumulative: list[int], percent: float) -> float:
+        """Return the duration of the bin in which the cumulative count reaches a percentage of all."""
+        rank = max(percent / 100 * cumulative[-1], 1)
+        return math.exp(bisect_left(cumulative, rank) * self._step)
 
 
 def _coarse() -> Durations:
-    return Durations(0.05)
+    return Durations(COARSE_BIN_RATIO)
 
 
 @dataclass
 class TickTimes:
-    """How ticks keep time, while armed."""
+    """Durations of the parts of a tick, while the robot is armed."""
 
-    cycle: Durations = field(default_factory=Durations)  # from the begin of a tick to that of the next
-    late: Durations = field(default_factory=_coarse)  # begin of a tick after its deadline
+    cycle: Durations = field(default_factory=Durations)  # from the start of a tick to the start of the next
+    late: Durations = field(default_factory=_coarse)  # start of a tick after its deadline
     read: Durations = field(default_factory=_coarse)  # the backend's sample
     write: Durations = field(default_factory=_coarse)  # the backend takes setpoints, and lets the tick pass
 
     def timings(self) -> dict[str, Timing]:
-        """Of each that was counted."""
-        found = {name: getattr(self, name).timing() for name in ("cycle", "late", "read", "write")}
-        return {name: timing for name, timing in found.items() if timing is not None}
+        """Return the timing of each part that was measured, by its name."""
+        timings = {
+            "cycle": self.cycle.timing(),
+            "late": self.late.timing(),
+            "read": self.read.timing(),
+            "write": self.write.timing(),
+        }
+        return {name: timing for name, timing in timings.items() if timing is not None}
 
 
 @dataclass
 class RunStatistics:
-    """Statistics of the host while armed."""
+    """Statistics of the host while the robot is armed."""
 
     ticks: int = 0
     overruns: int = 0

@@ -1,35 +1,45 @@
-"""Deadline of each tick of a host, what its backend takes of it, and publish times. On the monotonic clock."""
+"""Keeps time on the monotonic clock: the deadline of each tick, the duration of backend calls, and publish times.
+
+The host's thread makes every call.
+"""
 
 import time
 from collections import deque
 
 REANCHOR_PERIODS = 1  # if later, all deadlines are shifted: ticks that catch up in a burst would break rate limits
-KEPT = 4096
-LONG_AGO_NS = -(2**60)
-SMOOTHING = 0.1
-SETTLED_TICKS = 30
-MOST_SHARE = 0.8  # of a period; the rest is for answers
+KEPT_TICKS = 4096  # whose publish times are known
+LONG_AGO_NS = -(2**60)  # publish time of a tick that is not known
+SMOOTHING = 0.1  # weight of the newest duration
+SETTLED_TICKS = 30  # after which a smoothed duration is meaningful
+MAX_PERIOD_RATIO = 0.8  # of a period, for the backend; the rest is for answers
 
 
 class Deadlines:
     """Absolute deadlines: a late tick does not delay the next ones, unless it is much too late."""
 
     def __init__(self, period_ns: int) -> None:
-        self._robot_period_ns = self._period_ns = period_ns
+        """Start at speed 1; period_ns: of a tick in robot time."""
+        self._robot_period_ns = period_ns
+        self._period_ns = period_ns  # in wall time
         self._anchor_ns = 0  # when tick 0 began
 
     def begin(self, tick: int, speed: float | None = None) -> None:
-        """Start at this tick, now. speed: of robot time from now on; None: as it was."""
+        """Begin a tick now, and derive all later deadlines from this one.
+
+        Args:
+            tick: the tick that begins.
+            speed: robot time per wall time from now on; None: unchanged.
+        """
         if speed is not None:
             self._period_ns = round(self._robot_period_ns / speed)
         self._anchor_ns = time.monotonic_ns() - tick * self._period_ns
 
     def of(self, tick: int) -> int:
-        """Start time of a tick, which is the end of the previous one."""
+        """Return the start time of a tick in ns, which is the end of the previous one."""
         return self._anchor_ns + tick * self._period_ns
 
     def missed(self, tick: int) -> bool:
-        """Whether a tick begins too late; if much too late, all later deadlines are shifted."""
+        """Return whether a tick begins too late. If it is much too late, all later deadlines are shifted."""
         late_ns = time.monotonic_ns() - self.of(tick)
         if late_ns > REANCHOR_PERIODS * self._period_ns:
             self._anchor_ns += late_ns
@@ -37,61 +47,72 @@ class Deadlines:
 
 
 class BackendTime:
-    """How long the backend's calls take in a tick, smoothed over some ten of them."""
+    """Measures how long the backend's calls take in a tick, smoothed over some ten ticks."""
 
     def __init__(self, backend: str, period_ns: int) -> None:
-        self._backend, self._period_ns = backend, period_ns
-        self.read_ns = self.write_ns = 0.0
+        """Measure the backend of this name, in ticks of this period."""
+        self._backend = backend
+        self._period_ns = period_ns
+        self.read_ns = 0.0
+        self.write_ns = 0.0
         self._ticks = 0
 
     def read(self, since_ns: int) -> int:
-        """It has been sampled, since then. Returns how long that took, in ns."""
+        """Note that the backend has been sampled, since a monotonic time. Returns the duration in ns."""
         took_ns = time.monotonic_ns() - since_ns
         self.read_ns += SMOOTHING * (took_ns - self.read_ns)
         self._ticks += 1
         return took_ns
 
     def written(self, since_ns: int) -> int:
-        """It has taken the setpoints, and done what it does between two ticks, since then. Returns as `read` does."""
+        """Note that the backend has taken setpoints and advanced, since a monotonic time. Returns as `read` does."""
         took_ns = time.monotonic_ns() - since_ns
         self.write_ns += SMOOTHING * (took_ns - self.write_ns)
         return took_ns
 
     def too_slow(self) -> list[str]:
-        """That its calls leave a tick no time for anything else, and the rate that would hold; empty: they do."""
+        """Return a text that the backend's calls leave too little time in a tick, with a feasible rate; else empty."""
         taken_ns = self.read_ns + self.write_ns
-        if self._ticks < SETTLED_TICKS or taken_ns < MOST_SHARE * self._period_ns:
+        if self._ticks < SETTLED_TICKS or taken_ns < MAX_PERIOD_RATIO * self._period_ns:
             return []
-        holds_hz = MOST_SHARE * 1e9 / taken_ns
-        read_ms, write_ms, period_ms = (ns / 1e6 for ns in (self.read_ns, self.write_ns, self._period_ns))
+        feasible_hz = MAX_PERIOD_RATIO * 1e9 / taken_ns
+        read_ms = self.read_ns / 1e6
+        write_ms = self.write_ns / 1e6
+        period_ms = self._period_ns / 1e6
         return [
             f"backend {self._backend!r} takes {read_ms:.3g} ms to read and {write_ms:.3g} ms to write, of a tick of"
-            f" {period_ms:.3g} ms; it would hold {holds_hz:.2g} Hz (the scenario's rate_hz)"
+            f" {period_ms:.3g} ms; it would hold {feasible_hz:.2g} Hz (the scenario's rate_hz)"
         ]
 
 
 class PublishTimes:
-    """Safety time and monotonic time of publishing, by tick; ticks come in order without gaps."""
+    """Remembers when each tick was published. Ticks come in order without gaps."""
 
     def __init__(self) -> None:
-        self._rows: deque[tuple[int, int, int]] = deque(maxlen=KEPT)  # tick, safety ns, monotonic ns
+        """Start without ticks."""
+        self._rows: deque[tuple[int, int, int]] = deque(maxlen=KEPT_TICKS)  # tick, safety ns, monotonic ns
 
     @property
     def last_tick(self) -> int | None:
-        """The newest published tick."""
-        return self._rows[-1][0] if self._rows else None
+        """Return the newest published tick; None if there is none."""
+        if not self._rows:
+            return None
+        return self._rows[-1][0]
 
     def put(self, tick: int, safety_ns: int, monotonic_ns: int) -> None:
-        """Record the publishing of a tick; it may be a repeated one."""
+        """Record when a tick was published. If it is the newest one again, its times are replaced."""
         if self.last_tick == tick:
             self._rows.pop()
         self._rows.append((tick, safety_ns, monotonic_ns))
 
     def of(self, tick: int) -> tuple[int, int]:
-        """Safety and monotonic time of a tick; a time long ago if it is unknown."""
-        back = -1 if self.last_tick is None else self.last_tick - tick
-        if 0 <= back < len(self._rows):
-            found = self._rows[-1 - back]
-            if found[0] == tick:
-                return found[1], found[2]
+        """Return the safety time and the monotonic time of a tick, in ns; LONG_AGO_NS for an unknown tick."""
+        last_tick = self.last_tick
+        if last_tick is None:
+            return LONG_AGO_NS, LONG_AGO_NS
+        ticks_back = last_tick - tick
+        if 0 <= ticks_back < len(self._rows):
+            published_tick, safety_ns, monotonic_ns = self._rows[-1 - ticks_back]
+            if published_tick == tick:
+                return safety_ns, monotonic_ns
         return LONG_AGO_NS, LONG_AGO_NS

@@ -1,10 +1,10 @@
-"""The network; the only room that imports Zenoh.
+"""The network: the only package that imports Zenoh.
 
-`session`         publishers, readers and queries on Zenoh; with `endpoint`, `image_connection`, `mailbox`, `run_key`
+`session`         publishers, readers and queries on Zenoh; `connection` opens it, `endpoint` checks addresses
 `local_network`   the same sessions within one process, without Zenoh
-`client`          the interface of guidance, navigation and control; independent of the backend
+`client`          the interface of guidance, navigation and control, independent of the backend; with `feed`, `run_key`
 `robot_mismatch`  rejects messages that do not fit the robot
 `stop_port`       emergency stops by UDP, without Zenoh; `local_registry` finds the robots of this machine
-`foreign_network` raw bytes on the network of somebody else, such as that of ROS 2 nodes
+`foreign_network` raw bytes on the network of another system, such as that of ROS 2 nodes
 `private_channel` between a host and the process that started it
 """

@@ -2,6 +2,9 @@
 
 It is a client like any other. The host's limiter limits each command; without commands the lease ends within 50 to 100
 ms, and an armed robot goes into its stop mode.
+
+Threads: the thread that creates a `Commanding` makes every call. Commands are sent only while it is in a call, so it
+must call `wait` or `turn` in every tick.
 """
 
 import time
@@ -16,8 +19,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, Description, JointState, Message, Pose
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
-SILENCE_S = 2.0
-LEASE_S = 10.0
+SILENCE_S = 2.0  # without a clock: the host has stalled
+LEASE_TIMEOUT_S = 10.0  # to get the lease
 READ = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 
@@ -25,68 +28,105 @@ class Commanding:
     """Takes the place of the run's control service, from construction to the end of the session."""
 
     def __init__(self, session: Session, robot: Description, clock_mode: ClockMode) -> None:
-        """Takes the lease. Raises RefusedError when somebody else commands the robot."""
+        """Acquire the lease.
+
+        Args:
+            session: a session in the robot's namespace.
+            robot: its description.
+            clock_mode: of the run.
+
+        Raises:
+            RefusedError: another client commands the robot.
+            StalledError: the robot publishes no clock.
+        """
         if session.present(keys.alive(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
                 "--set services.control.external=true"
             )
         self._client = Client(session, CONTROL, clock_mode=clock_mode)
-        self._feeds: dict[str, Feed] = {key: self._client.subscribe(key, message) for key, message in READ.items()}
+        self._feeds: dict[str, Feed] = {}
+        for key, message in READ.items():
+            self._feeds[key] = self._client.subscribe(key, message)
         self._client.description()
         self._ticks = self._client.ticks(SILENCE_S)
         self._commander = Commander(self._client, robot)
-        self._last: RequestedSetpoints | None = None
-        self.clock: Clock | None = None
-        self._mine = False
+        self._last_setpoints: RequestedSetpoints | None = None
+        self.clock: Clock | None = None  # of the current tick
+        self._holds_lease = False
         tune_garbage_collector()  # looking through all objects of a notebook may take longer than a lease
         self._client.announce()
-        self.turn_until(self._lent, LEASE_S, lambda: f"no right to command {robot.robot}: {self._commander.refusal}")
+        self.turn_until(
+            self._is_lease_shown,
+            LEASE_TIMEOUT_S,
+            lambda: f"no right to command {robot.robot}: {self._commander.refusal}",
+        )
 
     def wait(self) -> Clock:
-        """The next tick. What was not commanded in the last one is told to the host, which may wait for it."""
+        """Wait for the next tick, and return its clock.
+
+        If the last tick was not commanded, this reports it as done, because a lockstep host waits for its output.
+
+        Raises:
+            StalledError: no clock arrived within SILENCE_S.
+        """
         if self.clock is not None:
             self._client.done(self.clock.tick)
         clock = next(self._ticks)
         if clock is None:
             raise StalledError(f"no tick of the robot for {SILENCE_S:g} s; is its HAL host running?")
-        self.clock, self._mine = clock, self._commander.holds(clock)
+        self.clock = clock
+        self._holds_lease = self._commander.holds(clock)
         return clock
 
     def host_changed(self) -> bool:
-        """Whether another host drives the robot now, as after a restart; the lease is to be taken anew then."""
+        """Return whether another host drives the robot now, as after a restart. Acquire the lease again then."""
         return self._client.new_description() is not None
 
     def read(self, key: str) -> Message | None:
-        """The sample that is valid at this tick; None when there is none."""
+        """Return the sample of a key in READ that is valid at this tick; None if there is none."""
         return self._client.read(self._feeds[key])
 
     @property
     def mine(self) -> bool:
-        """Whether the lease is ours at this tick."""
-        return self._mine
+        """Return whether this process holds the lease at this tick."""
+        return self._holds_lease
 
     def send(self, points: RequestedSetpoints) -> None:
-        """Command these in this tick. Raises RefusedError without the lease."""
+        """Command setpoints in this tick. Does nothing while no joint state has arrived.
+
+        Raises:
+            RefusedError: this process does not hold the lease.
+        """
         joints = self.read(keys.JOINTS)
         if not isinstance(joints, JointState) or self.clock is None:
             return
-        if not self._mine:
+        if not self._holds_lease:
             raise RefusedError(f"the right to command is lost: {self._commander.refusal or 'no command came in time'}")
         self._commander.send(self.clock, joints, points)
-        self._last = points
+        self._last_setpoints = points
 
     def turn(self) -> None:
-        """A tick without news: stay while not armed, then go on with the last command."""
-        clock, joints = self.wait(), self.read(keys.JOINTS)
-        if not isinstance(joints, JointState) or not self._mine:
+        """Wait for the next tick, and command it as before: hold still while not armed, then the last setpoints."""
+        clock = self.wait()
+        joints = self.read(keys.JOINTS)
+        if not isinstance(joints, JointState) or not self._holds_lease:
             return
-        if clock.lifecycle != "armed" or self._last is None:
-            self._last = self._commander.stay(joints)
-        self.send(self._last)
+        if clock.lifecycle != "armed" or self._last_setpoints is None:
+            self._last_setpoints = self._commander.stay(joints)
+        self.send(self._last_setpoints)
 
     def turn_until(self, condition: Callable[[], bool], limit_s: float, why: Callable[[], str]) -> None:
-        """Turn until then. Raises RefusedError after so long."""
+        """Command ticks as `turn` does until a condition is true.
+
+        Args:
+            condition: is checked after each tick.
+            limit_s: how long it may take.
+            why: returns the text of the error.
+
+        Raises:
+            RefusedError: the condition is not true in time.
+        """
         deadline = time.monotonic() + limit_s
         while True:
             self.turn()
@@ -95,6 +135,6 @@ class Commanding:
             if time.monotonic() > deadline:
                 raise RefusedError(why())
 
-    def _lent(self) -> bool:
-        """Whether the host's clock shows the lease, which it does a tick after it was granted."""
-        return self._mine and self.clock is not None and self.clock.lease_epoch != 0
+    def _is_lease_shown(self) -> bool:
+        """Return whether the host's clock shows the lease, one tick after it was granted."""
+        return self._holds_lease and self.clock is not None and self.clock.lease_epoch != 0

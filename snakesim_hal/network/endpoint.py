@@ -16,7 +16,15 @@ _parts = re.compile(
 
 
 def check_endpoint(text: str, origin: str) -> str:
-    """The endpoint, if it is valid. Raises ConfigError; origin: the flag or file that it came from."""
+    """Return an endpoint if it is valid.
+
+    Args:
+        text: the endpoint.
+        origin: the option or file that it came from, for the error.
+
+    Raises:
+        ConfigError: it is not valid.
+    """
     given = f"{origin} {short(text)}"
     if text.startswith("unixsock-stream/") and len(text) > len("unixsock-stream/"):
         return text
@@ -31,7 +39,11 @@ def check_endpoint(text: str, origin: str) -> str:
 
 
 def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, insecure: bool = False) -> None:
-    """Refuse to listen where others could reach a robot and nothing says who may command it. Raises ConfigError."""
+    """Check that a robot may listen on an endpoint.
+
+    Raises:
+        ConfigError: other machines could command the robot there, because no access control is set up.
+    """
     if access_control or insecure or not is_exposed(endpoint):
         return
     raise ConfigError(
@@ -42,7 +54,7 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
 
 
 def is_exposed(endpoint: str) -> bool:
-    """Whether other machines may reach what listens on an endpoint: it is not on loopback."""
+    """Return whether other machines may connect to an endpoint, because it is not on loopback."""
     parts = _parts.fullmatch(endpoint)
     if parts is None:
         return not endpoint.startswith("unixsock-stream/")
@@ -57,14 +69,14 @@ def check_loopback(endpoint: str) -> None:
     """Check that an endpoint on loopback can be reached at all: a new network namespace has that interface down.
 
     Raises:
-        RefusedError: it cannot; whoever waits for something there would wait forever.
+        RefusedError: it cannot; a client would wait there forever.
     """
     parts = _parts.fullmatch(endpoint)
     if parts is None or is_exposed(endpoint):
         return
     host = parts["host"].strip("[]")
-    driver_type = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(driver_type, socket.SOCK_DGRAM) as probe:
+    address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(address_family, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((host, int(parts["port"])))  # sends nothing
         except OSError as error:
@@ -76,7 +88,11 @@ def check_loopback(endpoint: str) -> None:
 
 
 def check_namespace(text: str, origin: str) -> str:
-    """The namespace, if it is valid. Raises ConfigError."""
+    """Return a namespace if it is valid.
+
+    Raises:
+        ConfigError: it is not valid.
+    """
     if not re.fullmatch(r"[^/*$?#\s@]+(/[^/*$?#\s@]+)*", text) or not text.isprintable():
         raise ConfigError(
             f"{origin} {short(text)!r}: this is not a namespace; give a name such as planar13 or lab/planar13, without "

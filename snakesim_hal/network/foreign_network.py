@@ -1,7 +1,9 @@
 """A second Zenoh network, with keys and payloads that are not ours: raw bytes with attachments, no namespace.
 
-A bridge joins it as a client of an explicit endpoint. Nothing that happens there can hold up the robot's own network:
-it is another session, samples are dropped rather than waited for, and only the newest of each key is kept.
+A bridge joins it as a client of an explicit endpoint. That network cannot delay the robot's own one: it is another
+session, samples are dropped rather than waited for, and only the newest of each key is kept.
+
+Threads: the bridge's thread makes every call, except `RawReader.take`, which Zenoh's thread calls.
 """
 
 import time
@@ -14,24 +16,24 @@ from typing import Any
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.network.session import Link, open_zenoh
+from snakesim_hal.network.connection import Link, open_zenoh
 
-WAITING = 10  # queries at one key, as rmw's profile of services has it
+MAX_WAITING_QUERIES = 10  # at one key, as rmw's profile of services has it
 CONNECT_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
 class RawPublisher:
-    """Puts bytes on one key."""
+    """Publishes bytes on one key."""
 
     _publisher: Any
 
     def put(self, payload: bytes, attachment: bytes) -> None:
-        """Send it; dropped when the network is too slow for it."""
+        """Send a payload. It is dropped if the network is too slow for it."""
         self._publisher.put(payload, attachment=attachment)
 
     def heard(self) -> bool:
-        """Whether anybody subscribes to it now."""
+        """Return whether the key has a subscriber now."""
         return bool(self._publisher.matching_status.matching)
 
 
@@ -45,28 +47,28 @@ class RawSample:
 
 
 class RawReader:
-    """The newest samples of one key."""
+    """Keeps the newest samples of one key."""
 
     def __init__(self, depth: int) -> None:
-        """depth: how many are kept."""
+        """Keep at most `depth` samples."""
         self._kept: deque[RawSample] = deque(maxlen=depth)
 
     def take(self, sample: zenoh.Sample) -> None:
-        """Keep one; in Zenoh's thread."""
+        """Keep a sample, in Zenoh's thread."""
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         self._kept.append(RawSample(sample.payload.to_bytes(), attachment, time.monotonic_ns()))
 
     def drain(self) -> list[RawSample]:
-        """What has arrived since the last call, as far as it is kept, oldest first."""
-        found: list[RawSample] = []
+        """Return the kept samples that have arrived since the last call, oldest first."""
+        samples: list[RawSample] = []
         while self._kept:
-            found.append(self._kept.popleft())
-        return found
+            samples.append(self._kept.popleft())
+        return samples
 
     def newest(self) -> RawSample | None:
-        """The newest one that has arrived since the last call; None: nothing."""
-        found = self.drain()
-        return found[-1] if found else None
+        """Return the newest sample that has arrived since the last call; None if there is none."""
+        samples = self.drain()
+        return samples[-1] if samples else None
 
 
 @dataclass(frozen=True)
@@ -78,28 +80,29 @@ class RawQuestion:
     attachment: bytes
 
     def reply(self, payload: bytes, attachment: bytes) -> None:
-        """Answer it at the key that was asked."""
+        """Send the reply on the key of the query."""
         with self._query as query:
             query.reply(query.key_expr, payload, attachment=attachment)
 
 
 @dataclass(frozen=True)
 class RawQueryable:
-    """The queries at one key."""
+    """Receives the queries at one key."""
 
     _queryable: Any
 
     def next(self) -> RawQuestion | None:
-        """The oldest one that waits; None: there is none."""
+        """Return the oldest query that waits; None if there is none."""
         query = self._queryable.try_recv()
         if query is None:
             return None
-        payload, attachment = (b"" if part is None else part.to_bytes() for part in (query.payload, query.attachment))
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        attachment = b"" if query.attachment is None else query.attachment.to_bytes()
         return RawQuestion(query, payload, attachment)
 
 
 class ForeignNetwork:
-    """A session on a network of somebody else. Open one with `open_foreign_network`."""
+    """A session on the network of another system. Open one with `open_foreign_network`."""
 
     def __init__(self, zenoh_session: zenoh.Session) -> None:
         self._zenoh = zenoh_session
@@ -107,26 +110,32 @@ class ForeignNetwork:
         self.id = str(zenoh_session.zid())
 
     def publisher(self, key: str, *, latched: bool = False, background: bool = False) -> RawPublisher:
-        """latched: later subscribers get the last value; background: after everything else, for images."""
+        """Declare a publisher.
+
+        Args:
+            key: where it publishes.
+            latched: later subscribers get the last value.
+            background: its samples are sent after all others, for images.
+        """
         priority = zenoh.Priority.BACKGROUND if background else zenoh.Priority.DATA
         if latched:
-            made: Any = ext.declare_advanced_publisher(
+            publisher: Any = ext.declare_advanced_publisher(
                 self._zenoh, key, cache=ext.CacheConfig(1), publisher_detection=True, priority=priority
             )
         else:
             drop = zenoh.CongestionControl.DROP
-            made = self._zenoh.declare_publisher(key, congestion_control=drop, priority=priority)
-        self._declared.append(made)
-        return RawPublisher(made)
+            publisher = self._zenoh.declare_publisher(key, congestion_control=drop, priority=priority)
+        self._declared.append(publisher)
+        return RawPublisher(publisher)
 
     def queryable(self, key: str) -> RawQueryable:
-        """The queries at a key, of which the newest wait."""
-        queryable = self._zenoh.declare_queryable(key, handlers.RingChannel(WAITING), complete=True)
+        """Declare a receiver of queries at a key. If too many wait, the oldest are dropped."""
+        queryable = self._zenoh.declare_queryable(key, handlers.RingChannel(MAX_WAITING_QUERIES), complete=True)
         self._declared.append(queryable)
         return RawQueryable(queryable)
 
     def reader(self, key: str, depth: int = 1) -> RawReader:
-        """The newest samples of a key."""
+        """Subscribe to a key, and keep its newest samples."""
         reader = RawReader(depth)
         self._declared.append(self._zenoh.declare_subscriber(key, reader.take))
         return reader
@@ -145,7 +154,15 @@ class ForeignNetwork:
 
 @contextmanager
 def open_foreign_network(endpoint: str, *, max_bytes: int) -> Iterator[ForeignNetwork]:
-    """Connect to a router. max_bytes: of a payload from there. Raises NotConnectedError."""
+    """Connect to a router.
+
+    Args:
+        endpoint: of the router.
+        max_bytes: maximum size of a received payload.
+
+    Raises:
+        NotConnectedError: the router does not answer.
+    """
     session = open_zenoh(Link(endpoint, max_bytes=max_bytes), CONNECT_TIMEOUT_S)
     with closing(ForeignNetwork(session)) as network:
         yield network

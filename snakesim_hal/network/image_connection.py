@@ -1,4 +1,4 @@
-"""A connection for images alone, so that they hold up nothing else on a slow link.
+"""Settings of a connection for images alone, so that they delay nothing else on a slow link.
 
 A session sends everything over one connection. Zenoh sends by priority, but nothing overtakes what the kernel has in
 its buffer, nor what waits before the link: an image of 38 kB takes 50 ms at 6 Mbit/s, as long as a lease. On their own
@@ -15,36 +15,39 @@ import zenoh
 from snakesim_hal.network.endpoint import is_exposed
 from snakesim_hal.network.session_file import of_mode
 
-# A piece waits up to a second for the one before it. Nobody waits for the thread that sends images.
-PATIENCE = {"transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1_000_000}
-PIECES = {
+# A piece waits up to a second for the one before it. No other thread waits for the thread that sends images.
+WAIT_SETTINGS = {"transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1_000_000}
+PIECE_SETTINGS = {
     "transport/link/tx/batch_size": 1400,  # bytes of a piece: less than a packet
     # The least that Linux allows: it takes twice the number, for its own records too. With 4096 a state waited twice as
     # long behind images on a link of 6 Mbit/s; on a good link that makes large images faster.
     **{f"transport/link/{kind}/so_sndbuf": 2304 for kind in ("tcp", "tls")},
 }
 # The type of service that `pfifo_fast` sends last, and Wi-Fi as background (AF11).
-BULK = "dscp=0x28"
-MARKED = ("tcp/", "tls/")
+BULK_PARAMETER = "dscp=0x28"
+MARKED_PROTOCOLS = ("tcp/", "tls/")
 
 
 def configure_for_images(config: zenoh.Config) -> None:
-    """Make a client's settings those of its connection for images. Values that a session file has stay."""
+    """Change a client's settings into those of its connection for images. Values of a session file stay."""
     endpoints = of_mode(config, "connect/endpoints", "client")
-    set_unless_given(config, PATIENCE)
+    set_unless_given(config, WAIT_SETTINGS)
     if any(is_exposed(endpoint) for endpoint in endpoints):  # loopback is never slow
-        set_unless_given(config, PIECES)
-    config.insert_json5("connect/endpoints", json.dumps([_marked(endpoint) for endpoint in endpoints]))
+        set_unless_given(config, PIECE_SETTINGS)
+    marked = [_mark_as_bulk(endpoint) for endpoint in endpoints]
+    config.insert_json5("connect/endpoints", json.dumps(marked))
 
 
-def _marked(endpoint: str) -> str:
-    if not endpoint.startswith(MARKED) or "dscp=" in endpoint:
+def _mark_as_bulk(endpoint: str) -> str:
+    """Return an endpoint with the type of service for bulk data, unless it names one already."""
+    if not endpoint.startswith(MARKED_PROTOCOLS) or "dscp=" in endpoint:
         return endpoint
-    return f"{endpoint};{BULK}" if "#" in endpoint else f"{endpoint}#{BULK}"
+    separator = ";" if "#" in endpoint else "#"
+    return f"{endpoint}{separator}{BULK_PARAMETER}"
 
 
 def set_unless_given(config: zenoh.Config, settings: Mapping[str, Any]) -> None:
-    """Set values that are as Zenoh has them by default."""
+    """Change the settings that still have Zenoh's default value."""
     untouched = zenoh.Config()
     for key, value in settings.items():
         if config.get_json(key) == untouched.get_json(key):

@@ -1,7 +1,9 @@
-"""A network within one process: sessions that hand each other the bytes that Zenoh would carry, in the same thread.
+"""A network within one process: its sessions pass each other the bytes that Zenoh would carry.
 
-A message has reached its readers when `put` returns; the order is kept, and nothing is lost. A query first runs the
-one that answers it (`LocalNetwork.answer`), because both are in the same thread.
+A message has reached its readers when `put` returns; the order is kept, and nothing is lost.
+
+Threads: one thread makes every call, so callbacks run in the thread that publishes. A query therefore first runs the
+part of the process that answers it (`LocalNetwork.answer`). Only `LocalQuery.reply` may be called from another thread.
 """
 
 import time
@@ -31,47 +33,54 @@ Take = Callable[[Arrival], None]
 
 
 class LocalNetwork:
-    """Where the sessions of one process meet."""
+    """Connects the sessions of one process. Create sessions with `session`."""
 
     def __init__(self) -> None:
+        """Start without sessions."""
         self.answer: Callable[[], None] = lambda: None  # runs the parts that answer queries
+        # Callbacks, each with the key or pattern that it is for.
         self.subscribers: list[tuple[str, Take]] = []
-        self.askable: list[tuple[str, Callable[[Question], None]]] = []
+        self.queryables: list[tuple[str, Callable[[Question], None]]] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
+        # What sessions have published.
         self.tokens: list[str] = []
-        self.latched: dict[str, Arrival] = {}
-        self._takers: dict[str, list[Take]] = {}  # by key, as `subscribers` says
+        self.latched: dict[str, Arrival] = {}  # by key
+        self._takers: dict[str, list[Take]] = {}  # cache of `takers`, by key
 
     def session(self) -> "LocalSession":
-        """A new session."""
+        """Return a new session."""
         return LocalSession(self)
 
     def close(self) -> None:
-        """Let go of the parts that answered queries; they hold this network."""
+        """Drop the reference to the parts that answer queries, because they refer to this network."""
         self.answer = lambda: None
 
     def takers(self, key: str) -> list[Take]:
-        """The subscribers of a key."""
-        found = self._takers.get(key)
-        if found is None:
-            found = self._takers[key] = [take for pattern, take in self.subscribers if intersects(pattern, key)]
-        return found
+        """Return the callbacks of all subscribers of a key."""
+        takers = self._takers.get(key)
+        if takers is None:
+            takers = [take for pattern, take in self.subscribers if intersects(pattern, key)]
+            self._takers[key] = takers
+        return takers
 
     def subscribe(self, pattern: str, take: Take) -> Callable[[], None]:
-        """Call `take` for what is published from now on. Returns a function that ends it."""
-        row = pattern, take
-        self.subscribers.append(row)
+        """Call `take` for all samples that are published from now on. Returns a function that ends it."""
+        subscriber = (pattern, take)
+        self.subscribers.append(subscriber)
         self._takers.clear()
 
-        def end() -> None:
-            self.subscribers.remove(row)
+        def unsubscribe() -> None:
+            self.subscribers.remove(subscriber)
             self._takers.clear()
 
-        return end
+        return unsubscribe
 
     def show(self, key: str, present: bool) -> None:
-        """A liveliness token comes or goes."""
-        (self.tokens.append if present else self.tokens.remove)(key)
+        """Add or remove a liveliness token, and call its watchers."""
+        if present:
+            self.tokens.append(key)
+        else:
+            self.tokens.remove(key)
         for pattern, take in self.watchers:
             if intersects(pattern, key):
                 take(key, present)
@@ -79,19 +88,19 @@ class LocalNetwork:
 
 @dataclass
 class Declared:
-    """What a session has declared; Zenoh's own have this method too."""
+    """A subscription, token or queryable of a session. Zenoh's own objects have the same method."""
 
     undeclare: Callable[[], None]
 
 
 class LocalReader(Reader[MessageT]):
-    """The newest samples of one key."""
+    """Reads the newest samples of one key from a queue that its subscription fills."""
 
     def __init__(self, declared: Declared, kept: deque[Arrival], message: type[MessageT], rejected: Any) -> None:
         super().__init__(declared, message, rejected)
         self._kept = kept
 
-    def _arrived(self) -> list[Arrival]:
+    def _take_samples(self) -> list[Arrival]:
         arrived = list(self._kept)
         self._kept.clear()
         return arrived
@@ -102,20 +111,20 @@ class LocalReader(Reader[MessageT]):
 
 @dataclass
 class LocalQuery:
-    """Takes the answer to a question."""
+    """A query that waits for answers."""
 
-    asked: int  # how many have been asked
+    asked: int  # number of queryables that have received it
     answers: Mailbox[tuple[str, bytes, str]] = field(default_factory=Mailbox[tuple[str, bytes, str]])
 
     def reply(self, key: str, payload: bytes, encoding: str) -> None:
-        """From any thread."""
+        """Store an answer. May be called from any thread."""
         self.answers.put((key, payload, encoding))
 
     def drop(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: there is no query of Zenoh to release."""
 
     def answered(self) -> Answer | None:
-        """The next answer, if it is there."""
+        """Return the next answer; None if there is none yet."""
         if self.answers.empty():
             return None
         _, payload, encoding = self.answers.get_nowait()
@@ -130,15 +139,15 @@ class LocalSession(Session):
         self._network = network
 
     def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
-        """Nothing is lost in either case."""
-        return self._local_publisher(key, message, latched=False)
+        """Declare a publisher. It is lossless in any case."""
+        return self._declare_publisher(key, message, latched=False)
 
     def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
-        """A publisher whose last value is given to readers that come later."""
-        return self._local_publisher(key, message, latched=True)
+        return self._declare_publisher(key, message, latched=True)
 
-    def _local_publisher(self, key: str, message: type[MessageT], *, latched: bool) -> Publisher[MessageT]:
-        network, encoding = self._network, encoding_of(message)
+    def _declare_publisher(self, key: str, message: type[MessageT], *, latched: bool) -> Publisher[MessageT]:
+        network = self._network
+        encoding = encoding_of(message)
 
         def send(payload: bytes) -> None:
             arrival = Arrival(key, payload, encoding, time.monotonic_ns())
@@ -147,49 +156,51 @@ class LocalSession(Session):
             for take in network.takers(key):
                 take(arrival)
 
-        return self._routed(key, Publisher(message, send, lambda: bool(network.takers(key))))
+        def has_subscribers() -> bool:
+            return bool(network.takers(key))
+
+        return self._register_publisher(key, Publisher(message, send, has_subscribers))
 
     def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
-        """The newest `depth` samples of a stream."""
         kept: deque[Arrival] = deque(maxlen=depth or depth_of(message))
-        return LocalReader(self._subscribe(key, kept.append), kept, message, self.rejected)
+        declared = self._subscribe(key, kept.append)
+        return LocalReader(declared, kept, message, self.rejected)
 
     def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
-        """Like `reader`, and it gets the value that was latched before it came."""
         kept: deque[Arrival] = deque(maxlen=READER_DEPTH)
         if key in self._network.latched:
             kept.append(self._network.latched[key])
-        return LocalReader(self._subscribe(key, kept.append), kept, message, self.rejected)
+        declared = self._subscribe(key, kept.append)
+        return LocalReader(declared, kept, message, self.rejected)
 
     def on_arrival(self, key: str, take: Take) -> None:
-        """Call `take` for every sample."""
+        """Call `take` for every sample, in the publisher's thread."""
         self._subscribe(key, take)
 
-    on_urgent_arrival = on_arrival  # all are at once
+    on_urgent_arrival = on_arrival  # every sample arrives at once
 
     def on_latched_arrival(self, key: str, take: Take) -> None:
-        """Like `on_arrival`, and for the values that were latched before."""
-        for at, arrival in list(self._network.latched.items()):
-            if intersects(key, at):
+        """Call `take` as `on_arrival` does, and also for the values that were latched before."""
+        for latched_key, arrival in list(self._network.latched.items()):
+            if intersects(key, latched_key):
                 take(arrival)
         self._subscribe(key, take)
 
     def on_question(self, key: str, take: Callable[[Question], None]) -> None:
-        """Call `take` for every query."""
-        row = key, take
-        self._network.askable.append(row)
-        self._declare(lambda: self._network.askable.remove(row))
+        """Call `take` for every query, in the thread of the session that sends it."""
+        queryable = (key, take)
+        self._network.queryables.append(queryable)
+        self._declare(lambda: self._network.queryables.remove(queryable))
 
     def declare_token(self, key: str) -> None:
-        """Show a liveliness token for as long as the session lives."""
         self._network.show(key, True)
         self._declare(lambda: self._network.show(key, False))
 
     def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
-        """Call `take(key, present)` for every token that is there, comes or goes."""
-        row = key, take
-        self._network.watchers.append(row)
-        self._declare(lambda: self._network.watchers.remove(row))
+        """Call `take(key, present)` for every token that exists, appears or vanishes, in the declaring thread."""
+        watcher = (key, take)
+        self._network.watchers.append(watcher)
+        self._declare(lambda: self._network.watchers.remove(watcher))
         for token in self._network.tokens:
             if intersects(key, token):
                 take(token, True)
@@ -209,15 +220,16 @@ class LocalSession(Session):
         return declared
 
     def put_question(self, pattern: str, request: Message) -> LocalQuery:
-        """Ask, without waiting: whoever answers may have to take a turn first."""
-        asked = [(key, take) for key, take in self._network.askable if intersects(pattern, key)]
-        query = LocalQuery(len(asked))
-        for key, take in asked:
+        """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
+        matching = [(key, take) for key, take in self._network.queryables if intersects(pattern, key)]
+        query = LocalQuery(len(matching))
+        for key, take in matching:
             take(Question(key, encode(request), encoding_of(type(request)), query))
         return query
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        query, decoder = self.put_question(pattern, request), Decoder(Answer)
+        decoder = Decoder(Answer)
+        query = self.put_question(pattern, request)
         self._network.answer()
         deadline = time.monotonic() + timeout_s
         for _ in range(query.asked):

@@ -34,7 +34,7 @@ class LocalRobot:
 
     @staticmethod
     def on(link: "Link", robot: str, backend: str, stop_port: socket.socket, config: str | None = None) -> "LocalRobot":
-        """A robot for which this process is responsible."""
+        """Return the entry of a robot for which this process is responsible."""
         stop_host, port = stop_port.getsockname()[:2]
         return LocalRobot(
             namespace=link.namespace or robot,
@@ -62,8 +62,13 @@ def robot_folder(robot: str, backend: str, hardware: str) -> Path:
 
 @contextlib.contextmanager
 def registered(robot: LocalRobot) -> Iterator[str | None]:
-    """Register a robot for tools. Yields why they will not find it, if the file cannot be written; otherwise None."""
-    path, failure = _live() / f"{robot.pid}.json", None
+    """Register a robot for tools, for as long as the context lasts.
+
+    Yields:
+        The reason why tools will not find it, if the file cannot be written; otherwise None.
+    """
+    path = _live() / f"{robot.pid}.json"
+    failure = None
     only = "`snakesim status` and `estop` find this run only with --endpoint"
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -85,7 +90,7 @@ def registered(robot: LocalRobot) -> Iterator[str | None]:
 
 
 def local_robots() -> list[LocalRobot]:
-    """Every robot whose process lives, by process id. Removes files of dead ones."""
+    """Return every robot whose process lives, sorted by file name. Removes the files of ended processes."""
     found: list[LocalRobot] = []
     for path in sorted(_live().glob("*.json")) if _live().is_dir() else []:
         with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
@@ -101,10 +106,19 @@ def local_robots() -> list[LocalRobot]:
 
 
 def _decoded(text: bytes) -> LocalRobot:
-    """The robot of a file. Raises ValueError or TypeError when it is none."""
+    """Return the robot in a file.
+
+    Raises:
+        ValueError: it is not JSON.
+        TypeError: a value is missing, or has a wrong type.
+    """
     values = json.loads(text)
-    robot = LocalRobot(**{one.name: values[one.name] for one in fields(LocalRobot) if one.name in values})
-    wrong = [one.name for one in fields(robot) if not isinstance(getattr(robot, one.name), cast(type, one.type))]
+    known = {field.name: values[field.name] for field in fields(LocalRobot) if field.name in values}
+    robot = LocalRobot(**known)
+    wrong: list[str] = []
+    for field in fields(robot):
+        if not isinstance(getattr(robot, field.name), cast(type, field.type)):
+            wrong.append(field.name)
     if wrong:
         raise TypeError(f"{', '.join(wrong)} cannot be meant")
     return robot
@@ -115,6 +129,7 @@ def _live() -> Path:
 
 
 def _is_locked(handle: int) -> bool:
+    """Return whether the process that wrote a file still lives: it holds a lock on it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -17,54 +17,61 @@ ItemT = TypeVar("ItemT")
 
 
 class Mailbox(Generic[ItemT]):
-    """Any number of threads put, one takes. Raises queue.Empty, as the queues of the standard library do.
+    """A queue into which any thread puts items, and from which one thread takes them.
 
     It may have lanes: items of a lower lane are taken before those of a higher one. A full lane drops its oldest item.
     """
 
     def __init__(self, limits: Sequence[int | None] = (None,)) -> None:
-        """limits: how many items each lane keeps; None: any number."""
+        """Create a lane for each limit, which is how many items it keeps; None: any number."""
         self._lanes: list[deque[ItemT]] = [deque(maxlen=limit) for limit in limits]
-        self._bell = threading.Lock()  # held: nothing new since the last look
+        self._bell = threading.Lock()  # held: no new item since the taking thread looked last
         self._bell.acquire()
 
     def put(self, item: ItemT, lane: int = 0) -> None:
-        """Add an item; never waits."""
+        """Add an item, from any thread; never waits."""
         self._lanes[lane].append(item)
         if self._bell.locked():
             with contextlib.suppress(RuntimeError):  # another thread has just released it
                 self._bell.release()
 
     def full(self, lane: int = 0) -> bool:
-        """Whether one more item would displace the oldest."""
+        """Return whether one more item would displace the oldest of a lane."""
         return len(self._lanes[lane]) == self._lanes[lane].maxlen
 
     def get(self, timeout: float | None = None) -> ItemT:
-        """The oldest item of the lowest lane; waits for one, at most `timeout` seconds."""
+        """Take the oldest item of the lowest lane. Waits for one, at most `timeout` seconds; None: without a limit.
+
+        Raises:
+            queue.Empty: there is no item in time, as in the queues of the standard library.
+        """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             for lane in self._lanes:
                 if lane:
                     return lane.popleft()
-            left_s = -1.0 if deadline is None else deadline - time.monotonic()
-            if deadline is not None and left_s <= 0.0:
+            if deadline is None:
+                self._bell.acquire()
+                continue
+            left_s = deadline - time.monotonic()
+            if left_s <= 0.0:
                 raise Empty
             self._bell.acquire(timeout=left_s)
 
     def wait(self, timeout: float) -> None:
-        """Until there is an item, at most `timeout` seconds; takes none."""
+        """Wait until there is an item, at most `timeout` seconds, without taking it."""
         deadline = time.monotonic() + timeout
         while self.empty() and (left_s := deadline - time.monotonic()) > 0.0:
             self._bell.acquire(timeout=left_s)
 
     def get_nowait(self) -> ItemT:
-        """The oldest item of the lowest lane, if there is one."""
+        """Take the oldest item of the lowest lane, without waiting; raises queue.Empty if there is none."""
         return self.get(timeout=0.0)
 
     def empty(self) -> bool:
-        """Whether there are no items now."""
+        """Return whether there are no items now."""
         return not any(self._lanes)
 
     def qsize(self) -> int:
-        """Number of items now."""
+        """Return the number of items now."""
         return sum(map(len, self._lanes))

@@ -2,6 +2,9 @@
 
 Over it the host sends its description and its status, and takes requests. So the starter knows, without
 trusting anything on the network, which robot that is, its state, and that it is this one that is armed.
+
+Threads: any thread of the host may send with `HostEnd.say`; requests arrive in a thread of the channel. The starter
+makes every call of `StarterEnd` from one thread.
 """
 
 import contextlib
@@ -17,7 +20,7 @@ MAX_BYTES = 1 << 18
 
 
 class HostMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """A message of the host: one of these at a time."""
+    """A message of the host, with one of these fields set."""
 
     description: Description | None = None
     status: Status | None = None
@@ -25,7 +28,7 @@ class HostMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def socket_pair() -> tuple[socket.socket, socket.socket]:
-    """Two ends with message boundaries: one for the starter, one to be inherited by the host."""
+    """Return two ends with message boundaries: one for the starter, one to be inherited by the host."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
 
@@ -33,16 +36,18 @@ class HostEnd:
     """The host's end. Never waits: messages that the starter does not read are lost."""
 
     def __init__(self, inherited: socket.socket | None) -> None:
-        """inherited: None for a host that was started on its own."""
+        """Use an inherited socket; None: the host was started on its own, and messages go nowhere."""
         self._socket = inherited
 
     @staticmethod
     def of(descriptor: int | None) -> "HostEnd":
-        """From the inherited file descriptor."""
-        return HostEnd(None if descriptor is None else socket.socket(fileno=descriptor))
+        """Return the end of an inherited file descriptor; None: the host was started on its own."""
+        if descriptor is None:
+            return HostEnd(None)
+        return HostEnd(socket.socket(fileno=descriptor))
 
     def say(self, message: HostMessage) -> None:
-        """Send a message to the starter."""
+        """Send a message to the starter. It is lost if the starter does not read."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
@@ -54,7 +59,7 @@ class HostEnd:
             return
         decoder = msgspec.msgpack.Decoder(LifecycleRequest)
 
-        def listen() -> None:
+        def receive_requests() -> None:
             while True:
                 try:
                     request = opened.recv(MAX_BYTES)
@@ -64,38 +69,43 @@ class HostEnd:
                     return
                 take(decoder.decode(request), lambda answer: self.say(HostMessage(answer=answer)))
 
-        start_worker("private channel", listen)
+        start_worker("private channel", receive_requests)
 
 
 class StarterEnd:
-    """The starter's end: the last messages of its host."""
+    """The starter's end. It keeps the last messages of its host."""
 
     def __init__(self, opened: socket.socket) -> None:
+        """Use an open socket; it never blocks from now on."""
         self._socket = opened
         self._socket.setblocking(False)
         self._decoder = msgspec.msgpack.Decoder(HostMessage)
         self.description: Description | None = None
         self.status: Status | None = None
         self.answers: list[Answer] = []
-        self.resets = 0  # how often another host has begun in the same process
+        self.resets = 0  # how often another host has started in the same process
 
     def take_in(self) -> None:
-        """Read new messages."""
+        """Read all messages that have arrived, without waiting."""
         while True:
             try:
-                message = self._socket.recv(MAX_BYTES)
-            except OSError:  # no message, or the host is gone
+                data = self._socket.recv(MAX_BYTES)
+            except OSError:  # no message, or the host has ended
                 return
-            if not message:
+            if not data:
                 return
-            said = self._decoder.decode(message)
-            if said.description is not None and self.description is not None:  # it was reset
-                self.status, self.resets = None, self.resets + 1
-                self.answers.clear()
-            self.description = said.description or self.description
-            self.status = said.status or self.status
-            if said.answer is not None:
-                self.answers.append(said.answer)
+            self._store(self._decoder.decode(data))
+
+    def _store(self, message: HostMessage) -> None:
+        """Keep the content of a message. A second description means that the host was reset."""
+        if message.description is not None and self.description is not None:
+            self.status = None
+            self.resets += 1
+            self.answers.clear()
+        self.description = message.description or self.description
+        self.status = message.status or self.status
+        if message.answer is not None:
+            self.answers.append(message.answer)
 
     def ask(self, request: LifecycleRequest) -> None:
         """Send a request; the answer is appended to `answers`."""

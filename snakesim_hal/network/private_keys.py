@@ -1,4 +1,4 @@
-"""Private keys that a Zenoh file names: whether every user of this computer may read them."""
+"""Checks whether every user of this computer may read the private keys that a Zenoh file names."""
 
 import json
 import stat
@@ -13,7 +13,7 @@ _NAMED = ("connect_private_key", "listen_private_key")  # below transport/link/t
 
 
 def readable_by_all(key: Path) -> str:
-    """What is wrong with who may read a private key, and the way out; empty when nothing is."""
+    """Return a text if every user may read a private key, with the remedy; else an empty text."""
     try:
         mode = stat.S_IMODE(key.stat().st_mode)
     except OSError:
@@ -24,7 +24,7 @@ def readable_by_all(key: Path) -> str:
 
 
 def warn_of_readable_keys(settings: zenoh.Config) -> None:
-    """Say on stderr which keys everybody may read. It refuses nothing: a stop must get through."""
+    """Warn on stderr of keys that every user may read. It refuses nothing, because a stop must get through."""
     for name in _NAMED:
         named = json.loads(settings.get_json(f"transport/link/tls/{name}"))
         if isinstance(named, str):
@@ -33,5 +33,6 @@ def warn_of_readable_keys(settings: zenoh.Config) -> None:
 
 @cache  # a command may read its file twice
 def _warn(key: Path) -> None:
-    if wrong := readable_by_all(key):
-        print_stderr(f"snakesim: warning: {wrong}, and renew it: snakesim deploy certs --rotate")
+    problem = readable_by_all(key)
+    if problem:
+        print_stderr(f"snakesim: warning: {problem}, and renew it: snakesim deploy certs --rotate")

@@ -1,4 +1,7 @@
-"""Measures a network without moving anything: round trips, clock offsets, and which keys answer."""
+"""Measures a network without moving anything: round trips, clock offsets, and which keys answer.
+
+Threads: the caller's thread makes every call; samples arrive in Zenoh's threads while it waits.
+"""
 
 import statistics
 import time
@@ -12,52 +15,62 @@ import zenoh
 from snakesim_hal.base.errors import NotConnectedError
 
 UNUSED_KEY = "nobody/is/here"
-TRIES = 9
+ROUND_TRIPS = 9  # of which the median counts
 
 
 class Probe:
-    """A session that only looks. Open one with `open_probe`."""
+    """A session that only measures. Open one with `open_probe`."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
 
     def round_trip_s(self) -> float:
-        """To the router and back, typically."""
-        took: list[float] = []
-        for _ in range(TRIES):
-            began = time.perf_counter()
+        """Return the median duration of a query to the router and back, in s."""
+        durations_s: list[float] = []
+        for _ in range(ROUND_TRIPS):
+            began_s = time.perf_counter()
             list(self._session.liveliness().get(UNUSED_KEY, timeout=1.0))
-            took.append(time.perf_counter() - began)
-        return statistics.median(took)
+            durations_s.append(time.perf_counter() - began_s)
+        return statistics.median(durations_s)
 
     def answers(self, key: str, timeout_s: float = 1.0) -> int:
-        """How many answer an empty query, which a HAL host refuses without any effect."""
+        """Return how many processes answer an empty query, which a HAL host refuses without any effect."""
         replies = self._session.get(key, timeout=timeout_s, target=zenoh.QueryTarget.ALL)
         return sum(reply.ok is not None for reply in replies)
 
     def clock_offsets_s(self, patterns: Sequence[str], listen_s: float) -> dict[str, float]:
-        """By key, how far the clock of who publishes there is ahead of this computer's, in s.
+        """Return, for each key, how far the publisher's clock is ahead of this computer's clock, in s.
 
-        Zenoh stamps a sample where it is put. The way here takes time, so that the largest difference is nearest to the
-        truth; it lacks the shortest way. Such a clock is never behind that of those whose samples it has read.
+        Zenoh timestamps samples at the publisher, so each difference is the clock offset minus the network latency.
+        The maximum over many samples is the best estimate; it is too small by the minimum latency. The clock of such a
+        timestamp is never behind the timestamps of samples that its process has read.
+
+        Args:
+            patterns: keys to listen to; they may have wildcards.
+            listen_s: how long to listen.
         """
-        ahead: dict[str, list[float]] = defaultdict(list)
+        offsets_s: dict[str, list[float]] = defaultdict(list)
 
         def take(sample: zenoh.Sample) -> None:
             if sample.timestamp is not None:
-                sent = sample.timestamp.get_time()
-                ahead[str(sample.key_expr)].append((sent.astimezone(UTC) - datetime.now(UTC)).total_seconds())
+                sent = sample.timestamp.get_time().astimezone(UTC)
+                offset = sent - datetime.now(UTC)
+                offsets_s[str(sample.key_expr)].append(offset.total_seconds())
 
         subscribers = [self._session.declare_subscriber(pattern, take) for pattern in patterns]
         time.sleep(listen_s)
         for subscriber in subscribers:
             subscriber.undeclare()
-        return {key: max(differences) for key, differences in ahead.items()}
+        return {key: max(offsets) for key, offsets in offsets_s.items()}
 
 
 @contextmanager
 def open_probe(settings: str) -> Iterator[Probe]:
-    """Connect. settings: of a session, as JSON5. Raises NotConnectedError when no router accepts it."""
+    """Connect to a router; settings: of a session, as JSON5.
+
+    Raises:
+        NotConnectedError: no router accepts the session.
+    """
     zenoh.init_log_from_env_or("off")
     try:
         session = zenoh.open(zenoh.Config.from_json5(settings))

@@ -1,4 +1,7 @@
-"""Who is on a robot's network: every process shows an entry, and the host compares them before anything is armed."""
+"""Entries of all processes on a robot's network. The host compares them before it arms.
+
+Threads: Zenoh's threads call `_on_token` and `_store_entry`; the host's thread calls the public methods.
+"""
 
 import os
 import secrets
@@ -21,7 +24,7 @@ MAX_ENTRIES = 256
 
 
 def own_entry(name: str, config: RunConfig | None = None) -> Process:
-    """The entry of this process. config: None for one that uses none."""
+    """Return the entry of this process; config: of its run, None if it uses none."""
     return Process(
         name=name,
         machine=socket.gethostname()[:64] or "unnamed",
@@ -35,9 +38,12 @@ def own_entry(name: str, config: RunConfig | None = None) -> Process:
 
 
 def show_process(session: Session, entry: Process) -> Publisher[Process]:
-    """Show an entry for as long as the session lives. The token comes first, so that a host waits for the entry.
+    """Publish an entry for as long as the session lives.
 
-    Returns the publisher, for later changes.
+    The liveliness token is declared first, so that a host waits for the entry.
+
+    Returns:
+        The publisher, for later changes.
     """
     key = keys.process(entry.name, secrets.token_hex(4))
     session.declare_token(key)
@@ -47,7 +53,7 @@ def show_process(session: Session, entry: Process) -> Publisher[Process]:
 
 
 def differences(one: Process, other: Process) -> list[str]:
-    """How two processes of one robot are set up differently; values in the order of the arguments."""
+    """Return the differences between two processes of one robot as texts, with values in the order of the arguments."""
     found = [
         f"`{field}` is {one.settings[field]} on {place(one)}, {other.settings[field]} on {place(other)}"
         for field in one.settings
@@ -62,47 +68,49 @@ def differences(one: Process, other: Process) -> list[str]:
 
 
 def place(entry: Process) -> str:
-    """Where a process runs."""
+    """Return the machine, name and id of a process as text."""
     return f"{entry.machine} ({entry.name}, process {entry.pid})"
 
 
 class ProcessEntries:
-    """The entries of all processes that are present now. Filled in Zenoh's threads, read in the host's."""
+    """The entries of all processes that are present now."""
 
     def __init__(self, session: Session) -> None:
+        """Subscribe to entries, also to those that were published before."""
         self._session = session
         self._decoder = Decoder(Process)
         self._entries: dict[str, Process] = {}
         self._alive: set[str] = set()
-        session.on_alive(self._take_token, keys.PROCESS_ALL)
-        session.on_latched_arrival(keys.PROCESS_ALL, self._take_entry)
+        session.on_alive(self._on_token, keys.PROCESS_ALL)
+        session.on_latched_arrival(keys.PROCESS_ALL, self._store_entry)
 
     def against(self, own: Process, names: Collection[str]) -> list[str]:
-        """What speaks against working together with the processes of these names, as texts."""
-        found: list[str] = []
+        """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
+        problems: list[str] = []
         for key in sorted(self._alive.copy()):
             name = keys.service_of(key).rpartition("-")[0]
             if name not in names:
                 continue
             entry = self._entries.get(key)
             if entry is None or entry.name != name:
-                found.append(f"{keys.service_of(key)} has not published its settings yet")
+                problems.append(f"{keys.service_of(key)} has not published its settings yet")
             else:
-                found += differences(entry, own)
-        return found
+                problems += differences(entry, own)
+        return problems
 
     def waits(self) -> dict[str, list[str]]:
-        """What processes that are present wait for: name -> keys."""
+        """Return the keys that each present process waits for, by its name."""
         entries = [self._entries[key] for key in sorted(self._alive.copy()) if key in self._entries]
         return {entry.name: entry.waits_for for entry in entries if entry.waits_for}
 
-    def _take_token(self, key: str, present: bool) -> None:
+    def _on_token(self, key: str, present: bool) -> None:
         if present and len(self._alive) < MAX_ENTRIES:
             self._alive.add(key)
         elif not present:
             self._alive.discard(key)  # the entry stays: if only the link was cut, it is not sent again
 
-    def _take_entry(self, arrival: Arrival) -> None:
+    def _store_entry(self, arrival: Arrival) -> None:
+        """Store an entry. If there are too many, entries of vanished processes make room; else it is dropped."""
         if len(self._entries) >= MAX_ENTRIES and arrival.key not in self._entries:
             for key in self._entries.keys() - self._alive:
                 self._entries.pop(key, None)

@@ -26,40 +26,41 @@ from snakesim_hal.wire.messages import (
     World,
 )
 
-MAX_PATH_M = 1e5
-OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
-OF_POWER = ("voltage_v", "current_a", "motor_c", "board_c", "leak", "valid")
-OF_IMUS = ("angular_velocity_rad_s", "acceleration_m_s2")
+MAX_PATH_M = 1e5  # a longer path exceeds the bounds of `control/state`
+JOINT_STATE_LISTS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
+POWER_LISTS = ("voltage_v", "current_a", "motor_c", "board_c", "leak", "valid")
+IMU_LISTS = ("angular_velocity_rad_s", "acceleration_m_s2")
 UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
 
 def mismatch(message: Message, robot: Description) -> WireError | None:
-    """Why a message does not fit this robot, with a reason to count by; None when it fits."""
-    joints, last_link = len(robot.joints), len(robot.links) - 1
+    """Return the error of a message that does not fit a robot, with a reason to count by; None if it fits."""
+    joints = len(robot.joints)
+    last_link = len(robot.links) - 1
     match message:
         case JointState():
-            return None if message.is_of(joints) else _lengths(message, OF_JOINTS, joints, "one a joint")
+            return None if message.is_of(joints) else _check_lengths(message, JOINT_STATE_LISTS, joints, "one a joint")
         case Power():
-            return _lengths(message, OF_POWER, joints, "one a joint")
+            return _check_lengths(message, POWER_LISTS, joints, "one a joint")
         case Imu():
-            wrong = _lengths(message, OF_IMUS, len(message.link), "one for each of Imu.link")
-            return wrong or _beyond("Imu.link", max(message.link, default=0), last_link)
+            wrong = _check_lengths(message, IMU_LISTS, len(message.link), "one for each of Imu.link")
+            return wrong or _check_link("Imu.link", max(message.link, default=0), last_link)
         case Contacts():
-            return _touching(message, last_link)
+            return _check_contacts(message, last_link)
         case DepthImage() | ColorImage():
             pixels = message.width * message.height
             if isinstance(message, DepthImage):
-                wrong = _lengths(message, ("depth",), 2 * pixels, "two bytes a pixel")
+                wrong = _check_lengths(message, ("depth",), 2 * pixels, "two bytes a pixel")
             else:
-                wrong = _lengths(message, ("rgb",), 3 * pixels, "three bytes a pixel")
-            return wrong or _mounted(message, last_link)
+                wrong = _check_lengths(message, ("rgb",), 3 * pixels, "three bytes a pixel")
+            return wrong or _check_mount(message, last_link)
         case MountedSample():
-            return _mounted(message, last_link)
+            return _check_mount(message, last_link)
         case World():
-            turned = message.base_orientation_wxyz
-            return _touching(message, last_link) or _no_rotation("World.base_orientation_wxyz", turned)
+            wrong = _check_contacts(message, last_link)
+            return wrong or _check_rotation("World.base_orientation_wxyz", message.base_orientation_wxyz)
         case Pose():
-            return _no_rotation("Pose.orientation_wxyz", message.orientation_wxyz)
+            return _check_rotation("Pose.orientation_wxyz", message.orientation_wxyz)
         case Trajectory():
             if _is_path(np.array(message.path_w)):
                 return None
@@ -69,33 +70,35 @@ def mismatch(message: Message, robot: Description) -> WireError | None:
             return None
 
 
-def _lengths(message: Message, fields: Sequence[str], wanted: int, why: str) -> WireError | None:
+def _check_lengths(message: Message, fields: Sequence[str], wanted: int, why: str) -> WireError | None:
+    """Return the error of the first field that has not the wanted length."""
     for field in fields:
-        if (length := len(getattr(message, field))) != wanted:
+        length = len(getattr(message, field))
+        if length != wanted:
             where = f"{type(message).__name__}.{field}"
             return WireError("wrong_length", f"{where} has length {length}, must have {wanted}: {why}")
     return None
 
 
-def _touching(message: Contacts | World, last_link: int) -> WireError | None:
+def _check_contacts(message: Contacts | World, last_link: int) -> WireError | None:
     furthest = max((contact.link for contact in message.contacts), default=0)
-    return _beyond(f"{type(message).__name__}.contacts: link", furthest, last_link)
+    return _check_link(f"{type(message).__name__}.contacts: link", furthest, last_link)
 
 
-def _mounted(message: MountedSample, last_link: int) -> WireError | None:
+def _check_mount(message: MountedSample, last_link: int) -> WireError | None:
     name = type(message).__name__
-    wrong = _beyond(f"{name}.link", message.link, last_link)
-    return wrong or _no_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
+    wrong = _check_link(f"{name}.link", message.link, last_link)
+    return wrong or _check_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
 
 
-def _beyond(where: str, link: int, last_link: int) -> WireError | None:
+def _check_link(where: str, link: int, last_link: int) -> WireError | None:
     if link <= last_link:
         return None
     return WireError("wrong_length", f"{where} is {link}, must be 0 (tail) to {last_link} (head)")
 
 
 def _is_path(points_w: NDArray[np.float64]) -> bool:
-    """Whether it is a usable path; longer ones would exceed the bounds of `control/state`."""
+    """Return whether points of shape (n, 2) are a usable path."""
     return (
         is_line(points_w)
         and float(np.hypot(*np.diff(points_w, axis=0).T).sum()) <= MAX_PATH_M
@@ -103,7 +106,7 @@ def _is_path(points_w: NDArray[np.float64]) -> bool:
     )
 
 
-def _no_rotation(where: str, wxyz: Sequence[float]) -> WireError | None:
+def _check_rotation(where: str, wxyz: Sequence[float]) -> WireError | None:
     norm = math.hypot(*wxyz)
     if abs(norm - 1.0) <= UNIT_NORM_ERROR:
         return None

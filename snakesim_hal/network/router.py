@@ -1,4 +1,4 @@
-"""A Zenoh router from a JSON5 file: `snakesim router`."""
+"""Runs a Zenoh router from a JSON5 file: `snakesim router`."""
 
 import json
 import os
@@ -15,7 +15,11 @@ from snakesim_hal.network.session_file import of_mode, read_zenoh_file, refused_
 
 
 def router_settings(config: Path) -> zenoh.Config:
-    """The settings in a router's JSON5 file; opens nothing. Raises ConfigError."""
+    """Read the settings in a router's JSON5 file, without opening anything.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not for a router.
+    """
     _, settings = read_zenoh_file(config)
     if json.loads(settings.get_json("mode")) != "router":
         raise ConfigError(f'{config}: `mode` must be "router"')
@@ -23,16 +27,23 @@ def router_settings(config: Path) -> zenoh.Config:
 
 
 def _denies_by_default(settings: zenoh.Config) -> bool:
+    """Return whether the access control denies everything that its rules do not allow."""
     rules = json.loads(settings.get_json("access_control"))
     return bool(rules["enabled"]) and rules["default_permission"] == "deny"
 
 
 @contextmanager
 def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
-    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError.
+    """Run a Zenoh router from a JSON5 file for as long as the context lives.
 
-    insecure: also one that other machines can connect to, and that does not deny what its rules do not allow.
-    Its log is short, unless RUST_LOG asks for Zenoh's own.
+    Its log is short, unless RUST_LOG sets Zenoh's own levels.
+
+    Args:
+        config: the file.
+        insecure: also run a router that other machines can connect to without access control.
+
+    Raises:
+        ConfigError: the file is not valid, or the router would let other machines command a robot.
     """
     settings = router_settings(config)
     for endpoint in of_mode(settings, "listen/endpoints", "router"):

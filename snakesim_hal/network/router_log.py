@@ -4,6 +4,9 @@ Zenoh logs refusals only at its most detailed level, where it also writes two li
 and lists all permissions of a session when that session first uses a key. The name in a certificate and the address of
 a session are logged at other levels. So Zenoh logs everything into a pipe, and the relevant lines go to stderr: each
 once, and once a minute how often it was repeated.
+
+Threads: the thread `log` reads the pipe and makes every call of `RouterLog`; after it has ended, the main thread makes
+the last one.
 """
 
 import contextlib
@@ -24,18 +27,21 @@ ZENOH_LEVELS = (
     "info,zenoh::net::routing::interceptor::access_control=trace,"
     "zenoh_link_tls::unicast=debug,zenoh_transport::unicast::establishment::accept=debug"
 )
-LOOK_S = 0.01  # between two looks into the pipe: Zenoh's threads wait while it is full
-PIPE_BYTES = 1024 * 1024  # the most that Linux gives without privileges
+POLL_S = 0.01  # between two looks into the pipe: Zenoh's threads wait while it is full
+PIPE_BYTES = 1024 * 1024  # the maximum that Linux gives without privileges
 CLOSE_LIMIT_S = 2.0
-AGAIN_S = 60.0
+REPORT_INTERVAL_S = 60.0  # between two reports of repeated lines
 # A flood of different refusals must not fill a disk: some 20 MB a day.
-BURST, PER_TURN = 10000, 100  # lines: at once, and in each `AGAIN_S`
-MAX_LINE_CHARACTERS = 300  # of a line
-SESSIONS_KEPT = 4000  # as many as a host of ours takes
+MAX_BURST_LINES = 10000  # at once
+LINES_PER_INTERVAL = 100  # in each REPORT_INTERVAL_S
+MAX_LINE_CHARACTERS = 300
+MAX_SESSIONS = 4000  # whose names are kept, as many as a host accepts
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 HEAD = re.compile(r"\S+Z +(?P<level>[A-Z]+) +(?:\S+ )?ThreadId\((?P<thread>\d+)\) (?P<module>[\w:]+): (?P<text>.*)")
-ALLOWED, LISTS, ENDS_LIST = " is authorized to ", "caching permissions for", "Declare Liveliness Subscriber ("
+ALLOWED = " is authorized to "
+LIST_BEGIN = "caching permissions for"
+LIST_END = "Declare Liveliness Subscriber ("
 REFUSED = re.compile(
     r"(?:Using cached result: )?(?P<session>[0-9a-f]+)(?: on (?P<subject>\S+))? is unauthorized to (?P<what>.*)"
 )
@@ -46,98 +52,117 @@ LET_IN = re.compile(r"New transport link accepted from (?P<session>[0-9a-f]+) to
 
 
 class RouterLog:
-    """Takes Zenoh's lines, and passes on the relevant ones."""
+    """Reads the lines of Zenoh's log, and writes the relevant ones, shortened."""
 
     def __init__(self, write: Callable[[str], None]) -> None:
+        """Write each relevant line with `write`."""
         self._write = write
-        self._names: dict[str, str] = {}  # in certificates, by session, and until it is there by address
+        # Sessions.
+        self._names: dict[str, str] = {}  # in certificates, by session; before the session is known, by address
         self._unmatched: dict[str, str] = {}  # sessions that no rule names
-        self._listing: set[str] = set()  # threads that list what would not be allowed
-        self._again: Counter[str] = Counter()  # lines of this turn -> number of repetitions
-        self._left, self._left_out = BURST, 0
+        self._listing: set[str] = set()  # threads of Zenoh that list what would not be allowed
+        # Written lines.
+        self._repetitions: Counter[str] = Counter()  # by line, since the last report
+        self._allowance = MAX_BURST_LINES  # how many lines may still be written
+        self._dropped = 0  # lines since the last report
 
     def take(self, line: str) -> None:
-        """One line of Zenoh's log."""
-        if ALLOWED in line and ENDS_LIST not in line:
+        """Process one line of Zenoh's log."""
+        if ALLOWED in line and LIST_END not in line:
             return
         line = COLOUR.sub("", line)
-        found = HEAD.fullmatch(line)
-        if found is None:
-            self._say(line)
-        elif found["module"].endswith("access_control"):
-            self._take_decision(found["thread"], found["text"])
-        elif certified := CERTIFIED.fullmatch(found["text"]):
+        parts = HEAD.fullmatch(line)
+        if parts is None:
+            self._write_once(line)
+            return
+        text = parts["text"]
+        if parts["module"].endswith("access_control"):
+            self._take_decision(parts["thread"], text)
+        elif certified := CERTIFIED.fullmatch(text):
             _keep(self._names, certified["address"], certified["name"])
-        elif let_in := LET_IN.match(found["text"]):
-            self._let_in(let_in["session"], let_in["address"])
-        elif found["level"] != "DEBUG":
-            self._say(f"{found['level']} {found['module']}: {found['text']}")
+        elif accepted := LET_IN.match(text):
+            self._report_connection(accepted["session"], accepted["address"])
+        elif parts["level"] != "DEBUG":
+            self._write_once(f"{parts['level']} {parts['module']}: {text}")
 
     def turn(self) -> None:
-        """Call it every `AGAIN_S`: reports repeated lines, and restarts the count."""
-        again, left_out = self._again, self._left_out
-        self._again, self._left_out, self._left = Counter(), 0, min(self._left + PER_TURN, BURST)
-        for line, times in again.items():
+        """Report repeated and dropped lines, and restart the count. Call it every REPORT_INTERVAL_S."""
+        repetitions = self._repetitions
+        dropped = self._dropped
+        self._repetitions = Counter()
+        self._dropped = 0
+        self._allowance = min(self._allowance + LINES_PER_INTERVAL, MAX_BURST_LINES)
+        for line, times in repetitions.items():
             if times:
-                self._say(f"{times} times more: {line}")
-        if left_out or self._left_out:
-            self._write(f"{left_out + self._left_out} lines left out: more than {PER_TURN} different ones a minute")
+                self._write_once(f"{times} times more: {line}")
+        dropped += self._dropped  # the reports themselves may have been dropped
+        if dropped:
+            self._write(f"{dropped} lines left out: more than {LINES_PER_INTERVAL} different ones a minute")
 
     def _take_decision(self, thread: str, text: str) -> None:
+        """Process a line of the access control: a refusal, a part of a list, or a session that no rule names."""
         refused = REFUSED.fullmatch(text)
-        if LISTS in text:
+        if LIST_BEGIN in text:
             self._listing.add(thread)
         elif thread in self._listing:
-            if ENDS_LIST in text:
+            if LIST_END in text:
                 self._listing.discard(thread)
         elif refused is not None:
-            named = IN_SUBJECT.search(refused["subject"] or "")
-            who = named[1] if named else self._names.get(refused["session"], f"session {refused['session']}")
-            self._say(f"refused: {who}: {refused['what']}")
+            name = self._find_name(refused["session"], refused["subject"] or "")
+            self._write_once(f"refused: {name}: {refused['what']}")
         elif unmatched := UNMATCHED.match(text):
             _keep(self._unmatched, unmatched["session"], "")
 
-    def _let_in(self, session: str, address: str) -> None:
+    def _find_name(self, session: str, subject: str) -> str:
+        """Return the name in a session's certificate, or the session's id if it is not known."""
+        named = IN_SUBJECT.search(subject)
+        if named:
+            return named[1]
+        return self._names.get(session, f"session {session}")
+
+    def _report_connection(self, session: str, address: str) -> None:
+        """Report a new connection. Its name is known by address until now, and by session from now on."""
         name = self._names.pop(address, f"session {session}")
         _keep(self._names, session, name)
         if self._unmatched.pop(session, None) is None:
-            self._say(f"let in: {name} from {address}")
+            self._write_once(f"let in: {name} from {address}")
         else:
-            self._say(f"refused: {name} from {address}: everything, because no rule is for it")
+            self._write_once(f"refused: {name} from {address}: everything, because no rule is for it")
 
-    def _say(self, line: str) -> None:
+    def _write_once(self, line: str) -> None:
+        """Write a line, unless it was written since the last report or there are too many lines."""
         line = line[:MAX_LINE_CHARACTERS]
-        if line in self._again:
-            self._again[line] += 1
-        elif self._left <= 0:
-            self._left_out += 1
+        if line in self._repetitions:
+            self._repetitions[line] += 1
+        elif self._allowance <= 0:
+            self._dropped += 1
         else:
-            self._left -= 1
-            self._again[line] = 0
+            self._allowance -= 1
+            self._repetitions[line] = 0
             self._write(line)
 
 
 def _keep(kept: dict[str, str], key: str, value: str) -> None:
-    """Store it as the newest, and forget the oldest of too many."""
+    """Store a value as the newest, and drop the oldest of too many."""
     kept.pop(key, None)
     kept[key] = value
-    while len(kept) > SESSIONS_KEPT:
+    while len(kept) > MAX_SESSIONS:
         del kept[next(iter(kept))]
 
 
 @contextlib.contextmanager
 def short_log() -> Iterator[None]:
-    """While this lasts, Zenoh's output on stdout goes shortened to stderr; our own output is unchanged."""
+    """Send Zenoh's output on stdout shortened to stderr, for as long as the context lasts. Our output is unchanged."""
     log = RouterLog(_to_stderr)
     reading, writing = os.pipe()
     os.set_blocking(reading, False)
-    with contextlib.suppress(PermissionError):  # somebody has too many pipes
+    with contextlib.suppress(PermissionError):  # the user has too many pipes
         fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
     source = os.fdopen(reading, "rb", buffering=0)
     with open(os.dup(1), "w", buffering=1) as stdout:  # noqa: PTH123 - a descriptor
         os.dup2(writing, 1)
         os.close(writing)
-        reader = start_worker("log", lambda: _read(source, log))
+        reader = start_worker("log", lambda: _read_pipe(source, log))
         try:
             with contextlib.redirect_stdout(stdout):
                 yield
@@ -156,15 +181,15 @@ def _to_stderr(line: str) -> None:
             print_stderr(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}")
 
 
-def _read(source: RawIOBase, log: RouterLog) -> None:
-    """Until the last writer has closed the pipe."""
-    rest = b""
-    turn_at_s = time.monotonic() + AGAIN_S
-    while (got := source.read(PIPE_BYTES)) != b"":
-        *lines, rest = (rest + (got or b"")).split(b"\n")
+def _read_pipe(source: RawIOBase, log: RouterLog) -> None:
+    """Pass lines to the log until the last writer has closed the pipe, in the thread `log`."""
+    unfinished = b""  # the begin of a line
+    next_report_s = time.monotonic() + REPORT_INTERVAL_S
+    while (data := source.read(PIPE_BYTES)) != b"":  # None: the pipe is empty now
+        *lines, unfinished = (unfinished + (data or b"")).split(b"\n")
         for line in lines:
             log.take(line.decode(errors="replace"))
-        if time.monotonic() >= turn_at_s:
-            turn_at_s += AGAIN_S
+        if time.monotonic() >= next_report_s:
+            next_report_s += REPORT_INTERVAL_S
             log.turn()
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)

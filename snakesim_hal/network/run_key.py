@@ -17,23 +17,27 @@ RUN_KEY = "SNAKESIM_RUN_KEY"  # environment variable: the processes of other use
 
 
 def new_run_key() -> str:
-    """A new key, for one run."""
+    """Return a new key, for one run."""
     return secrets.token_hex(32)
 
 
 def own_run_key() -> str | None:
-    """The key of the run that this process is part of; None when it was started on its own."""
+    """Return the key of the run that this process is part of; None if it was started on its own."""
     return os.environ.get(RUN_KEY) or None
 
 
 def proven(description: Description, key: str | None) -> Description:
-    """The description with its proof."""
-    return description if key is None else msgspec.structs.replace(description, proof=_proof(description, key))
+    """Return a description with the proof that it is of the run with this key."""
+    if key is None:
+        return description
+    return msgspec.structs.replace(description, proof=_proof(description, key))
 
 
 def is_proven(description: Description, key: str | None) -> bool:
-    """Whether it is of the run's own host; without a key this cannot be checked, and any is accepted."""
-    return key is None or hmac.compare_digest(description.proof, _proof(description, key))
+    """Return whether a description is of the run's own host. Without a key, any description is accepted."""
+    if key is None:
+        return True
+    return hmac.compare_digest(description.proof, _proof(description, key))
 
 
 def _proof(description: Description, key: str) -> str:

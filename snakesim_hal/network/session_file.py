@@ -34,7 +34,11 @@ class SessionFile:
     namespace: str | None  # of the only robot that this session can see; None: the file names none
 
     def namespace_for(self, wanted: str | None) -> str | None:
-        """The namespace of a session that should have the wanted one. Raises ConfigError when the file has another."""
+        """Return the namespace of a session; wanted: by the user, None: any.
+
+        Raises:
+            ConfigError: the file names another one.
+        """
         if self.namespace is not None and wanted not in (None, self.namespace):
             raise ConfigError(
                 f"{self.path}: `namespace` is {short(self.namespace)!r}, not {wanted!r}; use the session file of that "
@@ -44,13 +48,18 @@ class SessionFile:
 
 
 def read_session(path: Path) -> SessionFile:
-    """Read and check a session file; connects to nothing. Raises ConfigError."""
+    """Read and check a session file, without connecting.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not a session file for SnakeSIM.
+    """
     text, settings = read_zenoh_file(path)
     for key, wanted in REQUIRED.items():
         given = json.loads(settings.get_json(key))
         if given != wanted and (given is not None or key == "mode"):
-            dotted, is_now = key.replace("/", "."), "missing" if given is None else f"{json.dumps(given)}"
-            raise ConfigError(f"{path}: `{dotted}` is {is_now}, must be {json.dumps(wanted)}")
+            dotted_key = key.replace("/", ".")
+            present = "missing" if given is None else json.dumps(given)
+            raise ConfigError(f"{path}: `{dotted_key}` is {present}, must be {json.dumps(wanted)}")
     if of_mode(settings, "listen/endpoints", "client"):
         raise ConfigError(f"{path}: `listen.endpoints`: a session only connects; leave it out")
     endpoints = of_mode(settings, "connect/endpoints", "client")
@@ -65,7 +74,14 @@ def read_session(path: Path) -> SessionFile:
 
 
 def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
-    """A JSON5 file, as text and as Zenoh reads it. Raises ConfigError."""
+    """Read a JSON5 file of Zenoh.
+
+    Returns:
+        The text, and the settings that Zenoh reads in it.
+
+    Raises:
+        ConfigError: it cannot be read, or Zenoh refuses it.
+    """
     text = read_text(path)
     check_brackets(text, str(path))
     try:
@@ -77,11 +93,12 @@ def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
 
 
 def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:
-    """Zenoh's own words about a file."""
-    return ConfigError(f"{path}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
+    """Return an error with Zenoh's own message about a file, shortened because it quotes the file."""
+    message = " ".join(str(error).split())
+    return ConfigError(f"{path}: Zenoh refuses it: {short(message, 500)}")
 
 
 def of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:
-    """A list of endpoints; the file gives it for every mode, or for each one."""
+    """Return a list of endpoints for a mode. The file has one list for all modes, or one for each."""
     given = json.loads(settings.get_json(key))
     return given if isinstance(given, list) else given.get(mode, [])

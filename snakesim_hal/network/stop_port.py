@@ -9,6 +9,8 @@ connections, idle sessions, floods) leave this path open. A datagram is
 
 The kernel drops all other datagrams before they are queued, so a flood of them takes no room from a stop; and a
 flood of requests is a stop. Restrict access to the port by the network: stopping a robot needs no permission.
+
+Threads: the host serves requests in the thread `stop port`. A `StopRequester` is used by one thread.
 """
 
 import ctypes
@@ -25,11 +27,14 @@ from dataclasses import dataclass
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.base.workers import start_worker
 
-REQUEST, ANSWER = b"SNAKSTOP", b"SNAKDONE"
+REQUEST = b"SNAKSTOP"
+ANSWER = b"SNAKDONE"
 TEST = b"SNAKTEST"  # does nothing, and is never answered
-NONCE_BYTES, MAX_WHO_BYTES, MAX_ANSWER_BYTES = 16, 64, 1024
-UDP_HEADER = 8
-SO_ATTACH_FILTER = 26
+NONCE_BYTES = 16
+MAX_WHO_BYTES = 64
+MAX_ANSWER_BYTES = 1024
+UDP_HEADER = 8  # bytes
+SO_ATTACH_FILTER = 26  # of Linux; Python has no name for it
 PAUSE_S = 0.001  # between two requests: a flood of them must not block the interpreter
 MAX_REFUSED = 10  # answers of the kernel that the port is closed
 REPEAT_S = 0.02  # after which a sender repeats an unanswered request
@@ -40,7 +45,7 @@ Reply = Callable[[str], None]
 
 
 def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
-    """Address of a robot's stop port: that of the endpoint on which its host listens, else on loopback."""
+    """Return the address of a robot's stop port: that of the endpoint on which its host listens, else on loopback."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     if listens and protocol in ("tcp", "tls", "ws") and port.isdigit():
@@ -49,7 +54,15 @@ def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
 
 
 def open_stop_port(host: str, port: int) -> socket.socket:
-    """Bind the port. port 0: any. Raises NotConnectedError when it is in use."""
+    """Bind the stop port of a host.
+
+    Args:
+        host: address to listen on.
+        port: number of the port; 0: any free one.
+
+    Raises:
+        NotConnectedError: the port is in use.
+    """
     address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(address_family, socket.SOCK_DGRAM)
     try:
@@ -65,7 +78,13 @@ def open_stop_port(host: str, port: int) -> socket.socket:
 
 
 def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], None]) -> None:
-    """Call `take(who, reply)` for every request, from a thread of its own. robot: its namespace, for the answers."""
+    """Call `take(who, reply)` for every request, from the thread `stop port`.
+
+    Args:
+        opened: the bound socket; closing it ends the thread.
+        robot: its namespace, for the answers.
+        take: gets the name of the requester and a function that sends the answer.
+    """
 
     def serve() -> None:
         while True:
@@ -75,9 +94,10 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
                 return
             if not datagram.startswith(REQUEST) or len(datagram) < len(REQUEST) + NONCE_BYTES:
                 continue
-            nonce, who = datagram[len(REQUEST) :][:NONCE_BYTES], datagram[len(REQUEST) + NONCE_BYTES :]
-            reply = _replying(opened, nonce + robot.encode() + b"\n", sender)
-            take(who.decode(errors="replace") or "an unnamed client", reply)
+            nonce = datagram[len(REQUEST) :][:NONCE_BYTES]
+            who = datagram[len(REQUEST) + NONCE_BYTES :].decode(errors="replace")
+            reply = _make_reply(opened, nonce + robot.encode() + b"\n", sender)
+            take(who or "an unnamed client", reply)
             time.sleep(PAUSE_S)
 
     start_worker("stop port", serve)
@@ -92,7 +112,7 @@ class Stopped:
 
 
 class StopRequester:
-    """Asks stop ports to stop, and tests whether they are open, over sockets that it opens once.
+    """Sends stop requests to stop ports, and tests whether they are open, over sockets that it opens once.
 
     After `prepare` neither needs another file descriptor. Not thread-safe.
     """
@@ -101,39 +121,58 @@ class StopRequester:
         self._sockets: dict[Address, socket.socket] = {}
 
     def prepare(self, addresses: Collection[Address]) -> None:
-        """Open a socket for each of these stop ports, and close those of others. Raises OSError."""
+        """Open a socket for each of these stop ports, and close the sockets of others.
+
+        Raises:
+            OSError: no socket can be opened.
+        """
         for address in addresses:
             if address not in self._sockets:
                 self._sockets[address] = _open_for(address)
-        for address in [known for known in self._sockets if known not in addresses]:
+        unused = [address for address in self._sockets if address not in addresses]
+        for address in unused:
             self._sockets.pop(address).close()
 
     def ask(self, address: Address, who: str, timeout_s: float) -> Stopped | None:
-        """Repeat a request until it is answered; None when no answer came in time.
+        """Repeat a stop request until it is answered.
 
-        Raises NotConnectedError when that port is closed, OSError when `address` is not prepared and no socket is left.
+        Args:
+            address: of the stop port.
+            who: name of the requester, for the record.
+            timeout_s: how long to repeat it.
+
+        Returns:
+            The answer, or None if none came in time.
+
+        Raises:
+            NotConnectedError: the port is closed.
+            OSError: `address` is not prepared, and no socket can be opened.
         """
-        asking = self._sockets.get(address)
-        if asking is None:
-            self._sockets[address] = asking = _open_for(address)
-        return _ask(asking, address, who, timeout_s)
+        opened = self._sockets.get(address)
+        if opened is None:
+            opened = _open_for(address)
+            self._sockets[address] = opened
+        return _request_stop(opened, address, who, timeout_s)
 
     def test(self, address: Address, wait_s: float = TEST_WAIT_S) -> None:
-        """Send a datagram that does nothing to a stop port. Raises NotConnectedError when the port is closed.
+        """Send a datagram that does nothing to a stop port.
 
-        The robot's kernel drops it unread, so that a flood of tests takes no room from a stop; it answers for a port
-        that nobody has open.
+        The robot's kernel drops it unread, so that a flood of tests takes no room from a stop. For a port that no
+        process has open, the kernel answers with an error.
+
+        Raises:
+            NotConnectedError: the port is closed or cannot be reached, or `address` is not prepared.
         """
-        asking = self._sockets.get(address)
-        if asking is None:
+        opened = self._sockets.get(address)
+        if opened is None:
             raise NotConnectedError(f"no socket is prepared for udp/{address[0]}:{address[1]}")
         try:
-            asking.connect(address)
-            asking.send(TEST)
+            opened.connect(address)
+            opened.send(TEST)
             errors = select.poll()
-            errors.register(asking, select.POLLERR)
+            errors.register(opened, select.POLLERR)
             errors.poll(1000 * wait_s)
-            code = asking.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            code = opened.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         except OSError as error:
             code = error.errno or errno.EIO
         if code == errno.ECONNREFUSED:
@@ -149,9 +188,10 @@ class StopRequester:
 
 
 def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | None:
-    """Repeat the request until it is answered; None when no answer came in time.
+    """Send a stop request to one stop port, as `StopRequester.ask` does.
 
-    Raises NotConnectedError when that port is closed.
+    Raises:
+        NotConnectedError: the port is closed.
     """
     with closing(StopRequester()) as requester:
         return requester.ask((host, port), who, timeout_s)
@@ -162,22 +202,20 @@ def _open_for(address: Address) -> socket.socket:
     return socket.socket(address_family, socket.SOCK_DGRAM)
 
 
-def _ask(asking: socket.socket, address: Address, who: str, timeout_s: float) -> Stopped | None:
+def _request_stop(opened: socket.socket, address: Address, who: str, timeout_s: float) -> Stopped | None:
+    """Repeat a stop request until it is answered; None: no answer came in time."""
     nonce = os.urandom(NONCE_BYTES)
     request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
     deadline = time.monotonic() + timeout_s
     refused = 0
-    asking.settimeout(REPEAT_S)
+    opened.settimeout(REPEAT_S)
     while time.monotonic() < deadline:
         try:
-            asking.connect(address)  # so that the kernel accepts answers only from there
-            asking.send(request)
-            until = time.monotonic() + REPEAT_S
-            while time.monotonic() < until:
-                answer = asking.recv(MAX_ANSWER_BYTES)
-                if answer.startswith(ANSWER + nonce):
-                    robot, _, text = answer[len(ANSWER) + NONCE_BYTES :].decode(errors="replace").partition("\n")
-                    return Stopped(robot, text)
+            opened.connect(address)  # so that the kernel accepts answers only from there
+            opened.send(request)
+            answer = _receive_answer(opened, nonce)
+            if answer is not None:
+                return answer
         except TimeoutError:
             continue
         except ConnectionRefusedError:
@@ -190,11 +228,29 @@ def _ask(asking: socket.socket, address: Address, who: str, timeout_s: float) ->
     return None
 
 
-def _replying(opened: socket.socket, head: bytes, sender: object) -> Reply:
+def _receive_answer(opened: socket.socket, nonce: bytes) -> Stopped | None:
+    """Wait for the answer to the request with this nonce, for REPEAT_S; other datagrams are ignored.
+
+    Raises:
+        TimeoutError: nothing arrived.
+    """
+    until = time.monotonic() + REPEAT_S
+    while time.monotonic() < until:
+        datagram = opened.recv(MAX_ANSWER_BYTES)
+        if datagram.startswith(ANSWER + nonce):
+            content = datagram[len(ANSWER) + NONCE_BYTES :].decode(errors="replace")
+            robot, _, text = content.partition("\n")
+            return Stopped(robot, text)
+    return None
+
+
+def _make_reply(opened: socket.socket, head: bytes, sender: object) -> Reply:
+    """Return a function that sends the answer to a request, from any thread."""
+
     def reply(text: str) -> None:
         try:
             opened.sendto(ANSWER + head + text.encode()[: MAX_ANSWER_BYTES - 64], sender)  # pyright: ignore
-        except OSError:  # the requester is gone; the robot is stopped all the same
+        except OSError:  # the requester has ended; the robot is stopped all the same
             return
 
     return reply
@@ -206,19 +262,19 @@ def _accept_requests_only(opened: socket.socket) -> None:
     Classic BPF; offsets count from the UDP header. If the kernel refuses the filter, `serve_stops` still checks each.
     """
     first, second = struct.unpack(">II", REQUEST)
-    most = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES
+    max_bytes = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES
     program = [  # (code, jump if true, jump if false, constant)
         (0x20, 0, 0, UDP_HEADER),  # load the word there
         (0x15, 0, 3, first),  # continue if it is equal
         (0x20, 0, 0, UDP_HEADER + 4),
         (0x15, 0, 1, second),
-        (0x06, 0, 0, most),  # accept this many bytes
+        (0x06, 0, 0, max_bytes),  # accept this many bytes
         (0x06, 0, 0, 0),  # accept none
     ]
-    code = b"".join(struct.pack("HBBI", *line) for line in program)
-    kept = ctypes.create_string_buffer(code)
-    with_pointer = struct.pack("HL", len(program), ctypes.addressof(kept))
+    code = b"".join(struct.pack("HBBI", *instruction) for instruction in program)
+    buffer = ctypes.create_string_buffer(code)  # must live until the kernel has copied it
+    program_header = struct.pack("HL", len(program), ctypes.addressof(buffer))
     try:
-        opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, with_pointer)
+        opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program_header)
     except OSError:
         return

@@ -7,6 +7,8 @@ On disk it is one flat file: a line of JSON that names the columns, then the row
 an incomplete last row, as after a SIGKILL.
 
 `command_digest` is a hash over every applied setpoint, so runs with equal digests drove the motors equally.
+
+Threads: the host's thread records; the writer's thread reads rows with `rows_from` meanwhile, without a lock.
 """
 
 import hashlib
@@ -26,9 +28,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Pose
 
 MEMORY_BYTES = 16 * 2**20  # about four minutes of 13 joints at 100 Hz
-TAKEN_BYTES = 2**18  # at once: the host waits for the interpreter while they are copied, 20 us
-HEADER_LIMIT = 2**20
-ALIGNED = 64
+COPIED_BYTES = 2**18  # at once, at most: the host waits for the interpreter while they are copied, 20 us
+HEADER_LIMIT_BYTES = 2**20
+HEADER_ALIGNMENT_BYTES = 64
+ROW_ALIGNMENT_BYTES = 8
 
 
 class Column(msgspec.Struct, frozen=True):
@@ -40,12 +43,14 @@ class Column(msgspec.Struct, frozen=True):
 
     @property
     def format(self) -> Any:
-        """NumPy dtype."""
-        return self.type if self.width is None else (self.type, (self.width,))
+        """Return what NumPy makes a dtype of."""
+        if self.width is None:
+            return self.type
+        return self.type, (self.width,)
 
     @property
     def bytes(self) -> int:
-        """Size in each row."""
+        """Return its size in each row."""
         return np.dtype(self.format).itemsize
 
 
@@ -60,30 +65,32 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def of(robot: Description) -> "Layout":
-        """The columns for a robot. Names contain the units; vectors are in the frame of `Pose`."""
+        """Return the columns for a robot. Names contain the units; vectors are in the frame of `Pose`."""
         joints = len(robot.joints)
-        each = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
+        joint_columns = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
         columns = [
             Column("tick", "<i8"),
             Column("time_s", "<f8"),
-            *(Column(name, "<f8", joints) for name in each),
+            *(Column(name, "<f8", joints) for name in joint_columns),
             Column("position_w", "<f8", 3),
             Column("orientation_wxyz", "<f8", 4),
             Column("contact_peak_n", "<f8"),
             Column("contact_count", "<f8"),
             Column("mode", "|i1", joints),
         ]
-        used = sum(column.bytes for column in columns)
-        names = [joint.name for joint in robot.joints]
-        return Layout(robot=robot.robot, joints=names, row_bytes=used + -used % 8, columns=columns)
+        used_bytes = sum(column.bytes for column in columns)
+        padding_bytes = -used_bytes % ROW_ALIGNMENT_BYTES
+        joint_names = [joint.name for joint in robot.joints]
+        return Layout(robot=robot.robot, joints=joint_names, row_bytes=used_bytes + padding_bytes, columns=columns)
 
     def header(self) -> bytes:
-        """The line, padded so that the rows are aligned."""
+        """Return the first line of the file, padded so that the rows are aligned."""
         line = msgspec.json.encode(self)
-        return line + b" " * (-(len(line) + 1) % ALIGNED) + b"\n"
+        padding_bytes = -(len(line) + 1) % HEADER_ALIGNMENT_BYTES
+        return line + b" " * padding_bytes + b"\n"
 
     def arrays(self, rows: bytes) -> dict[str, NDArray[Any]]:
-        """Whole rows as columns, (n,) or (n, width)."""
+        """Return whole rows as columns by name, each of shape (n,) or (n, width)."""
         offsets = np.cumsum([0, *(column.bytes for column in self.columns)])
         dtype = np.dtype(
             {
@@ -98,15 +105,17 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BlackBox:
-    """A row a tick; keeps the newest rows until they are read."""
+    """Records a row in each tick, and keeps the newest rows until they are read."""
 
     def __init__(self, description: Description, memory_bytes: int = MEMORY_BYTES) -> None:
+        """Allocate the memory for a robot's rows."""
         self.layout = Layout.of(description)
         joints = len(description.joints)
         self._pack_into = struct.Struct(f"<qd{5 * joints + 9}d{joints}b").pack_into
         self._capacity = max(memory_bytes // self.layout.row_bytes, 2)
-        self._memory = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)  # touched: no page faults
-        self._rows = 0
+        # Multiplying writes every byte now, so that recording causes no page faults.
+        self._memory = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)
+        self._rows = 0  # recorded so far
         self._digest = hashlib.sha256()
         self._pack_setpoints = struct.Struct(f"<q{joints}b{2 * joints}d").pack
         self._pose = [np.nan] * 7
@@ -121,7 +130,8 @@ class BlackBox:
         contacts = samples.others.get(keys.CONTACTS)
         if isinstance(contacts, Contacts):
             self._contact_peak_n, self._contact_count = touching(contacts)
-        joints, points = samples.joints, decision.setpoints
+        joints = samples.joints
+        setpoints = decision.setpoints
         self._pack_into(
             self._memory,
             self._rows % self._capacity * self.layout.row_bytes,
@@ -130,59 +140,74 @@ class BlackBox:
             *joints.angle_rad,
             *joints.velocity_rad_s,
             *joints.torque_nm,
-            *points.target,
-            *points.torque_limit_nm,
+            *setpoints.target,
+            *setpoints.torque_limit_nm,
             *self._pose,
             self._contact_peak_n,
             self._contact_count,
-            *points.mode,
+            *setpoints.mode,
         )
-        self._digest.update(self._pack_setpoints(tick, *points.mode, *points.target, *points.torque_limit_nm))
+        packed = self._pack_setpoints(tick, *setpoints.mode, *setpoints.target, *setpoints.torque_limit_nm)
+        self._digest.update(packed)
         self._rows += 1  # last: another thread reads the counted rows
 
     @property
     def ticks(self) -> int:
-        """Rows recorded so far, read or not."""
+        """Return how many rows were recorded so far, read or not."""
         return self._rows
 
     @property
     def command_digest(self) -> str:
-        """Hash of every setpoint applied so far."""
+        """Return the hash of every setpoint applied so far."""
         return self._digest.hexdigest()
 
     def rows_from(self, row: int) -> tuple[int, bytes]:
-        """Some rows from number `row` on, or from the oldest that is still kept: the first one's number, and the rows.
+        """Return some rows from number `row` on, or from the oldest row that is still kept.
 
-        May be called from another thread: the rows are consistent, also while the host goes on.
+        May be called from another thread: the rows are consistent, also while the host records.
+
+        Returns:
+            The number of the first returned row, and the bytes of the rows.
         """
         size = self.layout.row_bytes
         while True:
             end = self._rows
             first = max(row, end - self._capacity + 1)  # the oldest row may be overwritten right now
-            at = first % self._capacity
-            count = min(end - first, self._capacity - at, max(TAKEN_BYTES // size, 1))
-            rows = bytes(memoryview(self._memory)[at * size : (at + count) * size])
-            if self._rows - first < self._capacity:  # else overwritten meanwhile
+            begin = first % self._capacity  # position in the ring
+            count = min(end - first, self._capacity - begin, max(COPIED_BYTES // size, 1))
+            rows = bytes(memoryview(self._memory)[begin * size : (begin + count) * size])
+            if self._rows - first < self._capacity:  # otherwise the host has overwritten them meanwhile
                 return first, rows
 
 
 def touching(contacts: Contacts) -> tuple[float, int]:
-    """The force of the strongest contact in N, and how many obstacles are touched.
+    """Return the force of the strongest contact in N, and the number of touched obstacles.
 
-    The force is a mean over 50 ms, see `measured_force`; of a sensor that does not tell it, that of the instant.
+    The force is the mean over 50 ms that the sensor measures, see `measured_force`; without one, it is the largest
+    contact force of this instant.
     """
     touched = len({contact.obstacle for contact in contacts.contacts})
     if contacts.measured_force_n is not None:
         return contacts.measured_force_n, touched
-    squares = [f[0] * f[0] + f[1] * f[1] + f[2] * f[2] for f in (contact.force_l for contact in contacts.contacts)]
+    squares: list[float] = []
+    for contact in contacts.contacts:
+        x, y, z = contact.force_l
+        squares.append(x * x + y * y + z * z)
     return max(squares, default=0.0) ** 0.5, touched
 
 
 def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
-    """Every complete row of a file that `recorder` wrote. Raises ConfigError for any other file."""
+    """Read every complete row of a black box file.
+
+    Returns:
+        The layout of the file, and its columns by name.
+
+    Raises:
+        ConfigError: it is not the black box of a run, or cannot be read.
+    """
     try:
         with path.open("rb") as file:
-            line = file.readline(HEADER_LIMIT)
+            line = file.readline(HEADER_LIMIT_BYTES)
             layout = msgspec.json.decode(line, type=Layout)
             return layout, layout.arrays(file.read())
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
@@ -190,7 +215,7 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
 
 
 def digest_of(columns: dict[str, NDArray[Any]]) -> str:
-    """`command_digest` recomputed from recorded rows, for a host that was killed."""
+    """Compute `command_digest` from recorded rows, for a host that was killed."""
     names = {"tick": "<i8", "mode": "|i1", "target": "<f8", "torque_limit_nm": "<f8"}
     dtype = [(name, type_, columns[name].shape[1:]) for name, type_ in names.items()]
     packed = np.empty(len(columns["tick"]), dtype=dtype)

@@ -1,4 +1,4 @@
-"""The files of a host's record, and the host's own numbers in it."""
+"""The names of the files in a host's record, and the statistics in `host.json`."""
 
 from typing import Literal
 

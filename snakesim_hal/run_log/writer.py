@@ -1,8 +1,10 @@
 """Writes the record of a host while it runs: black box, description and statistics.
 
-A separate thread writes, twice a second, so no tick waits for a disk. A failed write is retried each
-time, for as long as the black box keeps the rows. The statistics also go to `memory`, an in-memory file shared with the
-parent process: they are known there when the disk is full or hangs, and after a SIGKILL.
+A failed write is retried each time, for as long as the black box keeps the rows. The statistics also go to `memory`, an
+in-memory file shared with the parent process: they are known there when the disk is full or hangs, and after a SIGKILL.
+
+Threads: the thread `recorder` writes, twice a second, so no tick waits for a disk. The host's main thread starts it
+with `with`, and at the end waits for it.
 """
 
 import contextlib
@@ -40,14 +42,28 @@ class HostRecordWriter:
     def __init__(
         self, box: BlackBox, description: Description, numbers: Numbers, folder: Path | None, memory: int | None = None
     ) -> None:
-        """folder: None for no files; memory: a file descriptor, see above."""
-        self._box, self._description, self._numbers = box, description, numbers
-        self._folder, self._memory = folder, memory
-        self._file: int | None = None
-        self._begins = 0  # offset of the first row in the file
-        self._next = 0  # the first row that is not in the file yet
-        self._skipped = 0  # rows that were overwritten before they were written to disk
+        """Write nothing yet.
+
+        Args:
+            box: the black box with the rows.
+            description: of the robot.
+            numbers: makes the host's statistics.
+            folder: of the run; None: no files.
+            memory: file descriptor of the in-memory file; None: none.
+        """
+        # What is written, and where.
+        self._box = box
+        self._description = description
+        self._numbers = numbers
+        self._folder = folder
+        self._memory = memory
+        # The black box file. Only the writing thread changes these.
+        self._file: int | None = None  # descriptor; None: not created yet
+        self._rows_offset = 0  # of the first row in the file, in bytes
+        self._next_row = 0  # the first row that is not in the file yet
+        self._skipped_rows = 0  # overwritten before they were written to disk
         self._failure = ""
+        # The thread.
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -58,37 +74,41 @@ class HostRecordWriter:
         return self
 
     def __exit__(self, *_error: object) -> None:
-        """Write the rest, and how the host ended. Waits for a hanging disk no longer than CLOSE_LIMIT_S."""
+        """Write the rest and the final statistics. Waits for a hanging disk no longer than CLOSE_LIMIT_S."""
         self._closing.set()
         assert self._thread is not None
         self._thread.join(CLOSE_LIMIT_S)
         if self._thread.is_alive():
             self._note(f"{self._folder}: the disk has not answered for {CLOSE_LIMIT_S:g} s")
-            self._remember()
+            self._update_memory()
 
     def _run(self) -> None:
+        """Write twice a second, and once more at the end, in the writing thread."""
         closing = False
         while not closing:
             closing = self._closing.wait(PERIOD_S)
             if self._folder is not None:
-                self._note(self._written(self._folder))
-            self._remember()
+                self._note(self._update_folder(self._folder))
+            self._update_memory()
         if self._file is not None:
             os.close(self._file)
 
-    def _written(self, folder: Path) -> str:
-        """Bring the folder up to date. Returns which file could not be written, and why."""
+    def _update_folder(self, folder: Path) -> str:
+        """Write everything that is new. Returns which file could not be written, and why; empty: none."""
         failure = ""
         for write in (self._write_rows, self._write_numbers):
             try:
                 write(folder, failure)
             except OSError as error:
-                failure = failure or f"{folder}: {error.strerror or error}"
+                if not failure:
+                    failure = f"{folder}: {error.strerror or error}"
         return failure
 
     def _write_numbers(self, folder: Path, failure: str) -> None:
-        if self._file is not None:  # else they would overwrite an earlier host's
-            write_whole(folder / HOST_RECORD, msgspec.json.format(msgspec.json.encode(self._message(failure))))
+        if self._file is None:  # the file in the folder is an earlier host's, and must not be overwritten
+            return
+        content = msgspec.json.encode(self._make_statistics(failure))
+        write_whole(folder / HOST_RECORD, msgspec.json.format(content))
 
     def _open(self, folder: Path) -> int:
         """Create the files of this host; those of an earlier one in this run get a number."""
@@ -100,38 +120,49 @@ class HostRecordWriter:
         write_whole(folder / DESCRIPTION, msgspec.json.encode(self._description))
         header = self._box.layout.header()
         write_whole(folder / BLACK_BOX, header)
-        self._begins = len(header)
+        self._rows_offset = len(header)
         return os.open(folder / BLACK_BOX, os.O_WRONLY | os.O_CLOEXEC)
 
     def _write_rows(self, folder: Path, _failure: str) -> None:
+        """Append the new rows to the black box file.
+
+        Raises:
+            OSError: the disk does not take them all.
+        """
         if self._file is None:
             self._file = self._open(folder)
         size = self._box.layout.row_bytes
-        end = self._box.ticks  # now: a slow disk may never catch up with a host that goes on
-        while self._next < end:
-            first, rows = self._box.rows_from(self._next)
-            self._skipped += first - self._next
-            self._next = first
-            written = os.pwrite(self._file, rows, self._begins + (self._next - self._skipped) * size)
-            self._next += written // size  # an incomplete row is written again next time
+        end = self._box.ticks  # of now, because a slow disk may never catch up with a host that keeps recording
+        while self._next_row < end:
+            first, rows = self._box.rows_from(self._next_row)
+            self._skipped_rows += first - self._next_row
+            self._next_row = first
+            offset = self._rows_offset + (self._next_row - self._skipped_rows) * size
+            written = os.pwrite(self._file, rows, offset)
+            self._next_row += written // size  # an incomplete row is written again next time
             if written < len(rows):  # a full disk first takes a part
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _note(self, failure: str) -> None:
+        """Keep the present failure, and print the first of a series."""
         if failure and not self._failure:
             print_stderr(f"record: {failure}")
         self._failure = failure
 
-    def _message(self, failure: str) -> msgspec.Struct:
-        lost = self._skipped + (self._box.ticks - self._next if self._closing.is_set() else 0)
-        return self._numbers(lost_ticks=lost, failure=failure)
+    def _make_statistics(self, failure: str) -> msgspec.Struct:
+        lost_ticks = self._skipped_rows
+        if self._closing.is_set():
+            lost_ticks += self._box.ticks - self._next_row
+        return self._numbers(lost_ticks=lost_ticks, failure=failure)
 
-    def _remember(self) -> None:
-        if self._memory is not None:
-            content = msgspec.json.encode(self._message(self._failure))
-            with contextlib.suppress(OSError):  # no memory left: then only the folder has them
-                os.pwrite(self._memory, content, 0)
-                os.ftruncate(self._memory, len(content))
+    def _update_memory(self) -> None:
+        """Write the statistics into the in-memory file."""
+        if self._memory is None:
+            return
+        content = msgspec.json.encode(self._make_statistics(self._failure))
+        with contextlib.suppress(OSError):  # no memory left: then only the folder has them
+            os.pwrite(self._memory, content, 0)
+            os.ftruncate(self._memory, len(content))
 
 
 def _numbered(path: Path, number: int) -> Path:

@@ -42,7 +42,7 @@ def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     robot = description()
-    monkeypatch.setattr("snakesim_hal.network.client.MISSING_LIMIT_S", 0.1)
+    monkeypatch.setattr("snakesim_hal.network.client.MISSING_SAMPLE_TIMEOUT_S", 0.1)
     with meeting("worm", "worm") as (hal, session):
         client = Client(session, "control")
         feed = client.subscribe(keys.JOINTS, JointState)

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from snakesim_hal.network.router_log import BURST, MAX_LINE_CHARACTERS, PER_TURN, RouterLog
+from snakesim_hal.network.router_log import LINES_PER_INTERVAL, MAX_BURST_LINES, MAX_LINE_CHARACTERS, RouterLog
 
 ACL, TLS, LINK = (
     "zenoh::net::routing::interceptor::access_control",
@@ -94,10 +94,10 @@ def test_a_flood_of_different_lines_is_bounded() -> None:
     said: list[str] = []
     log = RouterLog(said.append)
     for _ in range(3):
-        for number in range(2 * BURST):
+        for number in range(2 * MAX_BURST_LINES):
             log.take(line(f"{SUBJECT} is unauthorized to Put (ingress) on {number:09}{'x' * 5000}"))
         log.turn()
-    assert len(said) <= BURST + 3 * PER_TURN + 3
+    assert len(said) <= MAX_BURST_LINES + 3 * LINES_PER_INTERVAL + 3
     assert max(map(len, said)) <= MAX_LINE_CHARACTERS
     assert "left out" in said[-1]
 

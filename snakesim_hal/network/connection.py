@@ -1,0 +1,174 @@
+"""How SnakeSIM opens Zenoh: the endpoint of a robot's network, the settings, and the number of receiving threads.
+
+Without a router of its own, all loopback sessions of a robot connect to its HAL host: the host listens (mode
+`router`), and everything else connects to it (mode `client`). Zenoh peers do not forward for one another unless gossip
+introduces them, and gossip is off here. With `--router` the host too is a client of the lab's router.
+"""
+
+import json
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_loopback
+from snakesim_hal.network.image_connection import set_unless_given
+from snakesim_hal.network.session_file import SessionFile
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+
+ENVELOPE_BYTES = 4096  # room around a payload for its key, its encoding and the numbers of an image
+
+# Every session has these settings, whatever its session file says.
+REQUIRED_SETTINGS: dict[str, Any] = {
+    "scouting/delay": 0,
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "timestamping/enabled": {"router": True, "peer": True, "client": True},
+    "transport/shared_memory/enabled": False,
+    "listen/exit_on_failure": True,
+    "connect/exit_on_failure": True,
+    "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
+}
+
+# A session file may have other values for its own network, such as a longer lease on a bad link.
+DEFAULT_SETTINGS: dict[str, Any] = {
+    # Connections that stay silent are closed after a second, and many of them are allowed.
+    "transport/unicast/accept_timeout": 1000,
+    "transport/unicast/accept_pending": 1000,
+    "transport/unicast/max_sessions": 4000,
+    "transport/link/tx/lease": 2000,
+    # A subscriber that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them hardly
+    # delay a writer. With less, bursts to good subscribers are lost: at 0 ms, two thirds of six express messages in a
+    # row.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 100,
+}
+
+# Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
+# froze together blocked the controller's commands for long enough to end its lease.
+RECEIVERS_LISTENING = 16
+# A client reads one connection; with two threads each message would wake both. With Zenoh's `handover: app` no thread
+# is woken, but a full image link then ends the lease of control.
+RECEIVERS_CONNECTED = 1
+RUNTIME = "ZENOH_RUNTIME"  # environment variable that sets the number of Zenoh's threads
+
+_environment_lock = threading.Lock()
+_opening_counts: list[int] = []  # receiving threads of each session that is being opened
+
+
+@dataclass(frozen=True)
+class Link:
+    """How a process connects to the robot's network."""
+
+    endpoint: str = DEFAULT_ENDPOINT
+    namespace: str | None = None  # None: the whole network, for tools that search for robots
+    listen: bool = False  # True: listen on the endpoint; False: connect to it
+    insecure: bool = False  # True: listen even where other machines can connect
+    max_bytes: int = MAX_PAYLOAD_BYTES  # of a payload; longer ones cost neither memory nor time
+    session: SessionFile | None = None  # how to connect; `endpoint` is then the first one in it
+
+    @staticmethod
+    def of_file(session: SessionFile, namespace: str | None = None) -> "Link":
+        """Return the link that a session file describes.
+
+        Raises:
+            ConfigError: the file is for another namespace.
+        """
+        return Link(session.endpoints[0], session.namespace_for(namespace), session=session)
+
+
+def open_zenoh(
+    link: Link, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
+) -> zenoh.Session:
+    """Open the Zenoh session under a `Session`.
+
+    Args:
+        link: where and how to connect.
+        connect_timeout_s: how long a client tries to connect.
+        change: edits the settings for this session alone, just before it is opened.
+
+    Raises:
+        NotConnectedError: the endpoint does not answer, or cannot be listened on.
+        RefusedError: the endpoint is on loopback, and that interface is down.
+    """
+    if link.session is None:  # a session file may name other endpoints, too
+        check_loopback(link.endpoint)
+    zenoh.init_log_from_env_or("off")
+    config = _build_config(link, connect_timeout_s)
+    if change is not None:
+        change(config)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise _describe_failure(link, error) from error
+
+
+def _build_config(link: Link, connect_timeout_s: float) -> zenoh.Config:
+    """Return the settings of a session file, if there is one, with the settings of every session on top."""
+    config = _build_base_config(link)
+    settings = {**REQUIRED_SETTINGS, "connect/timeout_ms": round(connect_timeout_s * 1000)}
+    if link.namespace is not None:
+        settings["namespace"] = link.namespace
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    size_limit = {"transport/link/rx/max_message_size": link.max_bytes + ENVELOPE_BYTES}
+    set_unless_given(config, DEFAULT_SETTINGS | size_limit)
+    return config
+
+
+def _build_base_config(link: Link) -> zenoh.Config:
+    """Return the settings of the session file; without one, Zenoh's defaults with the link's endpoint alone."""
+    if link.session is not None:
+        return zenoh.Config.from_json5(link.session.text)
+    endpoints = json.dumps([link.endpoint])
+    config = zenoh.Config()
+    if link.listen:
+        config.insert_json5("mode", json.dumps("router"))
+        config.insert_json5("listen/endpoints", endpoints)
+        config.insert_json5("connect/endpoints", "[]")
+    else:
+        config.insert_json5("mode", json.dumps("client"))
+        config.insert_json5("listen/endpoints", "[]")
+        config.insert_json5("connect/endpoints", endpoints)
+    return config
+
+
+def _describe_failure(link: Link, error: zenoh.ZError) -> NotConnectedError:
+    """Return the error that explains to a user why Zenoh did not open."""
+    if link.listen:
+        return NotConnectedError(
+            f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
+            f"choose one with --endpoint tcp/127.0.0.1:PORT"
+        )
+    if link.session is not None:
+        return NotConnectedError(
+            f"nothing on {', '.join(link.session.endpoints)} lets {link.session.path} in: no router runs there, or "
+            f"it does not accept the certificate; RUST_LOG=zenoh=warn says more"
+        )
+    return NotConnectedError(f"nothing listens on {link.endpoint}; start a run or a router there first")
+
+
+@contextmanager
+def limit_receiving_threads(count: int) -> Iterator[None]:
+    """Set the number of Zenoh's receiving threads in this process, unless the user has set it.
+
+    Child processes do not inherit the setting. Any number of threads may open sessions at once; Zenoh reads the
+    environment variable when the first of them opens.
+    """
+    with _environment_lock:
+        set_by_user = RUNTIME in os.environ and not _opening_counts
+        if not set_by_user:
+            _opening_counts.append(count)
+            os.environ.setdefault(RUNTIME, f"(rx: (worker_threads: {count}))")
+    try:
+        yield
+    finally:
+        if not set_by_user:
+            with _environment_lock:
+                _opening_counts.remove(count)
+                if not _opening_counts:
+                    del os.environ[RUNTIME]
