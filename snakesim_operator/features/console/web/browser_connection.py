@@ -42,7 +42,7 @@ class BrowserConnection(ServerConnection):
                 raise
             await self._in_clock_mode()
             try:
-                checked = self._admission.checked(self.viewer, data, self.age)
+                checked = self._admission.check_message(self.viewer, data, self.age)
             except Exception as error:  # noqa: BLE001 - this connection's outermost loop: its next message may be a stop
                 self._errors.write(error)
                 continue

@@ -62,11 +62,11 @@ def test_nobody_can_open_a_tunnel_to_the_internet():
 
 def test_control_is_taken_while_free_and_never_taken_away():
     token = ControlToken()
-    assert token.take(1) and token.take(1)
-    assert not token.take(2) and token.holder == 1
+    assert token.acquire(1) and token.acquire(1)
+    assert not token.acquire(2) and token.holder == 1
     assert not token.release(2) and token.holder == 1
     assert token.release(1) and token.holder is None
-    assert token.take(2) and token.holder == 2
+    assert token.acquire(2) and token.holder == 2
 
 
 def test_text_from_the_network_is_no_markup():
