@@ -191,11 +191,11 @@ def _patch_websocket_server(
         websockets.asyncio.server.serve = original_serve  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _limit_viewers(handler: Any, admission: Admission) -> Callable[[BrowserConnection], Awaitable[None]]:
+def _limit_viewers(handler: Any, admission: Admission) -> Callable[[Any], Awaitable[None]]:
     """Return viser's handler of a connection, for no more than MAX_VIEWERS connections at a time."""
     open_connections: set[BrowserConnection] = set()
 
-    async def handle_connection(connection: BrowserConnection) -> None:
+    async def handle_connection(connection: Any) -> None:  # a BrowserConnection
         if len(open_connections) >= MAX_VIEWERS:
             reason = f"more than {MAX_VIEWERS} pages are open"
             admission.drop(None, "too many viewers", reason)

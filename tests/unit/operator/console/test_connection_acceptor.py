@@ -127,7 +127,7 @@ def test_a_full_file_table_costs_a_reserved_descriptor_or_the_oldest_request_and
         FullTable.fails = 2
         assert at.ask("POST") == (200, "stopped")
         with at.send(HALF[1]) as oldest:
-            wait_until(lambda: len(front._waiting) == 1, "a request that waits", 5.0)
+            wait_until(lambda: len(front._pending) == 1, "a request that waits", 5.0)
             FullTable.fails = 1
             assert at.ask("POST") == (200, "stopped")
             wait_until(lambda: is_closed(oldest), "the end of the one that waited", 5.0)
