@@ -106,7 +106,7 @@ class Page:
         set_appearance(gui, dark=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH_PX)
-        self._header = gui.add_html(page_html.header(None), order=0)
+        self._header = gui.add_html(page_html.format_header(None), order=0)
         if self._operations is not None:
             self._add_stop_and_drive_keys()
             self._control_folder = gui.add_folder("Control", order=2)
@@ -116,7 +116,7 @@ class Page:
             self._add_command_tabs(tabs, self._operations)
         with tabs.add_tab("Log"):
             self._log_text = gui.add_html("")
-        gui.add_html(page_html.legend(LEGEND), order=3)
+        gui.add_html(page_html.format_legend(LEGEND), order=3)
 
     def _add_stop_and_drive_keys(self) -> None:
         """Add the stop, and the keys that drive the robot; all are handled by the thread that receives messages."""
@@ -369,18 +369,18 @@ class Page:
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
         log_lines = self._log.lines()
         if snapshot is not None:
-            self._state.content = page_html.state_table(snapshot)
-            self._streams.content = page_html.stream_table(snapshot)
+            self._state.content = page_html.format_state_table(snapshot)
+            self._streams.content = page_html.format_stream_table(snapshot)
             if self._commissioning is not None:
                 self._commissioning.show(snapshot)
             log_lines = [*snapshot.log, *log_lines]
         if log_lines != self._shown_log:
             self._shown_log = log_lines
-            self._log_text.content = page_html.log(log_lines)
+            self._log_text.content = page_html.format_log(log_lines)
         if self._operations is None:
-            self._header.content = page_html.header(snapshot, recorded=self._recorded)
+            self._header.content = page_html.format_header(snapshot, recorded=self._recorded)
         else:
-            self._header.content = page_html.header(snapshot, control=self._describe_viewers())
+            self._header.content = page_html.format_header(snapshot, control=self._describe_viewers())
 
     def _describe_viewers(self) -> str:
         """Return which viewer has control, how many viewers there are, and how many of their messages were dropped."""

@@ -44,7 +44,7 @@ DARK_COOKIE_SCRIPT = (
     b'<script>document.cookie = "snakesim-dark=" + matchMedia("(prefers-color-scheme: dark)").matches'
     b' + "; path=/; SameSite=Strict"</script>'
 )
-STICKY_HEADER_STYLE = (  # of `page_html.header`: what is below is scrolled behind it
+STICKY_HEADER_STYLE = (  # of `page_html.format_header`: what is below is scrolled behind it
     b"<style>div:has(> [data-robot]) {position: sticky; top: 0; z-index: 5; background: var(--mantine-color-body);"
     b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important; min-width: 0}"
     b' @media (max-width: 480px) {div[style*="width: 20em"] {width: 100% !important}}</style>'  # a phone's panel

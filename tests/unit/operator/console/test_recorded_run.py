@@ -17,10 +17,10 @@ def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> Non
     recorded = RecordedRun(tmp_path / "run")
     moving, (_, end_s) = recorded.at(0.5), recorded.span_s
     assert moving.status is not None and moving.status.lifecycle == "armed" and not moving.status.faults
-    assert moving.power is not None and "armed by" in page_html.header(moving, recorded="run")
+    assert moving.power is not None and "armed by" in page_html.format_header(moving, recorded="run")
     over = recorded.at(end_s)
     assert over.status is not None and over.status.lifecycle == "fault"
-    assert "joint_3" in page_html.state_table(over) and "FAULT" in page_html.header(over, recorded="run")
+    assert "joint_3" in page_html.format_state_table(over) and "FAULT" in page_html.format_header(over, recorded="run")
     assert any("robot fault" in line for line in over.log[:3]) and any(
         "control Locomoting" in line for line in moving.log
     )
