@@ -24,18 +24,14 @@ from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page import page_html
+from snakesim_operator.features.console.page.appearance import add_appearance, set_appearance
 from snakesim_operator.features.console.page.camera_tab import draw_picture
 from snakesim_operator.features.console.page.commissioning_tab import Commissioning
 from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
+from snakesim_operator.features.console.page.drive_controls import DRIVE_KEYS
 from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
 from snakesim_operator.features.console.page.joint_charts import JointCharts
-from snakesim_operator.features.console.page.viewer_controls import (
-    DRIVE_KEYS,
-    ViewerControls,
-    add_appearance,
-    format_viewer,
-    set_appearance,
-)
+from snakesim_operator.features.console.page.viewer_controls import ViewerControls, format_viewer
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import Surroundings, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
@@ -268,7 +264,7 @@ class Page:
     def _on_drive_key(self, key_name: str, viewer: int, action: PageAction) -> None:
         controls = self._controls.get(viewer)  # without the lock, as in `_stop_robot`
         if controls is not None:
-            controls.on_drive_key(key_name, action)
+            controls.drive.on_key(key_name, action)
 
     # --- each frame ------------------------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ FOLDER = Path(__file__).parent
 PATH = "/signals"
 MAX_SIGNALS = 16  # of one request
 LINE_COLORS = 8
-MAX_POINTS = 1500  # of one line: about the pixels of a wide screen
+MAX_BUCKETS = 1500  # of time, in each of which a line has at most three points
 OWN_PAGE_HEADER = "X-Snakesim"  # browsers do not let a page of another origin send this header
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self' {}; style-src 'unsafe-inline'; connect-src 'self'; "
@@ -155,7 +155,7 @@ def _parse_number(query: Query, name: str, default: float) -> float:
 
 def _thin_for_chart(times_s: Floats, values: Floats) -> dict[str, object]:
     """Return the points of a line that can be drawn, and minimum, mean and maximum of all its values."""
-    rows = thinned(values, MAX_POINTS)
+    rows = thinned(values, MAX_BUCKETS)
     known = values[np.isfinite(values)]
     value_range = None
     if len(known):

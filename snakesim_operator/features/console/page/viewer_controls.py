@@ -1,36 +1,31 @@
 """The controls of one viewer. Only the viewer in control can use them; every viewer can stop the robot."""
 
-import math
 import threading
-import time
 from collections.abc import Callable, Collection
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 import viser
 
 from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.base.workers import ErrorReport
 from snakesim_hal.model.fault_kinds import KINDS, TargetType
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.features.console.control_token import ControlToken
-from snakesim_operator.features.console.operations import BUTTON_VALIDITY_NS, KEY_VALIDITY_NS, Operations
-from snakesim_operator.features.console.page.commissioning_tab import Commissioning, CommissioningControls
+from snakesim_operator.features.console.operations import Operations
+from snakesim_operator.features.console.page.commissioning_controls import CommissioningControls
+from snakesim_operator.features.console.page.commissioning_tab import Commissioning
+from snakesim_operator.features.console.page.drive_controls import DriveControls
 from snakesim_operator.features.console.page.page_html import BAD, escape_text
 from snakesim_operator.features.console.page.settings_form import SettingsForm
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission, format_age
-from snakesim_operator.features.console.web.message_age import PageAction
+from snakesim_operator.features.console.web.admission import MAX_PRESS_AGE_S, Admission, format_age
 from snakesim_operator.robot_commands.fault import FaultOrder
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
-from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, turned
 
 NOTIFICATION_S = 6.0  # long enough to read a refusal
 MAX_OPERATIONS_AT_ONCE = 4  # of one viewer, so that the threads of viser are left for the others
-HOLD_REPEAT_HZ = 10.0  # how often a page repeats that the drive button is held
-MAX_SPEED_M_S = 0.5  # end of the speed slider; control limits the speed itself
-SLIDER_STEP_DEG = 5  # of the heading slider
 
 FAULT_KINDS: dict[str, tuple[str, TargetType]] = {
     f"{kind} ({target_type})": (kind, target_type) for target_type, kinds in KINDS.items() for kind in kinds
@@ -41,21 +36,14 @@ EXAMPLE_TARGETS: dict[TargetType, str] = {
     "joint": "joint_3",
     "bus": "bus_1",
 }
-DriveKey = Literal["I", "J", "K", "L"]
-DRIVE_KEYS: dict[str, DriveKey] = {  # viser uses the arrow keys to turn the view
-    "Ahead": "I",
-    "Backwards": "K",
-    "Left": "J",
-    "Right": "L",
-}
 SIMULATOR_SPEEDS: tuple[str, ...] = ("0.1", "0.25", "0.5", "1", "2", "5", "10")  # multiples of real time
 
 
 class ViewerControls:
     """The buttons and inputs of one viewer, and what they do.
 
-    viser calls the callbacks of buttons in threads of its own. The thread that receives this viewer's messages calls
-    `on_drive_key` and `_on_drive_held`, which must not wait.
+    viser calls the callbacks in threads of its own; they may wait for the robot. Only `drive` is called by the thread
+    that receives messages.
     """
 
     def __init__(
@@ -96,8 +84,6 @@ class ViewerControls:
         # What this viewer has done.
         self._free_operations = threading.Semaphore(MAX_OPERATIONS_AT_ONCE)
         self._offers_unchecked = False  # the host refused to arm because the joints were not checked
-        self._key_direction = 1  # of the last drive key: 1 ahead, -1 backwards
-        self._key_drive_time_s = -math.inf  # when a key last drove the robot
         self._errors = ErrorReport(f"console, {self.name}")
         # The controls.
         self._settings_tab = settings_tab
@@ -105,7 +91,9 @@ class ViewerControls:
         with control_folder:
             self._add_control_buttons()
             self._add_simulator_controls()
-            self._add_drive_controls()
+            self.drive = DriveControls(
+                client, admission, self._is_in_control, get_snapshot, partial(operations.drive, self.name)
+            )
             self._add_fault_controls()
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
@@ -136,14 +124,6 @@ class ViewerControls:
             self._time_buttons = gui.add_button_group("Time", ("Pause", "Resume", "Step", "Reset"))
             self._simulator_speed = gui.add_dropdown("Speed", SIMULATOR_SPEEDS, initial_value="1")
 
-    def _add_drive_controls(self) -> None:
-        gui = self.client.gui
-        self._heading_deg = gui.add_slider("Heading, °", -180, 180, SLIDER_STEP_DEG, 0)
-        self._speed_m_s = gui.add_slider("Speed, m/s", 0.0, MAX_SPEED_M_S, 0.01, 0.1)
-        self._drive = gui.add_button(
-            "Hold to drive  (keys I, K; turn: J, L)", icon=viser.Icon.STEERING_WHEEL, color="green"
-        )
-
     def _add_fault_controls(self) -> None:
         gui = self.client.gui
         self._fault_folder = gui.add_folder("Inject a fault", expand_by_default=False)
@@ -155,11 +135,11 @@ class ViewerControls:
     def _admit_controls(self) -> None:
         """Let this viewer's page use the controls.
 
-        What stops or calms the robot counts at any age. What may move it counts only while it is recent.
+        What calms the robot counts at any age. What may move it, now or later, counts only while it is recent.
         """
         admit = self._admission.admit
         admit(self._take_control, self.viewer)
-        for control in (self._heading_deg, self._speed_m_s, self._fault_kind, self._fault_target):
+        for control in (self._fault_kind, self._fault_target):
             admit(control, self.viewer, self._is_in_control)
         self._admit_press(self._lifecycle, at_any_age=("Disarm",))
         self._admit_press(self._time_buttons, at_any_age=("Pause",))
@@ -167,14 +147,6 @@ class ViewerControls:
         self._admit_press(self._fault_buttons, at_any_age=("End it",))
         self._admit_press(self._arm_unchecked, self._may_arm_unchecked)
         self._admit_press(self._apply)
-        admit(
-            self._drive,
-            self.viewer,
-            self._is_in_control,
-            HOLD_REPEAT_HZ,
-            handler=self._on_drive_held,
-            max_age_s=MAX_HOLD_AGE_S,
-        )
 
     def _admit_press(
         self, control: Any, is_allowed: Callable[[], bool] | None = None, at_any_age: Collection[str] = ()
@@ -204,9 +176,6 @@ class ViewerControls:
         self._fault_kind.on_update(lambda _: self._suggest_fault_target())
         self._fault_buttons.on_click(lambda event: self._change_fault(end=event.target.value == "End it"))
         self._apply.on_click(lambda _: self._apply_settings())
-        # The page repeats that the button is held only if viser has a callback for it. `_on_drive_held` gets the
-        # messages, and motion ends without them.
-        self._drive.on_hold(lambda _: None, callback_hz=HOLD_REPEAT_HZ)
 
     @property
     def name(self) -> str:
@@ -220,8 +189,9 @@ class ViewerControls:
         in_control = self._is_in_control()
         snapshot = self._get_snapshot()
         self._show_take_control()
-        for control in (self._lifecycle, self._heading_deg, self._speed_m_s, self._drive, self._fault_folder):
-            control.visible = in_control
+        self._lifecycle.visible = in_control
+        self.drive.set_visible(in_control)
+        self._fault_folder.visible = in_control
         self._show_unchecked(snapshot if in_control else None)
         is_simulated = snapshot is not None and snapshot.robot.simulated_time
         self._simulator_folder.visible = in_control and is_simulated
@@ -295,7 +265,7 @@ class ViewerControls:
         was_released = self._token.release(self.viewer)
         if not was_released:
             if self._token.acquire(self.viewer):
-                self._steer_straight_on()
+                self.drive.steer_straight_on()
             else:
                 self.notify("Not in control", f"{format_viewer(self._token.holder)} has it", bad=True)
         self._on_control_changed()
@@ -385,93 +355,7 @@ class ViewerControls:
         finally:
             self._free_operations.release()
 
-    # --- driving ---------------------------------------------------------------------------------------------
-
-    def _on_drive_held(self, _viewer: int, action: PageAction) -> None:
-        self._drive_robot(self._speed_m_s.value, BUTTON_VALIDITY_NS, action)
-
-    def on_drive_key(self, key_name: str, action: PageAction) -> None:
-        """Drive or steer, because a drive key was pressed or its keyboard repeats it.
-
-        A keyboard repeats only the key that was pressed last. So Left and Right keep the robot going if a key drove it
-        a short time ago, and only change the heading otherwise.
-
-        Args:
-            key_name: A key of DRIVE_KEYS.
-            action: The time of the press; a press older than MAX_HOLD_AGE_S is ignored.
-        """
-        if not self._is_in_control() or action.age_s > MAX_HOLD_AGE_S:
-            return
-        now_s = time.monotonic()
-        match key_name:
-            case "Ahead":
-                self._key_direction = 1
-            case "Backwards":
-                self._key_direction = -1
-            case _:
-                self._steer(HEADING_STEP_RAD if key_name == "Left" else -HEADING_STEP_RAD)
-                is_driving = now_s - self._key_drive_time_s <= KEY_VALIDITY_NS * 1e-9
-                if not is_driving:
-                    return
-        self._key_drive_time_s = now_s
-        self._drive_robot(self._key_direction * self._speed_m_s.value, KEY_VALIDITY_NS, action)
-
-    def _drive_robot(self, speed_m_s: float, valid_ns: int, action: PageAction) -> None:
-        """Send the robot an intent to drive, valid from the last moment at which the viewer is known to have acted.
-
-        Without such a moment the robot gets nothing, because the message may be of any age.
-        """
-        if action.robot_ns is None or not self._is_in_control():
-            return
-        self._operations.drive(self.name, self._heading_w_rad, speed_m_s, action.robot_ns, valid_ns)
-
-    def _steer(self, step_rad: float) -> None:
-        """Change the heading by a step."""
-        heading_w_rad = turned(self._heading_w_rad, step_rad, self._read_body_yaw_w_rad())
-        self._heading_deg.value = _round_to_slider_deg(heading_w_rad)
-
-    def _steer_straight_on(self) -> None:
-        """Set the heading to the direction of the body, so that a robot that is driven next does not turn."""
-        yaw_w_rad = self._read_body_yaw_w_rad()
-        if yaw_w_rad is not None:
-            self._heading_deg.value = _round_to_slider_deg(yaw_w_rad)
-
-    @property
-    def _heading_w_rad(self) -> float:
-        return math.radians(self._heading_deg.value)
-
-    def _read_body_yaw_w_rad(self) -> float | None:
-        snapshot = self._get_snapshot()
-        if snapshot is None or snapshot.base is None:
-            return None
-        _, orientation_wxyz = snapshot.base
-        return yaw_of(rotation_from_quaternion(orientation_wxyz))
-
-
-def _round_to_slider_deg(angle_rad: float) -> int:
-    """Return an angle in degrees, rounded to a step of the heading slider."""
-    return SLIDER_STEP_DEG * round(math.degrees(angle_rad) / SLIDER_STEP_DEG)
-
 
 def format_viewer(viewer: int | None) -> str:
     """Return the name of a viewer; None is no viewer."""
     return "nobody" if viewer is None else f"viewer {viewer + 1}"
-
-
-def set_appearance(gui: viser.GuiApi, *, dark: bool) -> None:
-    """Set colors and layout of the page, for one viewer or for all."""
-    gui.configure_theme(
-        dark_mode=dark,
-        show_logo=False,
-        show_share_button=False,
-        control_width="large",
-        brand_color=(0, 103, 176),
-    )
-
-
-def add_appearance(client: viser.ClientHandle, admission: Admission, *, dark: bool) -> None:
-    """Add a checkbox with which a viewer chooses a dark page. dark: what the browser prefers, until then."""
-    checkbox = client.gui.add_checkbox("Dark page", initial_value=dark, order=2.5)
-    admission.admit(checkbox, client.client_id)
-    checkbox.on_update(lambda _: set_appearance(client.gui, dark=checkbox.value))
-    set_appearance(client.gui, dark=dark)

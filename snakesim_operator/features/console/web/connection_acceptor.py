@@ -17,7 +17,7 @@ import select
 import socket
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
@@ -32,12 +32,13 @@ from snakesim_operator.features.console.web.connection_limits import (
     choose_limits,
     why_no_page,
 )
+from snakesim_operator.features.console.web.handoff_listener import HandoffListener
 from snakesim_operator.features.console.web.peer_user import PeerUsers
 
 PATH = "/stop"
 STOP_REQUESTS = tuple(f"{method} {PATH} ".encode() for method in ("GET", "POST"))  # how their first line begins
 END_OF_HEAD = b"\r\n\r\n"
-MAX_HEAD_BYTES = 16 * 1024  # of the head of a request, as in other web servers
+MAX_HEAD_BYTES = 16 * 1024  # of a request; far above what a browser sends
 HEAD_LIMIT_S = 10.0  # from the connection to the end of the request's head
 BACKLOG = 1024  # connections that the kernel keeps until they are accepted; it may have a lower limit
 MAX_ACCEPTED_AT_ONCE = 128  # then the connections that are waiting are read again
@@ -77,56 +78,6 @@ class StopPath(Protocol):
     def test_if_due(self) -> None:
         """Start a self-test, if it is time for one."""
         ...
-
-
-class HandoffListener(socket.socket):
-    """A listening socket for a server of asyncio, whose `accept` returns the connections that were handed off to it.
-
-    It is one end of a pair of sockets. A byte sent at the other end wakes the server.
-    """
-
-    def __init__(self, address: tuple[str, int]) -> None:
-        """Have no connection yet. address: where the connections were accepted."""
-        listening_end, self._wake_end = socket.socketpair()
-        super().__init__(listening_end.family, listening_end.type, fileno=listening_end.detach())
-        self._wake_end.setblocking(False)
-        self._address = address
-        self._connections: deque[socket.socket] = deque()
-
-    def hand_off(self, connection: socket.socket) -> None:
-        """Hand a connection off to the server; from any thread."""
-        self._connections.append(connection)
-        with contextlib.suppress(OSError):  # full of bytes: the server is being woken already
-            self._wake_end.send(b"\0")
-
-    def listen(self, backlog: int = 0, /) -> None:
-        """Do nothing: another socket listens."""
-
-    def getsockname(self) -> tuple[str, int]:
-        """Return the address at which the connections were accepted."""
-        return self._address
-
-    def accept(self) -> tuple[socket.socket, object]:
-        """Return the next connection and the address of its other end.
-
-        Raises:
-            BlockingIOError: There is no connection.
-        """
-        if not self._connections:
-            self.recv(4096)  # the wake-up bytes; a connection added before they were read is seen below
-            if not self._connections:
-                raise BlockingIOError
-        connection = self._connections.popleft()
-        with contextlib.suppress(OSError):
-            return connection, connection.getpeername()
-        return connection, self._address
-
-    def close(self) -> None:
-        """Close the listener, and all connections that the server has not accepted."""
-        for connection in self._connections:
-            connection.close()
-        self._wake_end.close()
-        super().close()
 
 
 class ReservedDescriptors:

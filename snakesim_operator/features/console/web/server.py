@@ -28,7 +28,8 @@ from snakesim_operator.base.console_port import LOOPBACK, address_of
 from snakesim_operator.base.page_origin import why_refused
 from snakesim_operator.features.console.web.admission import Admission
 from snakesim_operator.features.console.web.browser_connection import MAX_MESSAGE_BYTES, BrowserConnection
-from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, HandoffListener, StopPath
+from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, StopPath
+from snakesim_operator.features.console.web.handoff_listener import HandoffListener
 from snakesim_operator.features.console.web.pacing import ask_page, pace_pages
 
 MAX_VIEWERS = 64

@@ -13,13 +13,14 @@ from contextlib import contextmanager
 import pytest
 
 from snakesim_operator.base.console_port import open_port
-from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, HandoffListener
+from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor
 from snakesim_operator.features.console.web.connection_limits import (
     ConnectionLimits,
     PendingRequests,
     choose_limits,
     why_no_page,
 )
+from snakesim_operator.features.console.web.handoff_listener import HandoffListener
 from snakesim_operator.features.console.web.peer_user import PeerUsers
 from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 from tests.harness.wait import wait_until
