@@ -88,7 +88,7 @@ class CommissioningControls:
                 max_age_s=MAX_HOLD_AGE_S,
             )
 
-    def show(self) -> None:
+    def refresh(self) -> None:
         """Show the controls if this viewer may use them now."""
         self._folder.visible = self._commissioning.robot_file is not None and self._is_in_control()
 

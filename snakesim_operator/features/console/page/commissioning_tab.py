@@ -37,7 +37,7 @@ STEPS = {
 class Commissioning:
     """The table of joints that all viewers see, and the step that runs.
 
-    Threads: the display loop calls `update` and `show`. The threads of viser call `start` and `end`. `press_key` is
+    Threads: the display loop calls `update` and `redraw`. The threads of viser call `start` and `end`. `press_key` is
     also called by the thread that receives messages of browsers, so it must not wait.
     """
 
@@ -159,7 +159,7 @@ class Commissioning:
             for (lower_rad, upper_rad), angle_rad in zip(ranges, angles_rad, strict=True)
         ]
 
-    def show(self, snapshot: RobotSnapshot) -> None:
+    def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw the tab; called a few times a second."""
         if snapshot.configuration is not self._configuration:
             self._configuration = snapshot.configuration

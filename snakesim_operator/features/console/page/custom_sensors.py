@@ -99,7 +99,7 @@ class CustomSensorCharts:
             history = self._history.setdefault(quantity, deque(maxlen=MAX_SAMPLES))
             add_sample(history, (time_s, numbers))
 
-    def show(self, snapshot: RobotSnapshot) -> None:
+    def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw the table and the charts; called a few times a second."""
         self._table.content = sensor_table(snapshot)
         for quantity in list(self._history)[:MAX_CHARTS]:

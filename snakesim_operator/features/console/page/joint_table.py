@@ -46,7 +46,7 @@ def _check_html(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     if status is not None and status.unchecked:
         return f"<div style='color:{BAD}'>not checked: {escape_text(status.unchecked)}</div>"
     if config is None or status is None:
-        return "<div>whether it was checked is not known: its host has not said how it is set up</div>"
+        return "<div>whether it was checked is not known: its host has not published its configuration</div>"
     checked = config.robot.checked
     if checked is None:
         return "<div>not checked yet: this run is the start check</div>"

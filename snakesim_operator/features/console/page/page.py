@@ -227,7 +227,7 @@ class Page:
             all_controls = list(self._controls.values())
         for controls in all_controls:
             with self._ignore_closed_page(controls.client):
-                controls.show()
+                controls.refresh()
 
     def _ask_for_age(self) -> None:
         """Send the page in control the next question by which the age of its messages is known."""
@@ -329,10 +329,10 @@ class Page:
             self._sensor_charts.add_snapshot(snapshot)
         if not self._is_due(CHART_DECIMATION):
             return
-        self._joint_charts.show(snapshot)
+        self._joint_charts.redraw(snapshot)
         self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
         if self._sensor_charts is not None:
-            self._sensor_charts.show(snapshot)
+            self._sensor_charts.redraw(snapshot)
 
     def _show_new_robot(self, robot: Description) -> None:
         """Start scene and charts over, for a robot of another layout."""
@@ -368,7 +368,7 @@ class Page:
             self._state.content = page_html.format_state_table(snapshot)
             self._streams.content = page_html.format_stream_table(snapshot)
             if self._commissioning is not None:
-                self._commissioning.show(snapshot)
+                self._commissioning.redraw(snapshot)
             log_lines = [*snapshot.log, *log_lines]
         if log_lines != self._shown_log:
             self._shown_log = log_lines

@@ -52,7 +52,7 @@ def _make_field(parameter: Parameter) -> InputField | None:
 
 
 def _make_number_field(parameter: Parameter, value: float) -> InputField:
-    """Return a slider for a number: up to four times the value, as far as that is within the parameter's bounds."""
+    """Return the input for a number: up to four times its value, as far as the parameter's bounds allow."""
     reach = 4.0 * abs(value) or 1.0
     low = -reach
     if parameter.least is not None:
@@ -113,7 +113,7 @@ class SettingsForm:
         entered = {name: control.value for name, control in self._inputs.items()}
         return msgspec.json.encode({**self._values, **entered}).decode()
 
-    def show(self, settings: ControlSettings) -> bool:
+    def show_values(self, settings: ControlSettings) -> bool:
         """Show the values in force, and return whether this form is for their controller."""
         if settings.controller != self.controller:
             return False

@@ -70,7 +70,7 @@ class ViewerControls:
             settings_tab: The place of the controller's settings.
             on_control_changed: Called when this viewer took or released control.
             admission: Decides which messages of the page count.
-            commissioning: The step of all viewers that may run.
+            commissioning: Runs steps; all viewers share one.
             commissioning_tab: The place of the buttons for it.
         """
         self.client = client
@@ -108,7 +108,7 @@ class ViewerControls:
             self._on_late_press,
         )
         self._connect_callbacks()
-        self.show()
+        self.refresh()
 
     def _add_control_buttons(self) -> None:
         gui = self.client.gui
@@ -184,7 +184,7 @@ class ViewerControls:
 
     # --- what the viewer sees --------------------------------------------------------------------------------
 
-    def show(self) -> None:
+    def refresh(self) -> None:
         """Show and enable the controls that this viewer may use now."""
         in_control = self._is_in_control()
         snapshot = self._get_snapshot()
@@ -199,7 +199,7 @@ class ViewerControls:
         status = None if snapshot is None else snapshot.status
         self._simulator_speed.visible = status is not None and status.clock_mode == "realtime"
         self._apply.disabled = not in_control
-        self._commissioning_controls.show()
+        self._commissioning_controls.refresh()
         if self._settings_form is not None:
             self._settings_form.set_enabled(in_control)
 
@@ -228,10 +228,10 @@ class ViewerControls:
 
     def show_settings(self, settings: ControlSettings) -> None:
         """Show the controller settings in force."""
-        if self._settings_form is None or not self._settings_form.show(settings):
+        if self._settings_form is None or not self._settings_form.show_values(settings):
             self._replace_settings_form(settings)
         self._apply.visible = True
-        self.show()
+        self.refresh()
 
     def _replace_settings_form(self, settings: ControlSettings) -> None:
         """Add the form of the running controller, in the place of the form of another controller."""
@@ -294,7 +294,7 @@ class ViewerControls:
         robot = snapshot.robot
         is_armed = self.run_operation("Arm", lambda: self._operations.arm(self.name, robot, unchecked=unchecked))
         self._offers_unchecked = not is_armed
-        self.show()
+        self.refresh()
 
     def _change_time(self, action: str) -> None:
         """Pause, resume, step, reset or speed up the simulator."""

@@ -263,7 +263,7 @@ class LiveRobot:
         self._counts = counts
 
     def _list_streams(self, clock: Clock | None) -> dict[str, Stream]:
-        """Return rate and age of each key that is not latched and of which a message is known."""
+        """Return rate and age of each key that has published a message and is not latched."""
         streams: dict[str, Stream] = {}
         for key in list(self._buffers):
             message = self._newest.get(key)

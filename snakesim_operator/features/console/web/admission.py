@@ -205,12 +205,12 @@ class Admission:
             self.drop(viewer, "unknown", str(error))
             return None
         if isinstance(message, QuestionAnswer):
-            age.answer(message.request_uuid)
+            age.note_answer(message.request_uuid)
         elif isinstance(message, Update | Hold | Trigger):
             control = self._find_control(viewer, message)
             if control is None:
                 return None
-            action = age.action(time.monotonic())
+            action = age.date_action(time.monotonic())
             if control.is_late(message, action):
                 control.on_late(action.age_s)
                 self.drop(viewer, "too old", f"{control.name}: {format_age(action.age_s)}")

@@ -49,7 +49,7 @@ class MessageAge:
         """Return whether there is room for another question."""
         return len(self._unanswered) < MAX_UNANSWERED
 
-    def ask(self, question: str, now_s: float, robot_ns: int | None) -> None:
+    def note_question(self, question: str, now_s: float, robot_ns: int | None) -> None:
         """Note a question; called before it is sent.
 
         Args:
@@ -60,7 +60,7 @@ class MessageAge:
         with self._lock:
             self._unanswered[question] = _Question(now_s, robot_ns)
 
-    def answer(self, question: str) -> None:
+    def note_answer(self, question: str) -> None:
         """Note an answer. An answer to a question that was not asked is ignored."""
         with self._lock:
             answered = self._unanswered.pop(question, None)
@@ -73,7 +73,7 @@ class MessageAge:
             if answered.asked_s > self._answered.asked_s:
                 self._answered = answered
 
-    def action(self, now_s: float) -> PageAction:
+    def date_action(self, now_s: float) -> PageAction:
         """Return the time of the action that a message reports which arrives now."""
         answered = self._answered
         return PageAction(now_s - answered.asked_s, answered.robot_ns)

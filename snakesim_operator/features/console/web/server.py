@@ -119,7 +119,7 @@ class PageServer(viser.ViserServer):
         if browser is None or page is None or not browser.age.may_ask():
             return
         question = uuid.uuid4().hex
-        browser.age.ask(question, time.monotonic(), robot_ns)
+        browser.age.note_question(question, time.monotonic(), robot_ns)
         ask_page(page, question)
 
     def request_share_url(self, verbose: bool = True) -> str | None:
@@ -137,7 +137,7 @@ def page_server(
     """Run the web server, and yield it and its address.
 
     Args:
-        listening: Where browsers connect: a socket of `port.open_port`.
+        listening: Where browsers connect: a socket of `console_port.open_port`.
         report: Called with what was refused, once of each kind.
         stop: Stops the robot for the pages' second stop; None for a recording.
         answer_first: Answers requests for pages beside the console's; returns None for a page that it does not have.
