@@ -20,11 +20,15 @@ from pathlib import Path
 import viser
 
 from snakesim_hal.wire.messages import ControlSettings, Description
-from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page import page_html
-from snakesim_operator.features.console.page.appearance import add_appearance, set_appearance
+from snakesim_operator.features.console.page.appearance import (
+    add_appearance,
+    aim_initial_camera,
+    aim_phone_camera,
+    set_appearance,
+)
 from snakesim_operator.features.console.page.camera_tab import draw_picture
 from snakesim_operator.features.console.page.commissioning_tab import Commissioning
 from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
@@ -46,7 +50,6 @@ PICTURE_DECIMATION = 6
 QUESTION_DECIMATION = 3  # ten questions a second to the page in control, by which the age of its messages is known
 
 PANEL_WIDTH_PX = 460  # wide enough for all tabs in one line
-CAMERA_FOV_RAD = 0.75  # vertical field of view
 
 
 class Page:
@@ -170,7 +173,7 @@ class Page:
             if self._operations is not None:
                 self._add_controls(client, self._operations)
             if self._snapshot is not None:
-                _aim_phone_camera(client, self._snapshot.robot)
+                aim_phone_camera(client, self._snapshot.robot)
             self._log.write(f"{format_viewer(viewer)} came")
         if viewer not in self._server.get_clients():
             self._forget_viewer(viewer)
@@ -339,11 +342,9 @@ class Page:
         scene = self._server.scene
         scene.reset()
         scene.set_up_direction("+z")
-        camera = self._server.initial_camera
-        camera.position, camera.look_at = choose_view(robot, narrow=False)
-        camera.fov = CAMERA_FOV_RAD
+        aim_initial_camera(self._server, robot)
         for client in self._server.get_clients().values():
-            _aim_phone_camera(client, robot)
+            aim_phone_camera(client, robot)
         self._scene = RobotScene(scene, robot, self._surroundings)
         with self._joints_tab:
             if self._joint_charts is not None:
@@ -401,35 +402,6 @@ class Page:
 def _count_in_words(count: int, noun: str) -> str:
     plural = "" if count == 1 else "s"
     return f"{count} {noun}{plural}"
-
-
-def choose_view(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
-    """Return a camera position, and the point that it looks at, from which the whole body is in view.
-
-    Args:
-        robot: The robot to look at.
-        narrow: The screen is that of a phone, whose lower half the panel covers.
-
-    Returns:
-        Position and target in m, relative to the middle of the body.
-    """
-    length_m = sum(link.length_m for link in robot.links)
-    distance_m = 0.8 * length_m
-    target_offset_m = 0.0
-    if narrow:
-        distance_m = 1.15 * length_m
-        target_offset_m = 0.7 * length_m
-    x, y = -0.49, -0.87  # unit vector from the body to the camera, seen from above
-    target = x * target_offset_m, y * target_offset_m, 0.0
-    position = target[0] + 1.3 * distance_m * x, target[1] + 1.3 * distance_m * y, 1.6 * distance_m
-    return position, target
-
-
-def _aim_phone_camera(client: viser.ClientHandle, robot: Description) -> None:
-    """Aim the camera of a phone; other screens use the initial camera."""
-    camera = client.camera
-    if camera.image_width < camera.image_height:
-        camera.position, camera.look_at = choose_view(robot, narrow=True)
 
 
 def _urgent_state(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
