@@ -1,6 +1,6 @@
 """The console: a robot in the browser, live or from a recording. Needs the extra `console` (viser).
 
-`command` has the entry points, `display_loop` the loop: it takes one snapshot a frame and hands it to the page.
+`command` has the entry points, and `display_loop` the loop that takes one snapshot a frame and hands it to the page.
 
 - `robot_data`: snapshots of a robot, from the network (`live_robot`) or from a recording (`recorded_run`), and every
   number over time (`signals`).
@@ -12,4 +12,13 @@
 `operations` sends a viewer's commands to the robot, and `control_token` decides which viewer has control.
 
 The console is a client of the robot like any other: nothing in the robot waits for it.
+
+Threads:
+
+- The display loop is the main thread. It decodes messages, and shows snapshots.
+- Zenoh's threads store messages (`live_robot`).
+- viser's event loop receives the messages of browsers. `admission` checks them there, and calls the handlers of the
+  stop and of held buttons and keys. These must not wait.
+- viser's threads run the callbacks of all other controls, which may wait for the robot.
+- The connection acceptor has a thread of its own for the second stop.
 """

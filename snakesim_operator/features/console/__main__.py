@@ -1,4 +1,4 @@
-"""`python -m snakesim_operator.features.console`: the console of a run."""
+"""Runs the console of a run: `python -m snakesim_operator.features.console`."""
 
 import sys
 

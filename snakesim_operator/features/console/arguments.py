@@ -1,4 +1,4 @@
-"""Arguments of `snakesim console`. Importable without the extra that it needs."""
+"""The arguments of `snakesim console`. Can be imported without the extra that the console needs."""
 
 import argparse
 from math import inf
@@ -8,11 +8,11 @@ from typing import Any
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.programs.arguments import add_network, number
 
-TASK = "watch"  # under which `snakesim --help` lists it
+TASK = "watch"  # heading under which `snakesim --help` lists the command
 
 
 def add_commands(commands: Any) -> None:
-    """Add it to the parser of `snakesim`."""
+    """Add the command to the parser of `snakesim`."""
     console = commands.add_parser(
         "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
     )
@@ -30,10 +30,11 @@ def add_commands(commands: Any) -> None:
         help="the robot file that the host was started with: pages may find zeros, directions and limits, and jog",
     )
     add_network(console)
-    console.set_defaults(act=_console)
+    console.set_defaults(act=_run_console)
 
 
-def _console(arguments: argparse.Namespace) -> int:
+def _run_console(arguments: argparse.Namespace) -> int:
+    """Show a running robot, or the recorded run that the arguments name."""
     from snakesim_operator.base.robot_selection import selection_of
     from snakesim_operator.features.console.command import console, show_record
 

@@ -19,41 +19,93 @@ from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import open_port
 from snakesim_operator.base.targets import RobotSelection, only_robot
 
-MAX_OPEN_FILES = 4096  # connections of browsers take few of them; see `connections.ConnectionLimits`
+MAX_OPEN_FILES = 4096  # far more than connections of browsers may use; see `connection_limits.ConnectionLimits`
 
 
 def console(where: RobotSelection, port: int | None, commission: Path | None = None) -> int:
-    """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none, ConfigError.
+    """Show a running robot until Ctrl-C.
 
-    commission: its robot file, into which pages may write what was found by hand.
+    Args:
+        where: Selects the robot.
+        port: Port of the page; None: the default port, or any free one.
+        commission: The robot file, into which pages may write what was found by hand; None: pages write no file.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        NotConnectedError: There is no such robot.
+        ConfigError: An extra is missing, or the robot file is not valid.
     """
-    extras.check("console", "the console")
+    _prepare_process()
     if commission is not None:
         extras.check("commission", "commissioning")
-        decode(read_part(str(commission), "robots"), RobotFile)
-    raise_open_files(MAX_OPEN_FILES)
+        robot_text = read_part(str(commission), "robots")
+        decode(robot_text, RobotFile)  # an invalid file is an error now, rather than when a page writes it
     from snakesim_operator.features.console.display_loop import show_live
 
     link = only_robot(where, "console")
-    show_live(link, _surroundings(link), open_port(port), _until_signal(), commission=commission)
+    show_live(link, _find_surroundings(link), open_port(port), _stop_on_signal(), commission=commission)
     return 0
 
 
 def show_record(folder: Path, at_s: float, port: int | None) -> int:
-    """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
-    extras.check("console", "the console")
-    raise_open_files(MAX_OPEN_FILES)
+    """Show a recorded run until Ctrl-C.
+
+    Args:
+        folder: The folder of the run.
+        at_s: Where to begin, in seconds after the first instant.
+        port: Port of the page; None: the default port, or any free one.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: The folder is not one of a run.
+    """
+    _prepare_process()
     from snakesim_operator.features.console.display_loop import show_recorded
 
-    return show_recorded(folder, at_s, open_port(port), _until_signal())
+    return show_recorded(folder, at_s, open_port(port), _stop_on_signal())
 
 
-def _surroundings(link: Link):
-    """The true surroundings of a robot that runs on this computer, by its run's configuration; else None."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Show the run that started this process, on a port that the run has opened. The process ends with the run."""
+    parser = argparse.ArgumentParser(
+        prog="snakesim_operator.features.console", description="Show a run in the browser."
+    )
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
+    parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited descriptor
+    options = process_options(parser.parse_args(argv))
+    _prepare_process()
+    from snakesim_operator.features.console.display_loop import show_live
+    from snakesim_operator.features.console.robot_data.snapshot import expected_snapshot
+    from snakesim_operator.features.console.scene.drawing import Surroundings
+
+    listening = socket.socket(fileno=options.arguments.listening)
+    expected = expected_snapshot(options.config)
+    show_live(options.link, Surroundings(options.config), listening, _stop_on_signal(), expected)
+    return 0
+
+
+def _prepare_process() -> None:
+    """Check that the console can run, and raise the limit of open files, which a stop needs too.
+
+    Modules that need the extra can be imported only after this.
+    """
+    extras.check("console", "the console")
+    raise_open_files(MAX_OPEN_FILES)
+
+
+def _find_surroundings(link: Link):
+    """Return the true surroundings of a robot that runs on this computer, from its configuration; None for others."""
     from snakesim_operator.features.console.scene.drawing import Surroundings
 
     for robot in local_robots():
-        if (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace) and robot.config is not None:
+        is_same_robot = (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace)
+        if is_same_robot and robot.config is not None:
             try:
                 return Surroundings(read(Path(robot.config)))
             except (ConfigError, OSError):
@@ -61,29 +113,8 @@ def _surroundings(link: Link):
     return None
 
 
-def _until_signal() -> threading.Event:
+def _stop_on_signal() -> threading.Event:
+    """Return an event that is set when this process gets a signal to stop."""
     stop = threading.Event()
     on_stop_signal(stop.set)
     return stop
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The console of a run, as a child that dies with it, on a port that the run has opened."""
-    parser = argparse.ArgumentParser(
-        prog="snakesim_operator.features.console", description="Show a run in the browser."
-    )
-    add_scenario(parser)
-    add_network(parser, "")
-    add_parent(parser)
-    parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited socket
-    given = process_options(parser.parse_args(argv))
-    extras.check("console", "the console")
-    raise_open_files(MAX_OPEN_FILES)
-    from snakesim_operator.features.console.display_loop import show_live
-    from snakesim_operator.features.console.robot_data.snapshot import expected_snapshot
-    from snakesim_operator.features.console.scene.drawing import Surroundings
-
-    listening = socket.socket(fileno=given.arguments.listening)
-    expected = expected_snapshot(given.config)
-    show_live(given.link, Surroundings(given.config), listening, _until_signal(), expected)
-    return 0

@@ -1,10 +1,14 @@
-"""Which viewer has control. Pure, but for a lock: viewers press buttons in threads of their own."""
+"""Which viewer has control of the robot. Thread-safe, because viewers press buttons in threads of their own."""
 
 import threading
 
 
 class ControlToken:
-    """One token. It is taken while free, released, and returned when its holder's page is gone; never taken away."""
+    """The right of one viewer to command the robot.
+
+    A viewer acquires it while it is free. It is free again when its holder releases it, or when the holder's page is
+    closed. No viewer can take it away from another one.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -15,17 +19,17 @@ class ControlToken:
         """The viewer in control, if any."""
         return self._holder
 
-    def take(self, viewer: int) -> bool:
-        """Take it if it is free; whether the viewer has it now."""
+    def acquire(self, viewer: int) -> bool:
+        """Acquire the token if it is free, and return whether the viewer has it now."""
         with self._lock:
             if self._holder is None:
                 self._holder = viewer
             return self._holder == viewer
 
     def release(self, viewer: int) -> bool:
-        """Give it back; False when the viewer did not have it."""
+        """Release the token, and return whether the viewer had it."""
         with self._lock:
-            had = self._holder == viewer
-            if had:
+            had_token = self._holder == viewer
+            if had_token:
                 self._holder = None
-            return had
+            return had_token

@@ -1,4 +1,4 @@
-"""The loop: take in what has arrived, show it, wait for the next frame."""
+"""The display loop: take a snapshot of the robot, show it, and wait for the next frame."""
 
 import socket
 import threading
@@ -27,15 +27,24 @@ FRAMES_PER_S = 30.0
 
 def show_live(
     link: Link,
-    around: Surroundings | None,
+    surroundings: Surroundings | None,
     listening: socket.socket,
     stop: threading.Event,
     expected: RobotSnapshot | None = None,
     commission: Path | None = None,
 ) -> None:
-    """Show a robot until `stop` is set. Raises NotConnectedError when no network is there.
+    """Show a live robot until `stop` is set.
 
-    expected: what to show until there is a robot; commission: the robot file that pages may write into.
+    Args:
+        link: How to connect to the robot.
+        surroundings: The true surroundings of the robot, if they are known.
+        listening: Where browsers connect.
+        stop: Set to end the console.
+        expected: Shown until a robot describes itself.
+        commission: The robot file that pages may write into; None: none.
+
+    Raises:
+        NotConnectedError: There is no network.
     """
     log = PageLog()
     operations = Operations(link, log)
@@ -44,60 +53,76 @@ def show_live(
         log.write(line)
         say(line)
 
-    kept = LiveSignals()
-    signals = SignalsPage(kept, SECOND_STOP)
-    signals.now_s = kept.now_s
+    signals = LiveSignals()
+    signals_page = SignalsPage(signals, SECOND_STOP)
+    signals_page.now_s = signals.now_s
 
-    with page_server(listening, report, operations.stop, signals.answer) as (server, address):
-        page = Page(server, around, operations, log, commission=commission)
+    with page_server(listening, report, operations.stop, signals_page.answer) as (server, address):
+        page = Page(server, surroundings, operations, log, commission=commission)
         say(f"console: {address}")
         page.show(expected)
-        whole = replace(link, max_bytes=MAX_IMAGE_BYTES)
-        with open_session(whole, START_LIMIT_S) as session:
+        link_with_images = replace(link, max_bytes=MAX_IMAGE_BYTES)
+        with open_session(link_with_images, START_LIMIT_S) as session:
             operations.connect(session)
-            watch, changes = LiveRobot(session), StateChangeLog(log.write)
-            for _ in frames(stop):
-                snapshot = watch.snapshot() or expected
+            robot = LiveRobot(session)
+            changes = StateChangeLog(log.write)
+            for _ in wait_for_frames(stop):
+                snapshot = robot.snapshot() or expected
                 if snapshot is not None:
                     changes.note(snapshot.status)
                     changes.note(snapshot.control)
                     changes.note(snapshot.settings)
-                    kept.take(snapshot)
+                    signals.add_snapshot(snapshot)
                 page.show(snapshot)
 
 
-def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event) -> int:
-    """Show a run's record until `stop` is set. Returns the exit code. Raises ConfigError when the folder has none."""
-    # What only recordings need would delay the page of a run that starts.
+def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: threading.Event) -> int:
+    """Show the record of a run until `stop` is set.
+
+    Args:
+        folder: The folder of the run.
+        start_s: Where to begin, in seconds after the first instant.
+        listening: Where browsers connect.
+        stop: Set to end the console.
+
+    Returns:
+        The exit code: it reports data that the record should have and has not.
+
+    Raises:
+        ConfigError: The folder has no record.
+    """
+    # Imported here, because modules that only recordings need would delay the page of a run that starts.
     from snakesim_operator.features.console.robot_data.recorded_run import RecordedRun
     from snakesim_operator.features.console.robot_data.recorded_signals import RecordedSignals
     from snakesim_operator.results.missing_data import exit_code
 
-    recorded, log = RecordedRun(folder), PageLog()
-    for lack in recorded.record.lacks:
-        log.write(f"the record lacks {lack}")
-    if recorded.heard.thinned > 1:
-        log.write(f"of {recorded.heard.thinned} camera images one is kept")
-    code = exit_code(folder, recorded.record.lacks)
-    signals = SignalsPage(RecordedSignals(recorded))
-    with page_server(listening, say, more=signals.answer) as (server, address):
-        page = Page(server, Surroundings(recorded.record.config), None, log, recorded=folder.name)
-        player = Player(server, recorded.span_s, at_s)
-        signals.now_s, signals.go = (lambda: player.since_s), player.go
+    run = RecordedRun(folder)
+    log = PageLog()
+    for missing in run.record.lacks:
+        log.write(f"the record lacks {missing}")
+    if run.history.image_decimation > 1:
+        log.write(f"of {run.history.image_decimation} camera images one is kept")
+    code = exit_code(folder, run.record.lacks)
+    signals_page = SignalsPage(RecordedSignals(run))
+    with page_server(listening, say, answer_first=signals_page.answer) as (server, address):
+        page = Page(server, Surroundings(run.record.config), None, log, recorded=folder.name)
+        player = Player(server, run.span_s, start_s)
+        signals_page.now_s = lambda: player.since_begin_s
+        signals_page.jump_to = player.jump_to
         say(f"console: {address}")
         shown_s = None
-        for _ in frames(stop):
-            time_s, jumped = player.turn()
-            if jumped or shown_s is None:
-                page.recall(recorded.before(time_s))
+        for _ in wait_for_frames(stop):
+            time_s, has_jumped = player.advance()
+            if has_jumped or shown_s is None:
+                page.start_over(run.before(time_s))
             if time_s != shown_s:
-                page.show(recorded.at(time_s))
+                page.show(run.at(time_s))
                 shown_s = time_s
     return code
 
 
-def frames(stop: threading.Event) -> Iterator[None]:
-    """One turn a frame, until `stop` is set; a frame that takes too long delays the others."""
+def wait_for_frames(stop: threading.Event) -> Iterator[None]:
+    """Yield once for each frame until `stop` is set. A frame that takes too long delays the next ones."""
     due_s = time.monotonic()
     while not stop.is_set():
         yield

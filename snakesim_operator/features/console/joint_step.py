@@ -1,7 +1,8 @@
-"""A `snakesim joints` command that runs beside the console, in a terminal of its own: what it says, and keys for it.
+"""A `snakesim joints` command that runs beside the console, in a pseudo-terminal of its own.
 
-So the page has the command's words, checks and dead-man's switch. If the console ends, that terminal is gone, and the
-command ends as in one that was closed; a console that hangs types nothing, and a joint that is jogged stands.
+So the page has the texts, the checks and the dead-man's switch of the command. If the console ends, the terminal is
+closed, and the command ends as in any terminal that is closed. If the console hangs, it sends no keys, and a joint that
+is jogged stops.
 """
 
 import contextlib
@@ -15,74 +16,96 @@ from collections.abc import Sequence
 
 from snakesim_hal.base.process import child_environment, python_command
 
-LINES = 14
-ENTER, FORWARDS, BACKWARDS = b"\n", b"+", b"-"
+MAX_LINES = 14  # of output, so that the buttons below it stay in sight
+MAX_LINE_CHARACTERS = 300
+LOCAL_FLAGS = 3  # index of the local flags in what `termios.tcgetattr` returns
+
+# Keys of the command.
+ENTER = b"\n"
+FORWARDS = b"+"
+BACKWARDS = b"-"
 
 
 class JointStep:
-    """One run of it."""
+    """One run of the command. A thread of its own reads the output; every method may be called from any thread."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        """words: what follows `snakesim joints`."""
-        self.verb, self._lock = words[0], threading.Lock()
-        self._lines: deque[str] = deque(maxlen=LINES)
-        self._terminal, theirs = pty.openpty()
-        os.set_blocking(self._terminal, False)
-        mode = termios.tcgetattr(theirs)
-        mode[3] &= ~termios.ECHO
-        termios.tcsetattr(theirs, termios.TCSANOW, mode)
+        """Start the command. words: what follows `snakesim joints`, its verb first."""
+        self.verb = words[0]
+        self._lines: deque[str] = deque(maxlen=MAX_LINES)
+        self._lock = threading.Lock()  # of `_lines` and `_terminal`
+        self._terminal, command_terminal = pty.openpty()
         try:
-            self._process = subprocess.Popen(
-                python_command("-m", "snakesim_operator", "joints", *words),
-                env=child_environment(),
-                stdin=theirs,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-            )
-        except OSError:
+            os.set_blocking(self._terminal, False)
+            _switch_echo_off(command_terminal)
+            self._process = _start_command(words, command_terminal)
+        except BaseException:
             os.close(self._terminal)
             raise
         finally:
-            os.close(theirs)
-        self._reader = threading.Thread(target=self._read, name="joint step", daemon=True)
+            os.close(command_terminal)
+        self._reader = threading.Thread(target=self._read_output, name="joint step", daemon=True)
         self._reader.start()
 
     @property
-    def runs(self) -> bool:
-        """Whether it has more to say."""
+    def is_running(self) -> bool:
+        """Whether the command may still print something."""
         return self._reader.is_alive()
 
     @property
     def lines(self) -> list[str]:
-        """The newest that it has said, oldest first."""
+        """The newest lines of output, oldest first."""
         with self._lock:
             return list(self._lines)
 
-    def press(self, key: bytes) -> None:
-        """Type a key. What nobody takes in is lost: a key must not count later."""
-        with self._lock, contextlib.suppress(OSError):  # full, or over
+    def press_key(self, key: bytes) -> None:
+        """Send a key to the command. Does not wait.
+
+        A key that the command cannot take now is lost, because a key must not count later.
+        """
+        with self._lock, contextlib.suppress(OSError):  # the terminal is full, or closed
             os.write(self._terminal, key)
 
     def end(self) -> None:
-        """End it, as Ctrl-C does: a joint that is jogged is disarmed, a file is not written."""
+        """End the command as Ctrl-C does: a joint that is jogged is disarmed, and a file is not written."""
         with contextlib.suppress(ProcessLookupError):
             self._process.terminate()
 
-    def _read(self) -> None:
+    def _read_output(self) -> None:
         assert self._process.stdout is not None
         try:
-            with self._process.stdout as said:
-                for line in said:
-                    with self._lock:
-                        self._lines.append(line.rstrip("\n")[:300])
-        except BaseException:  # its output cannot be read: a step that nobody sees must not go on
+            with self._process.stdout as output:
+                for line in output:
+                    self._add_line(line.rstrip("\n")[:MAX_LINE_CHARACTERS])
+        except BaseException:  # a step whose output cannot be shown must not go on
             self.end()
             raise
         finally:
-            code = self._process.wait()
+            exit_code = self._process.wait()
+            self._add_line("done" if exit_code == 0 else f"ended ({exit_code})")
             with self._lock:
-                self._lines.append("done" if code == 0 else f"ended ({code})")
                 os.close(self._terminal)
-                self._terminal = -1
+                self._terminal = -1  # a key that is sent now fails, rather than going to another file
+
+    def _add_line(self, line: str) -> None:
+        with self._lock:
+            self._lines.append(line)
+
+
+def _switch_echo_off(terminal: int) -> None:
+    """Keep a terminal from printing the keys that are sent to it."""
+    attributes = termios.tcgetattr(terminal)
+    attributes[LOCAL_FLAGS] &= ~termios.ECHO
+    termios.tcsetattr(terminal, termios.TCSANOW, attributes)
+
+
+def _start_command(words: Sequence[str], terminal: int) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        python_command("-m", "snakesim_operator", "joints", *words),
+        env=child_environment(),
+        stdin=terminal,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+    )

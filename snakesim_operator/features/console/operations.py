@@ -1,7 +1,8 @@
-"""What viewers can do to the robot: the commands of the command line, from a page.
+"""The commands that viewers can give to the robot: those of the command line, from a page.
 
-Each call takes as long as its command does, and returns what that would print, or raises its SnakesimError. So each
-command's checks hold here too: two answers are an attack, and a state counts once the host itself publishes it.
+Each call takes as long as its command does. It returns the text that the command would print, or raises its
+SnakesimError. So the checks of each command hold here too: two answers are an attack, and a state counts only once the
+host itself publishes it.
 """
 
 import threading
@@ -20,102 +21,147 @@ from snakesim_operator.robot_commands.prepared_stop import PreparedStop
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
 LOG_LINES = 200
+
 # How long an intent from the page is valid, from the last moment at which its button or key is known to have been held.
-# Then a viewer who is gone moves nothing. A button sends ten times a second that it is held; a held key at first after
-# as long as its keyboard takes to repeat it, mostly 0.25 to 0.66 s. Both include the page's answer to a question, by
-# which that moment is known: about 0.2 s.
-BUTTON_NS, KEY_NS = 700_000_000, 1_000_000_000
+# After that, a viewer whose page is gone moves nothing. Both times include about 0.2 s for the page's answer to a
+# question, by which that moment is known.
+BUTTON_VALIDITY_NS = 700_000_000  # a page repeats ten times a second that a button is held
+KEY_VALIDITY_NS = 1_000_000_000  # a keyboard first repeats a held key after 0.25 to 0.66 s
+
+Print = Callable[[str], None]
 
 
 class PageLog:
-    """The newest lines of what viewers did and what became of the robot; newest first."""
+    """The newest lines about what viewers did and how the robot's state changed. Thread-safe."""
 
     def __init__(self) -> None:
         self._lines: deque[str] = deque(maxlen=LOG_LINES)
         self._lock = threading.Lock()
-        self.written = 0
 
     def write(self, line: str) -> None:
-        """Add a line, with the time of day; from any thread."""
+        """Add a line, with the time of day."""
         with self._lock:
             self._lines.appendleft(f"{datetime.now():%H:%M:%S}  {line}")
-            self.written += 1
 
     def lines(self) -> list[str]:
-        """All of them."""
+        """Return all lines, newest first."""
         with self._lock:
             return list(self._lines)
 
 
 class Operations:
-    """The robot at a link, as far as one can act on it."""
+    """Sends the commands of viewers to the robot at a link, and logs each of them with its outcome.
+
+    `who` is the name of the viewer. Each method that returns a text waits for the robot's answer, and raises a
+    SnakesimError when the robot refuses, or does not answer.
+    """
 
     def __init__(self, link: Link, log: PageLog) -> None:
         self.link = link
-        self._where = RobotSelection(link.endpoint, link.namespace, link.session)
+        self._selection = RobotSelection(link.endpoint, link.namespace, link.session)
         self._log = log
-        self.stop = PreparedStop(self._where, link, lambda who, text: log.write(f"{who}: EMERGENCY STOP: {text}"))
+        self.stop = PreparedStop(self._selection, link, self._log_stop)
+        # Known once the console is connected.
         self._session: Session | None = None
         self._intents: Publisher[Intent] | None = None
 
+    def _log_stop(self, requester: str, outcome: str) -> None:
+        self._log.write(f"{requester}: EMERGENCY STOP: {outcome}")
+
     def connect(self, session: Session) -> None:
-        """Use this session for what the command line has no command for."""
-        self._session, self._intents = session, session.publisher(keys.INTENT, Intent)
+        """Use this session for intents, settings and the stop."""
+        self._session = session
+        self._intents = session.publisher(keys.INTENT, Intent)
         self.stop.connect(session)
 
     def arm(self, who: str, robot: Description, *, unchecked: bool = False) -> str:
-        """Arm the robot that the page shows. unchecked: also without a check of its joints."""
-        what = f"{who}: arm{', unchecked' if unchecked else ''}"
-        return self._do(what, lambda say: arm(robot.robot, robot.backend, self._where, say, unchecked=unchecked))
+        """Arm the robot that the page shows. unchecked: also if its joints were not checked."""
+        title = f"{who}: arm"
+        if unchecked:
+            title += ", unchecked"
+        return self._run_command(
+            title, lambda print_: arm(robot.robot, robot.backend, self._selection, print_, unchecked=unchecked)
+        )
 
     def disarm(self, who: str) -> str:
         """Make the joints passive."""
-        return self._do(f"{who}: disarm", lambda say: disarm(self._where, say))
+        return self._run_command(f"{who}: disarm", lambda print_: disarm(self._selection, print_))
 
     def clear(self, who: str) -> str:
         """Clear a fault or an emergency stop."""
-        return self._do(f"{who}: clear", lambda say: clear(self._where, say))
+        return self._run_command(f"{who}: clear", lambda print_: clear(self._selection, print_))
 
     def change_time(self, who: str, order: SimulatorOrder) -> str:
-        """Pause, step, speed or reset, where the robot is a simulator."""
-        return self._do(f"{who}: simulator: {order}", lambda say: simulator(order, self._where, say))
+        """Pause, resume, step, speed up or reset a simulator."""
+        return self._run_command(f"{who}: simulator: {order}", lambda print_: simulator(order, self._selection, print_))
 
     def inject(self, who: str, order: FaultOrder) -> str:
-        """Inject a fault, where the run allows it."""
-        return self._do(f"{who}: fault {order.kind}:{order.target}", lambda say: fault(order, self._where, say))
+        """Inject a fault, or end it, if the run allows fault injection."""
+        title = f"{who}: fault {order.kind}:{order.target}"
+        return self._run_command(title, lambda print_: fault(order, self._selection, print_))
 
     def configure(self, who: str, controller: str, settings: str) -> str:
-        """Have the running controller go on with other settings."""
+        """Change the settings of the running controller. settings: all of them, as JSON."""
         request = SettingsRequest(who=who, controller=controller, settings=settings)
-        return self._do(f"{who}: settings", lambda say: self._ask(keys.SETTINGS, request, say))
+        return self._run_command(f"{who}: settings", lambda print_: self._send_request(keys.SETTINGS, request, print_))
 
     def drive(self, who: str, heading_w_rad: float, speed_m_s: float, acted_ns: int, valid_ns: int) -> None:
-        """Ask for a direction and a speed. acted_ns: robot time at which the viewer did; valid_ns: from then on."""
-        if self._intents is not None:
-            intent = Intent(
-                timestamp_ns=acted_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=valid_ns
-            )
-            self._intents.put(intent)
+        """Publish an intent to go in a direction at a speed. Does not wait; does nothing before `connect`.
 
-    def _ask(self, key: str, request: Message, say: Callable[[str], None]) -> int:
-        """One question, and its answer. Raises RefusedError, NotConnectedError."""
+        Args:
+            who: Name of the viewer.
+            heading_w_rad: Direction in the world frame.
+            speed_m_s: Speed; negative is backwards.
+            acted_ns: Robot time at which the viewer is known to have acted.
+            valid_ns: How long the intent is valid from then on.
+        """
+        if self._intents is None:
+            return
+        intent = Intent(
+            timestamp_ns=acted_ns,
+            who=who,
+            speed_m_s=speed_m_s,
+            heading_w_rad=heading_w_rad,
+            valid_for_ns=valid_ns,
+        )
+        self._intents.put(intent)
+
+    def _send_request(self, key: str, request: Message, print_: Print) -> int:
+        """Send a request that has no command of the command line, and print the answer.
+
+        Returns:
+            0, the exit code of a command that succeeded.
+
+        Raises:
+            RefusedError: The receiver refused the request.
+            NotConnectedError: There is no connection or no answer.
+        """
         if self._session is None:
             raise NotConnectedError("not connected to the robot yet")
         answer = self._session.ask(key, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)
-        say(answer.reason)
+        print_(answer.reason)
         return 0
 
-    def _do(self, what: str, call: Callable[[Callable[[str], None]], int]) -> str:
+    def _run_command(self, title: str, command: Callable[[Print], int]) -> str:
+        """Run a command, log its outcome, and return what it printed.
+
+        Args:
+            title: Viewer and command, for the log.
+            command: Prints with the function that it gets, and returns an exit code.
+
+        Raises:
+            SnakesimError: The command failed.
+        """
         lines: list[str] = []
         try:
-            failed = call(lines.append) != 0
-            said = "; ".join(lines)
-            if failed:
-                raise RefusedError(said)
+            exit_code = command(lines.append)
+            text = "; ".join(lines)
+            if exit_code != 0:
+                raise RefusedError(text)
         except SnakesimError as error:
-            self._log.write(f"{what}: {error}")
+            self._log.write(f"{title}: {error}")
             raise
-        self._log.write(f"{what}: {said}")
-        return said
+        self._log.write(f"{title}: {text}")
+        return text

@@ -1,1 +1,1 @@
-"""What stands on the page beside the scene: header, tabs, charts, and the controls of each viewer."""
+"""The panel beside the scene: header, tabs, charts, and the controls of each viewer."""

@@ -1,13 +1,12 @@
-"""Commissioning, as a tab: every joint in a table, and the commands `snakesim joints` run from the page.
+"""The Commission tab: all joints in a table, and the commands of `snakesim joints`, run from the page.
 
-One step at a time, of the viewer in control; without control, or with its page, it ends.
+One step runs at a time, for the viewer in control. It ends when that viewer releases control or closes the page.
 """
 
 import shlex
 import threading
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -17,20 +16,16 @@ from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link
 from snakesim_hal.wire.messages import Configuration
-from snakesim_hal.wire.quantities import MAX_JOINTS
 from snakesim_operator.base.targets import flags_of
 from snakesim_operator.features.console.control_token import ControlToken
-from snakesim_operator.features.console.joint_step import BACKWARDS, ENTER, FORWARDS, JointStep
+from snakesim_operator.features.console.joint_step import ENTER, JointStep
 from snakesim_operator.features.console.operations import PageLog
-from snakesim_operator.features.console.page.joint_table import Range, commissioning_html
+from snakesim_operator.features.console.page.joint_table import AngleRange, commissioning_html
 from snakesim_operator.features.console.page.page_html import escape_text
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
-from snakesim_operator.features.console.web.message_age import PageAction
 
-HOLD_HZ = 20.0  # a command counts a key as held for 0.15 s
-NOBODY = -1  # as the viewer of a step: it is being ended
-LEFT_S = 60.0  # a jog in which nothing is held for so long ends
+MAX_IDLE_JOG_S = 60.0  # a jog leaves the robot armed, so it ends when no button is held for this long
+NO_VIEWER = -1  # viewer of a step that is being ended already
 STEPS = {
     "direction": "turn joints by hand, as it asks; Enter skips one",
     "zero": "lay the robot straight, let go of it, then Enter",
@@ -40,196 +35,201 @@ STEPS = {
 
 
 class Commissioning:
-    """What all viewers see of it, and the step that runs."""
+    """The table of joints that all viewers see, and the step that runs.
+
+    Threads: the display loop calls `update` and `redraw`. The threads of viser call `start` and `end`. `press_key` is
+    also called by the thread that receives messages of browsers, so it must not wait.
+    """
 
     def __init__(
         self,
         gui: viser.GuiApi,
         tab: viser.GuiFolderHandle,
         link: Link,
-        file: Path | None,
+        robot_file: Path | None,
         token: ControlToken,
         log: PageLog,
     ) -> None:
-        """file: the robot file on this computer with which the host was started; None: steps need a terminal."""
-        self.file, self._link, self._token, self._log = file, link, token, log
-        self._step: JointStep | None = None
-        self._viewer, self._held_s = NOBODY, 0.0
+        """Add the table to the page.
+
+        Args:
+            gui: The page of all viewers.
+            tab: The place of the table.
+            link: How a step connects to the robot.
+            robot_file: The robot file on this computer with which the host was started; None: steps need a terminal.
+            token: Decides which viewer has control.
+            log: Gets a line for each step that starts or is ended.
+        """
+        self.robot_file = robot_file
+        self._link = link
+        self._token = token
+        self._log = log
+        # The step. The lock keeps two viewers from starting one at the same time.
         self._lock = threading.Lock()
-        self._configured: Configuration | None = None
+        self._step: JointStep | None = None
+        self._viewer = NO_VIEWER
+        self._last_key_s = 0.0  # when the step was started, or got its newest key
+        self._moved_ranges: list[AngleRange] = []
+        # The configuration of the run, decoded once.
+        self._configuration: Configuration | None = None
         self._config: RunConfig | None = None
-        self._moved: list[Range] = []
         with tab:
             self._table = gui.add_html("", order=0)
-            self._said = gui.add_html("", order=1)
-            self._typed = gui.add_html("", order=3)
+            self._step_output = gui.add_html("", order=1)
+            self._terminal_commands = gui.add_html("", order=3)
 
-    def start(self, viewer: int, verb: str, joint: int, more: list[str]) -> str:
-        """Start a step. joint: its number, 0: all of them. Raises RefusedError."""
-        if self.file is None:
+    def start(self, viewer: int, verb: str, joint: int, options: list[str]) -> str:
+        """Start a step.
+
+        Args:
+            viewer: The viewer in control.
+            verb: A key of STEPS.
+            joint: Number of the joint; 0: all joints.
+            options: Further words of the command line.
+
+        Returns:
+            The command that was started.
+
+        Raises:
+            RefusedError: A step runs already, or the step cannot be started from this page.
+        """
+        if self.robot_file is None:
             raise RefusedError("the console was started without --commission FILE")
         if verb == "jog" and not joint:
             raise RefusedError("jog moves one joint: give its number")
-        named = [f"joint_{joint}"] if joint and verb != "zero" else []
+        joint_names: list[str] = []
+        if joint and verb != "zero":
+            joint_names.append(f"joint_{joint}")
         with self._lock:
-            if self._step is not None and self._step.runs:
+            if self._step is not None and self._step.is_running:
                 raise RefusedError(f"{self._step.verb} is under way: end it first")
-            where = shlex.split(flags_of(self._link, None))
-            self._step = JointStep([verb, str(self.file), *named, *more, *where])
-            self._viewer, self._held_s, self._moved = viewer, time.monotonic(), []
-        what = f"joints {' '.join([verb, *named])}"
-        self._log.write(f"viewer {viewer + 1}: {what}")
-        return what
+            robot_flags = shlex.split(flags_of(self._link, None))
+            self._step = JointStep([verb, str(self.robot_file), *joint_names, *options, *robot_flags])
+            self._viewer = viewer
+            self._last_key_s = time.monotonic()
+            self._moved_ranges = []
+        command = f"joints {' '.join([verb, *joint_names])}"
+        self._log.write(f"viewer {viewer + 1}: {command}")
+        return command
 
-    def press(self, viewer: int, key: bytes) -> None:
-        """A key for the step, of the viewer who started it."""
+    def press_key(self, viewer: int, key: bytes) -> None:
+        """Send a key to the step, if the viewer who started it sends the key and is still in control."""
         step = self._step
         if step is None or viewer != self._viewer or self._token.holder != viewer:
             return
-        if key == ENTER if step.verb != "jog" else key != ENTER and step.lines:  # a jog speaks once it is armed
-            self._held_s = time.monotonic()
-            step.press(key)
+        if _takes_key(step, key):
+            self._last_key_s = time.monotonic()
+            step.press_key(key)
 
     def end(self) -> None:
-        """End the step."""
+        """End the step, if there is one."""
         if self._step is not None:
             self._step.end()
 
-    def turn(self, snapshot: RobotSnapshot | None) -> None:
-        """Each frame: no step goes on without its viewer, and no jog that is left alone."""
+    def update(self, snapshot: RobotSnapshot | None) -> None:
+        """End a step that must not go on, and note how far the joints were moved; called for each frame."""
         step = self._step
-        if step is None or not step.runs:
+        if step is None or not step.is_running:
             return
-        left = step.verb == "jog" and time.monotonic() - self._held_s > LEFT_S
-        if self._viewer != NOBODY and (left or self._token.holder != self._viewer):
-            why = f"nothing was held for {LEFT_S:g} s" if left else "control was given up"
-            self._log.write(f"joints {step.verb} ends: {why}")
-            self._viewer = NOBODY
-            step.end()
+        self._end_abandoned_step(step)
         if step.verb == "limits" and snapshot is not None and snapshot.joints is not None:
-            now = snapshot.joints.angle_rad
-            before = self._moved or [(angle, angle) for angle in now]
-            self._moved = [(min(least, at), max(most, at)) for (least, most), at in zip(before, now, strict=True)]
+            self._extend_moved_ranges(snapshot.joints.angle_rad)
 
-    def show(self, snapshot: RobotSnapshot) -> None:
-        """A few times a second."""
-        if snapshot.configuration is not self._configured:
-            self._configured = snapshot.configuration
-            self._config = None if self._configured is None else _read(self._configured.content)
-        moved = self._moved if len(self._moved) == len(snapshot.robot.joints) else ()
-        self._table.content = commissioning_html(snapshot, self._config, moved)
-        step = self._step
-        if step is not None:
-            lines = "".join(f"<div>{escape_text(line)}</div>" for line in step.lines)
-            self._said.content = (
-                f"<div data-step style='margin:.4em .6em;padding:.4em .6em;border:1px solid;border-radius:6px;"
-                f"font-size:.85em'><b>joints {escape_text(step.verb)}</b>{lines}</div>"
-            )
-        self._typed.content = self._in_a_terminal(snapshot)
+    def _end_abandoned_step(self, step: JointStep) -> None:
+        """End a step whose viewer has lost control, and a jog in which no button was held for a long time."""
+        if self._viewer == NO_VIEWER:
+            return
+        is_idle_jog = step.verb == "jog" and time.monotonic() - self._last_key_s > MAX_IDLE_JOG_S
+        has_control = self._token.holder == self._viewer
+        if is_idle_jog:
+            reason = f"nothing was held for {MAX_IDLE_JOG_S:g} s"
+        elif not has_control:
+            reason = "control was given up"
+        else:
+            return
+        self._log.write(f"joints {step.verb} ends: {reason}")
+        self._viewer = NO_VIEWER
+        step.end()
 
-    def _in_a_terminal(self, snapshot: RobotSnapshot) -> str:
-        """What this page cannot do, as the exact commands."""
-        flags, file = flags_of(self._link, snapshot.robot.robot), "FILE" if self.file is None else str(self.file)
-        check = [
-            f"snakesim run SCENARIO --controller joint_check --backend {snapshot.robot.backend} --out runs/check",
-            f"snakesim joints check runs/check {file} --straight",
+    def _extend_moved_ranges(self, angles_rad: Sequence[float]) -> None:
+        """Extend the range in which each joint was moved by its present angle."""
+        ranges = self._moved_ranges or [(angle_rad, angle_rad) for angle_rad in angles_rad]
+        self._moved_ranges = [
+            (min(lower_rad, angle_rad), max(upper_rad, angle_rad))
+            for (lower_rad, upper_rad), angle_rad in zip(ranges, angles_rad, strict=True)
         ]
-        texts = [
-            ("The start check, once the host is stopped (SCENARIO: the one that the host was started with):", check)
-        ]
-        if self.file is None:
-            steps = [f"snakesim joints {verb} FILE{' joint_N' if verb == 'jog' else ''}{flags}" for verb in STEPS]
-            again = f"snakesim console --commission FILE{flags}"
-            texts = [
-                ("Where the robot's FILE is, with which the host was started, type:", steps),
-                ("or do these from a page, with a console on that computer:", [again]),
-                *texts,
+
+    def redraw(self, snapshot: RobotSnapshot) -> None:
+        """Redraw the tab; called a few times a second."""
+        if snapshot.configuration is not self._configuration:
+            self._configuration = snapshot.configuration
+            self._config = None
+            if self._configuration is not None:
+                self._config = _decode_config(self._configuration.content)
+        has_ranges = len(self._moved_ranges) == len(snapshot.robot.joints)
+        moved_ranges = self._moved_ranges if has_ranges else ()
+        self._table.content = commissioning_html(snapshot, self._config, moved_ranges)
+        if self._step is not None:
+            self._step_output.content = _step_html(self._step)
+        self._terminal_commands.content = self._terminal_html(snapshot)
+
+    def _terminal_html(self, snapshot: RobotSnapshot) -> str:
+        """Return the exact commands for everything that this page cannot do."""
+        flags = flags_of(self._link, snapshot.robot.robot)
+        parts: list[str] = []
+        if self.robot_file is None:
+            steps: list[str] = []
+            for verb in STEPS:
+                joint = " joint_N" if verb == "jog" else ""
+                steps.append(f"snakesim joints {verb} FILE{joint}{flags}")
+            parts = [
+                _commands_html("Where the robot's FILE is, with which the host was started, type:", steps),
+                _commands_html(
+                    "or do these from a page, with a console on that computer:",
+                    [f"snakesim console --commission FILE{flags}"],
+                ),
             ]
-        return "".join(
-            f"<div style='padding:.3em .6em;font-size:.82em'>{escape_text(what)}"
-            + "".join(f"<pre style='margin:.2em 0;white-space:pre-wrap'>{escape_text(line)}</pre>" for line in typed)
-            + "</div>"
-            for what, typed in texts
+        file_name = "FILE" if self.robot_file is None else str(self.robot_file)
+        backend = snapshot.robot.backend
+        check = [
+            f"snakesim run SCENARIO --controller joint_check --backend {backend} --out runs/check",
+            f"snakesim joints check runs/check {file_name} --straight",
+        ]
+        parts.append(
+            _commands_html(
+                "The start check, once the host is stopped (SCENARIO: the one that the host was started with):", check
+            )
         )
+        return "".join(parts)
 
 
-class CommissioningControls:
-    """One viewer's buttons for it."""
+def _takes_key(step: JointStep, key: bytes) -> bool:
+    """Return whether a step takes a key now: a jog the keys that move a joint, every other step only Enter.
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        tab: viser.GuiFolderHandle,
-        commissioning: Commissioning,
-        admission: Admission,
-        may: Callable[[], bool],
-        do: Callable[[str, Callable[[], str]], object],
-        on_late: Callable[[float], None],
-    ) -> None:
-        """may: whether this viewer is in control; do: does something, and tells the viewer what came of it.
-
-        on_late: called with the age of a press that was too old.
-        """
-        self._commissioning, self._may, self._do = commissioning, may, do
-        self._viewer, gui = client.client_id, client.gui
-        with tab:
-            self._folder = gui.add_folder("Do it here", order=2, visible=False)
-        with self._folder:
-            self._verb = gui.add_dropdown("Step", tuple(STEPS), initial_value="direction")
-            self._about = gui.add_html("")
-            self._joint = gui.add_number("Joint (0: all)", 0, min=0, max=MAX_JOINTS, step=1)
-            self._speed = gui.add_slider("Speed, rad/s", 0.01, 0.5, 0.01, 0.1)
-            self._travel = gui.add_slider("Travel, rad", 0.05, 3.2, 0.05, 0.2)
-            self._torque = gui.add_slider("Share of torque", 0.05, 1.0, 0.05, 0.3)
-            start = gui.add_button("Start step", color="blue")
-            self._enter = gui.add_button("Enter")
-            self._forwards = gui.add_button("Hold: forwards (+)", color="green")
-            self._backwards = gui.add_button("Hold: backwards (-)", color="green")
-            end = gui.add_button("End step", color="gray")
-        for one in (self._verb, self._joint, self._speed, self._travel, self._torque, end):
-            admission.admit(one, self._viewer, may)
-        for one in (start, self._enter):
-            admission.admit(one, self._viewer, may, max_age_s=MAX_PRESS_AGE_S, on_late=on_late)
-        for one, key in ((self._forwards, FORWARDS), (self._backwards, BACKWARDS)):
-            one.on_hold(lambda _: None, callback_hz=HOLD_HZ)  # so that the page repeats that it is held
-            act = partial(self._on_held, key)
-            admission.admit(one, self._viewer, may, HOLD_HZ, act=act, max_age_s=MAX_HOLD_AGE_S)
-        self._verb.on_update(lambda _: self._describe())
-        start.on_click(lambda _: self._start())
-        self._enter.on_click(lambda _: commissioning.press(self._viewer, ENTER))
-        end.on_click(lambda _: self._end())
-        self._describe()
-
-    def show(self) -> None:
-        """Whether this viewer may."""
-        self._folder.visible = self._commissioning.file is not None and self._may()
-
-    def _describe(self) -> None:
-        """What the chosen step is, and its inputs alone."""
-        verb = self._verb.value
-        self._about.content = f"<div style='padding:.2em .6em;font-size:.85em'>{escape_text(STEPS[verb])}</div>"
-        self._joint.visible, self._enter.visible = verb != "zero", verb != "jog"
-        for one in (self._speed, self._travel, self._torque, self._forwards, self._backwards):
-            one.visible = verb == "jog"
-
-    def _on_held(self, key: bytes, _viewer: int, _action: PageAction) -> None:
-        """A button is held, by a message that is not too old."""
-        self._commissioning.press(self._viewer, key)
-
-    def _start(self) -> None:
-        verb, joint = self._verb.value, int(self._joint.value)
-        jog = ["--speed", self._speed, "--travel", self._travel, "--torque", self._torque]
-        words = [one if isinstance(one, str) else f"{one.value:g}" for one in jog] if verb == "jog" else []
-        if self._may():
-            self._do("Joints", lambda: self._commissioning.start(self._viewer, verb, joint, words))
-
-    def _end(self) -> None:
-        if self._may():
-            self._commissioning.end()
+    A jog takes keys only once it has printed a line, which it does when the robot is armed.
+    """
+    if step.verb == "jog":
+        return key != ENTER and bool(step.lines)
+    return key == ENTER
 
 
-def _read(content: str) -> RunConfig | None:
-    """None: of another version."""
+def _step_html(step: JointStep) -> str:
+    """Return the output of a step."""
+    lines = "".join(f"<div>{escape_text(line)}</div>" for line in step.lines)
+    return (
+        f"<div data-step style='margin:.4em .6em;padding:.4em .6em;border:1px solid;border-radius:6px;"
+        f"font-size:.85em'><b>joints {escape_text(step.verb)}</b>{lines}</div>"
+    )
+
+
+def _commands_html(introduction: str, commands: Sequence[str]) -> str:
+    """Return commands for a terminal, below a line that introduces them."""
+    lines = [f"<pre style='margin:.2em 0;white-space:pre-wrap'>{escape_text(command)}</pre>" for command in commands]
+    return f"<div style='padding:.3em .6em;font-size:.82em'>{escape_text(introduction)}{''.join(lines)}</div>"
+
+
+def _decode_config(content: str) -> RunConfig | None:
+    """Return the configuration of a run; None if it is of another version."""
     try:
         return msgspec.json.decode(content, type=RunConfig)
     except msgspec.DecodeError:

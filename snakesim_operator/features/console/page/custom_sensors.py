@@ -15,7 +15,7 @@ from snakesim_operator.features.console.page.joint_charts import (
     add_history_chart,
     add_sample,
 )
-from snakesim_operator.features.console.page.page_html import escape_text, table
+from snakesim_operator.features.console.page.page_html import escape_text, format_table
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 MAX_CHARTS = 8
@@ -57,7 +57,7 @@ def sensor_table(snapshot: RobotSnapshot) -> str:
         rows.append((escape_text(key), f"{message_type} on link {sample.link}{_format_age(snapshot, key)}"))
         for name, value in kind.numbers(sample).items():
             rows.append((escape_text(name), _format_value(kind, name, value)))
-    return table(rows)
+    return format_table(rows)
 
 
 def _format_age(snapshot: RobotSnapshot, key: str) -> str:
@@ -99,7 +99,7 @@ class CustomSensorCharts:
             history = self._history.setdefault(quantity, deque(maxlen=MAX_SAMPLES))
             add_sample(history, (time_s, numbers))
 
-    def show(self, snapshot: RobotSnapshot) -> None:
+    def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw the table and the charts; called a few times a second."""
         self._table.content = sensor_table(snapshot)
         for quantity in list(self._history)[:MAX_CHARTS]:

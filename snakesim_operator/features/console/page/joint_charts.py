@@ -103,7 +103,7 @@ class JointCharts:
             return
         add_sample(self._history, (snapshot.time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
 
-    def show(self, snapshot: RobotSnapshot) -> None:
+    def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw all charts; called a few times a second."""
         joints = snapshot.joints
         if joints is None:

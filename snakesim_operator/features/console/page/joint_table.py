@@ -1,6 +1,6 @@
-"""A table of what the file says of each joint and its drive of itself, and whether anybody has checked them. Pure.
+"""A table of the joints: what the robot file says about each joint, and whether the joints were checked.
 
-Everything that comes from the network is escaped.
+Also what each drive reports about itself. Pure; everything that comes from the network is escaped.
 """
 
 from collections.abc import Sequence
@@ -11,57 +11,90 @@ from snakesim_hal.wire.messages import JointDescription
 from snakesim_operator.features.console.page.page_html import BAD, escape_text
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
-Range = tuple[float, float]
+AngleRange = tuple[float, float]  # lower and upper end, rad
+
+HEADINGS = ("", "now", "limits, rad", "sign", "zero, rad")
 
 
-def commissioning_html(snapshot: RobotSnapshot, config: RunConfig | None, moved: Sequence[Range] = ()) -> str:
-    """config: with which the host was started, None: not known; moved: from where to where, so far, tail to head."""
-    rows = "".join(_row(snapshot, i, config, moved) for i in range(len(snapshot.robot.joints)))
-    head = "".join(f"<th style='text-align:left;padding-right:.8em'>{word}</th>" for word in ("", "now", "limits, rad"))
-    more = "<th style='text-align:left;padding-right:.8em'>sign</th><th style='text-align:left'>zero, rad</th>"
+def commissioning_html(
+    snapshot: RobotSnapshot, config: RunConfig | None, moved_ranges: Sequence[AngleRange] = ()
+) -> str:
+    """Return the table of joints as HTML.
+
+    Args:
+        snapshot: The robot now.
+        config: Configuration with which the host was started; None: not known.
+        moved_ranges: The range in which each joint was moved by hand so far, tail to head; empty: not measured.
+    """
+    rows: list[str] = []
+    for joint_index in range(len(snapshot.robot.joints)):
+        built = None if config is None else config.robot.joint_table[joint_index]
+        moved_range = moved_ranges[joint_index] if moved_ranges else None
+        rows.append(_row_html(snapshot, joint_index, built, moved_range))
+    head = "".join(f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS)
     return (
-        f"<div style='padding:0 .6em .4em;font-size:.85em'>{_checked(snapshot, config)}"
-        f"<table style='border-spacing:0;width:100%'><tr style='opacity:.7'>{head}{more}</tr>{rows}</table></div>"
+        f"<div style='padding:0 .6em .4em;font-size:.85em'>{_check_html(snapshot, config)}"
+        f"<table style='border-spacing:0;width:100%'><tr style='opacity:.7'>{head}</tr>{''.join(rows)}</table></div>"
     )
 
 
-def _checked(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
-    robot, status = snapshot.robot, snapshot.status
-    if robot.emulated:
+def _check_html(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
+    """Return whether the joints were checked, and how."""
+    status = snapshot.status
+    if snapshot.robot.emulated:
         return "<div>nothing real moves: its joints need no check</div>"
     if status is not None and status.unchecked:
         return f"<div style='color:{BAD}'>not checked: {escape_text(status.unchecked)}</div>"
     if config is None or status is None:
-        return "<div>whether it was checked is not known: its host has not said how it is set up</div>"
+        return "<div>whether it was checked is not known: its host has not published its configuration</div>"
     checked = config.robot.checked
     if checked is None:
         return "<div>not checked yet: this run is the start check</div>"
-    parts = [f"{name} of {', '.join(joints)}" for name, joints in checked.by_hand.items()]
-    by_hand = f"; by hand: {'; '.join(parts)}" if parts else ""
-    on = f"{checked.backend} {checked.hardware}".strip()
-    return f"<div>{escape_text(f'checked by {checked.by} on {checked.on}, on {on}{by_hand}')}</div>"
+    hardware = f"{checked.backend} {checked.hardware}".strip()
+    text = f"checked by {checked.by} on {checked.on}, on {hardware}"
+    if checked.by_hand:
+        parts = [f"{name} of {', '.join(joints)}" for name, joints in checked.by_hand.items()]
+        text += f"; by hand: {'; '.join(parts)}"
+    return f"<div>{escape_text(text)}</div>"
 
 
-def _row(snapshot: RobotSnapshot, i: int, config: RunConfig | None, moved: Sequence[Range]) -> str:
-    described, joints = snapshot.robot.joints[i], snapshot.joints
-    now = "unknown" if joints is None or not joints.valid[i] else f"{joints.angle_rad[i]:+.3f}"
-    limits = f"{described.angle_min_rad:+.2f} to {described.angle_max_rad:+.2f}"
-    built = None if config is None else config.robot.joint_table[i]
-    sign, zero = ("?", "?") if built is None else (f"{built.drive.sign:+d}", f"{built.drive.zero_rad:+.4f}")
-    cells = "".join(f"<td style='padding-right:.8em'>{cell}</td>" for cell in (now, limits, sign, zero))
+def _row_html(snapshot: RobotSnapshot, joint_index: int, built: Joint | None, moved_range: AngleRange | None) -> str:
+    """Return two rows for a joint: its numbers, and its drive below them."""
+    described = snapshot.robot.joints[joint_index]
+    numbers = (
+        _format_angle(snapshot, joint_index),
+        f"{described.angle_min_rad:+.2f} to {described.angle_max_rad:+.2f}",
+        "?" if built is None else f"{built.drive.sign:+d}",
+        "?" if built is None else f"{built.drive.zero_rad:+.4f}",
+    )
+    cells = "".join(f"<td style='padding-right:.8em'>{number}</td>" for number in numbers)
     name = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{escape_text(described.name)}</td>"
-    seen = f"<div>moved from {moved[i][0]:+.3f} to {moved[i][1]:+.3f} rad</div>" if moved else ""
-    drive = escape_text(_drive(described, built))
-    below = f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{seen}</td>"
+    drive = escape_text(_describe_drive(described, built))
+    moved = ""
+    if moved_range is not None:
+        lower_rad, upper_rad = moved_range
+        moved = f"<div>moved from {lower_rad:+.3f} to {upper_rad:+.3f} rad</div>"
+    below = f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{moved}</td>"
     return f"<tr>{name}{cells}</tr><tr>{below}</tr>"
 
 
-def _drive(described: JointDescription, built: Joint | None) -> str:
-    where: list[str] = []
+def _format_angle(snapshot: RobotSnapshot, joint_index: int) -> str:
+    joints = snapshot.joints
+    if joints is None or not joints.valid[joint_index]:
+        return "unknown"
+    return f"{joints.angle_rad[joint_index]:+.3f}"
+
+
+def _describe_drive(described: JointDescription, built: Joint | None) -> str:
+    """Return axis, address, driver type, serial number and firmware of a joint's drive, as far as they are known."""
+    parts: list[str] = [described.axis]
     if built is not None:
-        where = [f"id {built.id}", *([f"on {built.drive.port}"] if built.drive.port else [])]
-        where += [built.drive.driver] if built.drive.driver else []
-    serial = f"serial {described.serial}" if described.serial else "no serial number"
-    return ", ".join(
-        [described.axis, *where, serial, *([f"firmware {described.firmware}"] if described.firmware else [])]
-    )
+        parts.append(f"id {built.id}")
+        if built.drive.port:
+            parts.append(f"on {built.drive.port}")
+        if built.drive.driver:
+            parts.append(built.drive.driver)
+    parts.append(f"serial {described.serial}" if described.serial else "no serial number")
+    if described.firmware:
+        parts.append(f"firmware {described.firmware}")
+    return ", ".join(parts)

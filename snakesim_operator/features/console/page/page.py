@@ -1,7 +1,13 @@
-"""The page: the scene in the middle, the state and the controls beside it; the same for every viewer but the controls.
+"""The page: the scene in the middle, the state and the controls beside it.
 
-The loop hands over one snapshot a frame. Each viewer gets the newest value of each thing when it has shown the one
-before (`pacing`), so a slow browser gets fewer frames, and never makes the loop wait.
+All viewers see the same, except that each viewer has controls of its own.
+
+Threads: the display loop calls `show` and `start_over`, with one snapshot a frame. viser calls `_on_viewer_connect` and
+`_on_viewer_disconnect` in threads of its own. The thread that receives the messages of browsers calls `_stop_robot` and
+`_on_drive_key`, which must not wait.
+
+Each viewer gets the newest value of each thing when its page has shown the one before (`pacing`). So a slow browser
+gets fewer frames, and never makes the display loop wait.
 """
 
 import contextlib
@@ -14,22 +20,22 @@ from pathlib import Path
 import viser
 
 from snakesim_hal.wire.messages import ControlSettings, Description
-from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page import page_html
-from snakesim_operator.features.console.page.camera_tab import picture
-from snakesim_operator.features.console.page.commissioning_tab import Commissioning
-from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
-from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
-from snakesim_operator.features.console.page.joint_charts import JointCharts
-from snakesim_operator.features.console.page.viewer_controls import (
-    KEYS,
-    ViewerControls,
+from snakesim_operator.features.console.page.appearance import (
     add_appearance,
-    format_viewer,
+    aim_initial_camera,
+    aim_phone_camera,
     set_appearance,
 )
+from snakesim_operator.features.console.page.camera_tab import draw_picture
+from snakesim_operator.features.console.page.commissioning_tab import Commissioning
+from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
+from snakesim_operator.features.console.page.drive_controls import DRIVE_KEYS
+from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
+from snakesim_operator.features.console.page.joint_charts import JointCharts
+from snakesim_operator.features.console.page.viewer_controls import ViewerControls, format_viewer
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import Surroundings, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
@@ -37,62 +43,94 @@ from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.message_age import PageAction
 from snakesim_operator.features.console.web.server import PageServer
 
-TEXT_EVERY, CHARTS_EVERY, PICTURES_EVERY = 6, 5, 6  # frames
-ASK_EVERY = 3  # frames between two questions to the page in control: ten a second
-PANEL_PX = 460  # wide enough for all tabs in one line
-VIEW_RAD = 0.75  # vertical angle of view
+# Decimation: every how many frames each part of the page is renewed, at 30 frames a second.
+TEXT_DECIMATION = 6
+CHART_DECIMATION = 5
+PICTURE_DECIMATION = 6
+QUESTION_DECIMATION = 3  # ten questions a second to the page in control, by which the age of its messages is known
+
+PANEL_WIDTH_PX = 460  # wide enough for all tabs in one line
 
 
 class Page:
-    """Everything that viewers see."""
+    """The page that all viewers see, and the controls of each viewer."""
 
     def __init__(
         self,
         server: PageServer,
-        around: Surroundings | None,
+        surroundings: Surroundings | None,
         operations: Operations | None,
         log: PageLog,
         recorded: str = "",
         commission: Path | None = None,
     ) -> None:
-        """around: the true surroundings, if known; operations: None shows a recording, which `recorded` names.
+        """Lay out the page, without a robot.
 
-        commission: the robot file on this computer with which the host was started.
+        Args:
+            server: Serves the page.
+            surroundings: The true surroundings of the robot, if they are known.
+            operations: Sends commands to the robot; None for a recording.
+            log: Lines to show.
+            recorded: Name of the recording; empty for a live robot.
+            commission: The robot file on this computer with which the host was started; None: pages may not change it.
         """
-        self._server, self._around, self._operations = server, around, operations
-        self._log, self._recorded = log, recorded
-        self._token, self._commission = ControlToken(), commission
+        # What the page is given.
+        self._server = server
+        self._surroundings = surroundings
+        self._operations = operations
+        self._log = log
+        self._recorded = recorded
+        self._commission = commission
+        # Viewers.
+        self._token = ControlToken()
         self._commissioning: Commissioning | None = None
-        self._controls: dict[int, ViewerControls] = {}
+        self._controls: dict[int, ViewerControls] = {}  # by viewer
         self._lock = threading.Lock()  # of `_controls`; viser fills a folder from one thread at a time
-        self._frames = 0
-        self._moment: RobotSnapshot | None = None
-        self._stage: RobotScene | None = None
-        self._charts: JointCharts | None = None
-        self._own_sensors: CustomSensorCharts | None = None
+        # What is shown.
+        self._frame_count = 0
+        self._snapshot: RobotSnapshot | None = None
+        self._scene: RobotScene | None = None
+        self._joint_charts: JointCharts | None = None
+        self._sensor_charts: CustomSensorCharts | None = None
         self._shown_log: list[str] = []
-        self._pictures: dict[str, viser.GuiImageHandle] = {}
+        self._pictures: dict[str, viser.GuiImageHandle] = {}  # by key
         self._lay_out()
-        server.on_client_connect(self._came)
-        server.on_client_disconnect(self._went)
+        server.on_client_connect(self._on_viewer_connect)
+        server.on_client_disconnect(self._on_viewer_disconnect)
+
+    # --- layout ----------------------------------------------------------------------------------------------
 
     def _lay_out(self) -> None:
         gui = self._server.gui
         set_appearance(gui, dark=False)
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(PANEL_PX)
-        self._header = gui.add_html(page_html.header(None), order=0)
+        gui.main_panel.set_width(PANEL_WIDTH_PX)
+        self._header = gui.add_html(page_html.format_header(None), order=0)
         if self._operations is not None:
-            # The stop, and what moves the robot while it is held, are acted on where messages are received.
-            admit = self._server.admission.admit
-            button = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
-            admit(button, act=self._estop)
-            admit(gui.add_command("Emergency stop", hotkey="escape"), act=self._estop)
-            for what, hotkey in KEYS.items():
-                command = gui.add_command(f"Drive: {what.lower()}", hotkey=hotkey)
-                admit(command, act=partial(self._press, what))
+            self._add_stop_and_drive_keys()
             self._control_folder = gui.add_folder("Control", order=2)
         tabs = gui.add_tab_group(order=4)
+        self._add_robot_tabs(tabs)
+        if self._operations is not None:
+            self._add_command_tabs(tabs, self._operations)
+        with tabs.add_tab("Log"):
+            self._log_text = gui.add_html("")
+        gui.add_html(page_html.format_legend(LEGEND), order=3)
+
+    def _add_stop_and_drive_keys(self) -> None:
+        """Add the stop, and the keys that drive the robot; all are handled by the thread that receives messages."""
+        gui = self._server.gui
+        admit = self._server.admission.admit
+        button = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
+        admit(button, handler=self._stop_robot)
+        admit(gui.add_command("Emergency stop", hotkey="escape"), handler=self._stop_robot)
+        for key_name, hotkey in DRIVE_KEYS.items():
+            command = gui.add_command(f"Drive: {key_name.lower()}", hotkey=hotkey)
+            admit(command, handler=partial(self._on_drive_key, key_name))
+
+    def _add_robot_tabs(self, tabs: viser.GuiTabGroupHandle) -> None:
+        """Add the tabs that show the robot."""
+        gui = self._server.gui
         with tabs.add_tab("Joints"):
             self._joints_tab = gui.add_folder(None)
         with tabs.add_tab("Forces"):
@@ -109,205 +147,246 @@ class Page:
                 self._no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
         with tabs.add_tab("Sensors"):
             self._sensors_tab = gui.add_folder(None)
-        if self._operations is not None:
-            with tabs.add_tab("Settings"):
-                self._settings_tab = gui.add_folder(None)
-            with tabs.add_tab("Commission"):
-                self._commission_tab = gui.add_folder(None)
-            self._commissioning = Commissioning(
-                gui, self._commission_tab, self._operations.link, self._commission, self._token, self._log
-            )
-        with tabs.add_tab("Log"):
-            self._log_text = gui.add_html("")
-        gui.add_html(page_html.legend(LEGEND), order=3)
+
+    def _add_command_tabs(self, tabs: viser.GuiTabGroupHandle, operations: Operations) -> None:
+        """Add the tabs with which viewers change the robot."""
+        gui = self._server.gui
+        with tabs.add_tab("Settings"):
+            self._settings_tab = gui.add_folder(None)
+        with tabs.add_tab("Commission"):
+            self._commission_tab = gui.add_folder(None)
+        self._commissioning = Commissioning(
+            gui, self._commission_tab, operations.link, self._commission, self._token, self._log
+        )
 
     # --- viewers ---------------------------------------------------------------------------------------------
 
-    def _came(self, client: viser.ClientHandle) -> None:
-        """In a thread of viser's: the viewer may be gone before it ends. Nothing is shown before it can be pressed."""
-        with self._of_who_is_there(client), client.atomic():
-            with self._lock:
-                add_appearance(client, self._server.admission, dark=self._server.prefers_dark(client.client_id))
-            if self._operations is not None:
-                self._give_controls(client)
-            if self._moment is not None:
-                _aim(client, self._moment.robot)
-            self._log.write(f"{format_viewer(client.client_id)} came")
-        if client.client_id not in self._server.get_clients():
-            self._forget(client.client_id)
+    def _on_viewer_connect(self, client: viser.ClientHandle) -> None:
+        """Give a viewer its controls. Its page may close before this ends.
 
-    def _give_controls(self, client: viser.ClientHandle) -> None:
-        assert self._operations is not None and self._commissioning is not None
+        The page shows all of it at once, so no control is shown before it can be pressed.
+        """
+        viewer = client.client_id
+        with self._ignore_closed_page(client), client.atomic():
+            with self._lock:
+                add_appearance(client, self._server.admission, dark=self._server.prefers_dark(viewer))
+            if self._operations is not None:
+                self._add_controls(client, self._operations)
+            if self._snapshot is not None:
+                aim_phone_camera(client, self._snapshot.robot)
+            self._log.write(f"{format_viewer(viewer)} came")
+        if viewer not in self._server.get_clients():
+            self._forget_viewer(viewer)
+
+    def _add_controls(self, client: viser.ClientHandle, operations: Operations) -> None:
+        assert self._commissioning is not None
         with self._lock:
             controls = ViewerControls(
                 client,
                 self._control_folder,
                 self._token,
-                self._operations,
-                lambda: self._moment,
+                operations,
+                lambda: self._snapshot,
                 self._settings_tab,
-                self._control_changed,
+                self._on_control_changed,
                 self._server.admission,
-                (self._commissioning, self._commission_tab),
+                self._commissioning,
+                self._commission_tab,
             )
-            if self._moment is not None and self._moment.settings is not None:
-                controls.show_settings(self._moment.settings)
+            if self._snapshot is not None and self._snapshot.settings is not None:
+                controls.show_settings(self._snapshot.settings)
             self._controls[client.client_id] = controls
 
-    def _went(self, client: viser.ClientHandle) -> None:
-        """Control returns with the page that had it."""
-        self._forget(client.client_id)
-        had = self._token.release(client.client_id)
-        self._log.write(f"{format_viewer(client.client_id)} left{', and with it control' if had else ''}")
-        self._control_changed()
+    def _on_viewer_disconnect(self, client: viser.ClientHandle) -> None:
+        """Forget a viewer; if it had control, any other viewer may take it now."""
+        viewer = client.client_id
+        self._forget_viewer(viewer)
+        had_control = self._token.release(viewer)
+        line = f"{format_viewer(viewer)} left"
+        if had_control:
+            line += ", and with it control"
+        self._log.write(line)
+        self._on_control_changed()
 
-    def _forget(self, viewer: int) -> None:
+    def _forget_viewer(self, viewer: int) -> None:
         with self._lock:
             self._controls.pop(viewer, None)
         self._server.admission.forget_viewer(viewer)
 
     @contextlib.contextmanager
-    def _of_who_is_there(self, client: viser.ClientHandle) -> Iterator[None]:
-        """What a viewer's page shows can be changed until it closes, which may be now: then viser raises."""
+    def _ignore_closed_page(self, client: viser.ClientHandle) -> Iterator[None]:
+        """Ignore the errors that viser raises when a page is changed that has just been closed."""
         try:
             yield
-        except (RuntimeError, KeyError):  # the latter of what stands in a folder that is gone
+        except (RuntimeError, KeyError):  # a KeyError comes from a control whose folder is gone
             if client.client_id in self._server.get_clients():
                 raise
 
+    def _on_control_changed(self) -> None:
+        """Show each viewer the controls that it may use now."""
+        # Ask first: the page that may press something next has to have answered before its presses count.
+        self._ask_for_age()
+        with self._lock:
+            all_controls = list(self._controls.values())
+        for controls in all_controls:
+            with self._ignore_closed_page(controls.client):
+                controls.refresh()
+
     def _ask_for_age(self) -> None:
-        """Ask the page in control the next question by which the age of what it sends is known."""
-        holder, moment = self._token.holder, self._moment
+        """Send the page in control the next question by which the age of its messages is known."""
+        holder = self._token.holder
         if holder is None:
             return
-        time_s = None if moment is None else moment.time_s
-        self._server.ask_for_age(holder, None if time_s is None else round(time_s * 1e9))
+        snapshot = self._snapshot
+        robot_ns = None
+        if snapshot is not None and snapshot.time_s is not None:
+            robot_ns = round(snapshot.time_s * 1e9)
+        self._server.ask_for_age(holder, robot_ns)
 
-    def _control_changed(self) -> None:
-        self._ask_for_age()  # before the page shows what it may press now
-        with self._lock:
-            everybody = list(self._controls.values())
-        for controls in everybody:
-            with self._of_who_is_there(controls.client):
-                controls.show()
+    # --- messages of browsers --------------------------------------------------------------------------------
 
-    def _estop(self, viewer: int, _action: PageAction) -> None:
-        """Stop the robot, however old the press is. A page that cannot draw the scene has no controls, but may stop."""
+    def _stop_robot(self, viewer: int, _action: PageAction) -> None:
+        """Stop the robot, however old the press is, and whichever viewer has control.
+
+        A page that cannot draw the scene has no controls, but may stop the robot.
+        """
         assert self._operations is not None
         stopped = self._operations.stop.request(format_viewer(viewer))
-        controls = self._controls.get(viewer)  # without the lock: whoever holds it may wait for this thread
+        controls = self._controls.get(viewer)  # without the lock: the thread that holds it may wait for this one
         if controls is not None:
-            stopped.add_done_callback(partial(self._show_stop, controls))
+            stopped.add_done_callback(partial(self._show_stop_result, controls))
 
-    def _show_stop(self, controls: ViewerControls, stopped: "Future[str]") -> None:
-        with self._of_who_is_there(controls.client):
+    def _show_stop_result(self, controls: ViewerControls, stopped: "Future[str]") -> None:
+        with self._ignore_closed_page(controls.client):
             error = stopped.exception()
-            controls.tell("Emergency stop", str(error) if error else stopped.result(), bad=error is not None)
+            if error is not None:
+                controls.notify("Emergency stop", str(error), bad=True)
+            else:
+                controls.notify("Emergency stop", stopped.result())
 
-    def _press(self, key: str, viewer: int, action: PageAction) -> None:
-        controls = self._controls.get(viewer)  # as above
+    def _on_drive_key(self, key_name: str, viewer: int, action: PageAction) -> None:
+        controls = self._controls.get(viewer)  # without the lock, as in `_stop_robot`
         if controls is not None:
-            controls.press(key, action)
-
-    def recall(self, before: Iterable[RobotSnapshot]) -> None:
-        """The next snapshot is not the one after this: the trail starts over, charts begin with those before it."""
-        for snapshot in before:
-            if self._stage is None:
-                self._meet(snapshot.robot)
-                self._moment = snapshot
-            assert self._charts is not None
-            self._charts.add_snapshot(snapshot)  # going back forgets
-            if self._own_sensors is not None:
-                self._own_sensors.add_snapshot(snapshot)
-        if self._stage is not None:
-            self._stage.clear_trail()
-        self._frames = 0
+            controls.drive.on_key(key_name, action)
 
     # --- each frame ------------------------------------------------------------------------------------------
 
     def show(self, snapshot: RobotSnapshot | None) -> None:
-        """Show a snapshot; None: there is no robot yet."""
-        before, self._moment = self._moment, snapshot
-        self._frames += 1
-        if self._frames % ASK_EVERY == 0:
+        """Show a snapshot; None while there is no robot."""
+        previous = self._snapshot
+        self._snapshot = snapshot
+        self._frame_count += 1
+        if self._frame_count % QUESTION_DECIMATION == 0:
             self._ask_for_age()
         if self._commissioning is not None:
-            self._commissioning.turn(snapshot)
+            self._commissioning.update(snapshot)
         if snapshot is not None:
-            self._show_robot(before, snapshot)
-        if self._frames % TEXT_EVERY == 1 or _what(before) != _what(snapshot):
+            self._show_robot(previous, snapshot)
+        if self._is_due(TEXT_DECIMATION) or _urgent_state(previous) != _urgent_state(snapshot):
             self._show_texts(snapshot)
 
-    def _show_robot(self, before: RobotSnapshot | None, snapshot: RobotSnapshot) -> None:
+    def start_over(self, earlier: Iterable[RobotSnapshot]) -> None:
+        """Prepare for a snapshot that does not follow the last one, because a viewer jumped in a recording.
+
+        The trail starts over, and the charts begin with the snapshots of the time before the jump's target.
+        """
+        for snapshot in earlier:
+            if self._scene is None:
+                self._show_new_robot(snapshot.robot)
+                self._snapshot = snapshot
+            assert self._joint_charts is not None
+            self._joint_charts.add_snapshot(snapshot)  # charts start over when time goes back
+            if self._sensor_charts is not None:
+                self._sensor_charts.add_snapshot(snapshot)
+        if self._scene is not None:
+            self._scene.clear_trail()
+        self._frame_count = 0
+
+    def _is_due(self, decimation: int) -> bool:
+        """Return whether a part of the page is renewed in this frame; all parts are in the first frame."""
+        return self._frame_count % decimation == 1
+
+    def _show_robot(self, previous: RobotSnapshot | None, snapshot: RobotSnapshot) -> None:
         """Show the scene at once, and charts, images and settings when they are due."""
-        if self._stage is None or before is None or before.robot.layout != snapshot.robot.layout:
-            self._meet(snapshot.robot)
-        if before is None or before.robot is not snapshot.robot:
-            self._control_changed()  # a simulator has controls of its own
-        drawing = draw(snapshot, self._around)
-        assert self._stage is not None and self._charts is not None
+        if self._scene is None or previous is None or previous.robot.layout != snapshot.robot.layout:
+            self._show_new_robot(snapshot.robot)
+        if previous is None or previous.robot is not snapshot.robot:
+            self._on_control_changed()  # a simulator has controls that other robots do not have
+        drawing = draw(snapshot, self._surroundings)
+        assert self._scene is not None
         if drawing is not None:
             with self._server.atomic():
-                self._stage.show(drawing)
-        self._charts.add_snapshot(snapshot)
-        if self._own_sensors is not None:
-            self._own_sensors.add_snapshot(snapshot)
-        if self._frames % CHARTS_EVERY == 1:
-            self._charts.show(snapshot)
-            self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
-            if self._own_sensors is not None:
-                self._own_sensors.show(snapshot)
-        if self._frames % PICTURES_EVERY == 1:
+                self._scene.show(drawing)
+        self._update_charts(snapshot)
+        if self._is_due(PICTURE_DECIMATION):
             self._show_pictures(snapshot)
-        if snapshot.settings is not None and (before is None or snapshot.settings != before.settings):
-            self._show_settings(snapshot.settings)
+        settings = snapshot.settings
+        if settings is not None and (previous is None or settings != previous.settings):
+            self._show_settings(settings)
 
-    def _meet(self, robot: Description) -> None:
-        """Another robot: scene and charts start over."""
-        self._server.scene.reset()
-        self._server.scene.set_up_direction("+z")
-        camera = self._server.initial_camera
-        camera.position, camera.look_at = view_of(robot, narrow=False)
-        camera.fov = VIEW_RAD
+    def _update_charts(self, snapshot: RobotSnapshot) -> None:
+        """Keep a sample for the charts, and redraw them when they are due."""
+        assert self._joint_charts is not None
+        self._joint_charts.add_snapshot(snapshot)
+        if self._sensor_charts is not None:
+            self._sensor_charts.add_snapshot(snapshot)
+        if not self._is_due(CHART_DECIMATION):
+            return
+        self._joint_charts.redraw(snapshot)
+        self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
+        if self._sensor_charts is not None:
+            self._sensor_charts.redraw(snapshot)
+
+    def _show_new_robot(self, robot: Description) -> None:
+        """Start scene and charts over, for a robot of another layout."""
+        scene = self._server.scene
+        scene.reset()
+        scene.set_up_direction("+z")
+        aim_initial_camera(self._server, robot)
         for client in self._server.get_clients().values():
-            _aim(client, robot)
-        self._stage = RobotScene(self._server.scene, robot, self._around)
+            aim_phone_camera(client, robot)
+        self._scene = RobotScene(scene, robot, self._surroundings)
         with self._joints_tab:
-            if self._charts is not None:
-                self._charts.remove()
-            self._charts = JointCharts(self._server.gui, robot)
-        if self._own_sensors is not None:
-            self._own_sensors.remove()
-            self._own_sensors = None
+            if self._joint_charts is not None:
+                self._joint_charts.remove()
+            self._joint_charts = JointCharts(self._server.gui, robot)
+        if self._sensor_charts is not None:
+            self._sensor_charts.remove()
+            self._sensor_charts = None
         if robot.own:
             with self._sensors_tab:
-                self._own_sensors = CustomSensorCharts(self._server.gui)
+                self._sensor_charts = CustomSensorCharts(self._server.gui)
 
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:
             for controls in self._controls.values():
-                with self._of_who_is_there(controls.client):
+                with self._ignore_closed_page(controls.client):
                     controls.show_settings(settings)
 
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
+        log_lines = self._log.lines()
         if snapshot is not None:
-            self._state.content = page_html.state_table(snapshot)
-            self._streams.content = page_html.stream_table(snapshot)
+            self._state.content = page_html.format_state_table(snapshot)
+            self._streams.content = page_html.format_stream_table(snapshot)
             if self._commissioning is not None:
-                self._commissioning.show(snapshot)
-        lines = [*(() if snapshot is None else snapshot.log), *self._log.lines()]
-        if lines != self._shown_log:
-            self._shown_log = lines
-            self._log_text.content = page_html.log(lines)
+                self._commissioning.redraw(snapshot)
+            log_lines = [*snapshot.log, *log_lines]
+        if log_lines != self._shown_log:
+            self._shown_log = log_lines
+            self._log_text.content = page_html.format_log(log_lines)
         if self._operations is None:
-            self._header.content = page_html.header(snapshot, recorded=self._recorded)
-            return
-        holder = self._token.holder
-        viewers = self._server.viewers()
-        control = f"{format_viewer(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
-        if dropped := self._server.admission.dropped.total():
-            control += f"; {dropped} message{'' if dropped == 1 else 's'} of browsers dropped"
-        self._header.content = page_html.header(snapshot, control=control)
+            self._header.content = page_html.format_header(snapshot, recorded=self._recorded)
+        else:
+            self._header.content = page_html.format_header(snapshot, control=self._describe_viewers())
+
+    def _describe_viewers(self) -> str:
+        """Return which viewer has control, how many viewers there are, and how many of their messages were dropped."""
+        viewers = _count_in_words(self._server.viewers(), "viewer")
+        text = f"{format_viewer(self._token.holder)} has control; {viewers}"
+        dropped = self._server.admission.dropped.total()
+        if dropped:
+            text += f"; {_count_in_words(dropped, 'message')} of browsers dropped"
+        return text
 
     def _show_pictures(self, snapshot: RobotSnapshot) -> None:
         for key, image in snapshot.images.items():
@@ -315,34 +394,22 @@ class Page:
             if handle is None:
                 self._no_camera.visible = False
                 with self._cameras_tab:
-                    self._pictures[key] = self._server.gui.add_image(picture(image), label=key)
+                    self._pictures[key] = self._server.gui.add_image(draw_picture(image), label=key)
             else:
-                handle.image = picture(image)
+                handle.image = draw_picture(image)
 
 
-def view_of(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
-    """Where a camera stands and what it looks at, relative to the body's middle, to have the whole body in view.
-
-    narrow: a phone, whose lower half the panel covers.
-    """
-    length_m = sum(link.length_m for link in robot.links)
-    far_m, before_m = (1.15 * length_m, 0.7 * length_m) if narrow else (0.8 * length_m, 0.0)
-    x, y = -0.49, -0.87  # where it stands
-    at = x * before_m, y * before_m, 0.0
-    return (at[0] + 1.3 * far_m * x, at[1] + 1.3 * far_m * y, 1.6 * far_m), at
+def _count_in_words(count: int, noun: str) -> str:
+    plural = "" if count == 1 else "s"
+    return f"{count} {noun}{plural}"
 
 
-def _aim(client: viser.ClientHandle, robot: Description) -> None:
-    """Turn a phone's view; other screens have the initial one."""
-    camera = client.camera
-    if camera.image_width < camera.image_height:
-        camera.position, camera.look_at = view_of(robot, narrow=True)
-
-
-def _what(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
-    """What viewers must see at once when it changes."""
+def _urgent_state(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
+    """Return the state whose changes viewers must see at once, rather than when texts are due."""
     if snapshot is None:
         return None
-    status, control = snapshot.status, snapshot.control
+    status = snapshot.status
+    control = snapshot.control
     host_state = None if status is None else (status.lifecycle, status.why, status.paused_by)
-    return host_state, None if control is None else control.state
+    control_state = None if control is None else control.state
+    return host_state, control_state

@@ -1,4 +1,4 @@
-"""The texts of the console, as HTML. Everything that comes from the network is escaped. Pure."""
+"""The texts of the page, as HTML. Pure; everything that comes from the network is escaped."""
 
 from collections.abc import Iterable
 from html import escape
@@ -7,11 +7,23 @@ from snakesim_hal.base.terminal import printable
 from snakesim_hal.wire.messages import Description, Status
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
-SILENT_S = 1.0
-LIFECYCLE_COLOURS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
-STATE_COLOURS = {"Locomoting": "#1a7f4b", "NotLocomoting": "#b26a00", "Idle": "#6b7683", "PowerOff": "#59626d"}
-BAD = "#d64541"  # of text, on a light and on a dark page
-SIMULATED, EMULATED, REAL, RECORDED = "#0067b0", "#7a3fa8", "#b3261e", "#59626d"
+MAX_SILENCE_S = 1.0  # a host publishes its status more often, so a longer silence is an alarm
+MAX_BACKEND_CHARACTERS = 12  # of a backend's name, so that it cannot fill the bar
+
+# Colors that can be read on a light and on a dark page.
+BAD = "#d64541"  # of text about a fault or an alarm
+LIFECYCLE_COLORS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
+CONTROL_STATE_COLORS = {
+    "Locomoting": "#1a7f4b",
+    "NotLocomoting": "#b26a00",
+    "Idle": "#6b7683",
+    "PowerOff": "#59626d",
+}
+# Colors of the bar that tells what moves.
+SIMULATED_COLOR = "#0067b0"
+EMULATED_COLOR = "#7a3fa8"
+REAL_COLOR = "#b3261e"
+RECORDED_COLOR = "#59626d"  # also while nothing moves
 
 SIGNALS = (
     "<iframe src='/signals?within' title='Signals' loading='lazy' style='border:0;width:100%;height:60vh'></iframe>"
@@ -24,17 +36,17 @@ def escape_text(text: object) -> str:
     return escape(printable(str(text)))
 
 
-def backend_in_words(robot: Description) -> tuple[str, str]:
+def describe_backend(robot: Description) -> tuple[str, str]:
     """Return the words that name what moves, and their color."""
-    kind = robot.backend.upper()[:12]
+    name = robot.backend.upper()[:MAX_BACKEND_CHARACTERS]
     if not robot.emulated:  # whatever the backend is called
-        return f"REAL ROBOT ON {kind}", REAL
+        return f"REAL ROBOT ON {name}", REAL_COLOR
     if robot.backend == "sim":
-        return "EMULATED BY A SIMULATOR", SIMULATED
-    return f"EMULATED ROBOT ON {kind}", EMULATED
+        return "EMULATED BY A SIMULATOR", SIMULATED_COLOR
+    return f"EMULATED ROBOT ON {name}", EMULATED_COLOR
 
 
-def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:
+def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:
     """Return the top of the page: which backend, which state, and the reason for the state.
 
     Args:
@@ -43,50 +55,52 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
         control: Text that names the viewer in control; empty to leave it out.
     """
     if snapshot is None:
-        return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
+        return _format_bar("WAITING FOR THE ROBOT", RECORDED_COLOR, "no host has described itself yet")
     if snapshot.expected:
         name = escape_text(snapshot.robot.robot)
-        return _bar("WAITING FOR THE ROBOT", RECORDED, f"{name}, drawn as its scenario places it")
-    lines = [_backend_bar(snapshot.robot, recorded), *_alarm_lines(snapshot)]
+        return _format_bar("WAITING FOR THE ROBOT", RECORDED_COLOR, f"{name}, drawn as its scenario places it")
+    lines = [_format_backend_bar(snapshot.robot, recorded), *_list_alarms(snapshot)]
     status = snapshot.status
     if status is not None:
-        lines.append(_state(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle], status.why, ".45em"))
+        lines.append(_format_state(status.lifecycle.upper(), LIFECYCLE_COLORS[status.lifecycle], status.why, ".45em"))
     control_state = snapshot.control
     if control_state is not None:
-        state_color = STATE_COLOURS[control_state.state]
-        lines.append(_state(control_state.state, state_color, control_state.reason, ".35em"))
+        state_color = CONTROL_STATE_COLORS[control_state.state]
+        lines.append(_format_state(control_state.state, state_color, control_state.reason, ".35em"))
     if control:
         lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
 
 
-def _backend_bar(robot: Description, recorded: str) -> str:
+def _format_backend_bar(robot: Description, recorded: str) -> str:
     """Return the bar that tells a real robot from an emulated one, and a recording from a live robot."""
-    words, color = backend_in_words(robot)
+    words, color = describe_backend(robot)
     place = escape_text(robot.robot)
     if robot.hardware:
         place += f" · {escape_text(robot.hardware)}"
     if recorded:
         words = f"RECORDING OF: {words}"
-        color = RECORDED
+        color = RECORDED_COLOR
         place += f" · {escape_text(recorded)}"
-    return _bar(words, color, place)
+    return _format_bar(words, color, place)
 
 
-def _alarm_lines(snapshot: RobotSnapshot) -> list[str]:
+def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
     """Return what a viewer must know before trusting the rest of the page."""
     lines: list[str] = []
     status = snapshot.status
     if status is not None and status.paused_by is not None:
-        lines.append(_bar("PAUSED", RECORDED, f"by {escape_text(status.paused_by)}; robot time stands"))
+        lines.append(_format_bar("PAUSED", RECORDED_COLOR, f"by {escape_text(status.paused_by)}; robot time stands"))
     if len(snapshot.hosts) > 1:
-        lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
-    if snapshot.silent_s > SILENT_S:
-        lines.append(_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
+        lines.append(
+            _format_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them.")
+        )
+    if snapshot.silent_s > MAX_SILENCE_S:
+        lines.append(_format_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
     return lines
 
 
-def _state(word: str, color: str, why: str, margin_top: str) -> str:
+def _format_state(word: str, color: str, why: str, margin_top: str) -> str:
     """Return a state as a word on a color, with the reason beside it. margin_top: CSS length above it."""
     return (
         f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{margin_top}'>"
@@ -95,7 +109,8 @@ def _state(word: str, color: str, why: str, margin_top: str) -> str:
     )
 
 
-def _bar(words: str, color: str, below: str) -> str:
+def _format_bar(words: str, color: str, below: str) -> str:
+    """Return words in large letters on a color, with smaller HTML below them."""
     return (
         f"<div style='background:{color};color:#fff;border-radius:6px;padding:.35em .6em;margin:.3em .6em .3em .3em'>"
         f"<div style='font-size:1.3em;font-weight:700;letter-spacing:.03em'>{escape_text(words)}</div>"
@@ -103,24 +118,24 @@ def _bar(words: str, color: str, below: str) -> str:
     )
 
 
-def _warning(text: str) -> str:
+def _format_warning(text: str) -> str:
     return (
         f"<div style='border:2px solid {BAD};color:{BAD};border-radius:6px;padding:.3em .6em;margin-top:.4em;"
         f"font-weight:600'>{escape_text(text)}</div>"
     )
 
 
-def state_table(snapshot: RobotSnapshot) -> str:
+def format_state_table(snapshot: RobotSnapshot) -> str:
     """Return a table of lease, commands, warnings and health, and the list of faults below it."""
     rows: list[tuple[str, str]] = []
     if snapshot.status is not None:
-        rows += _status_rows(snapshot.status, snapshot.time_s)
-        rows += _warning_rows(snapshot.status)
-    rows += _health_rows(snapshot)
-    return table(rows) + faults(snapshot.status)
+        rows += _list_status_rows(snapshot.status, snapshot.time_s)
+        rows += _list_warning_rows(snapshot.status)
+    rows += _list_health_rows(snapshot)
+    return format_table(rows) + format_faults(snapshot.status)
 
 
-def _status_rows(status: Status, time_s: float | None) -> list[tuple[str, str]]:
+def _list_status_rows(status: Status, time_s: float | None) -> list[tuple[str, str]]:
     """Return the rows that every status has."""
     robot_time = "" if time_s is None else f"{time_s:.2f} s · "
     return [
@@ -134,7 +149,7 @@ def _status_rows(status: Status, time_s: float | None) -> list[tuple[str, str]]:
     ]
 
 
-def _warning_rows(status: Status) -> list[tuple[str, str]]:
+def _list_warning_rows(status: Status) -> list[tuple[str, str]]:
     """Return the rows that are shown only when they have something to report."""
     rows: list[tuple[str, str]] = []
     if status.real_time_factor is not None:
@@ -157,7 +172,7 @@ def _format_speed(status: Status) -> str:
     return f"{status.real_time_factor:.2f} of the wall clock{wanted}"
 
 
-def faults(status: Status | None) -> str:
+def format_faults(status: Status | None) -> str:
     """Return the faults since the last reset as a list; empty when there are none."""
     if status is None or not status.faults:
         return ""
@@ -172,36 +187,42 @@ def faults(status: Status | None) -> str:
     return f"<div style='{style}'>Faults<ul>{''.join(items)}</ul></div>"
 
 
-def _health_rows(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
-    power, joints = snapshot.power, snapshot.robot.joints
+def _list_health_rows(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
+    """Return the rows about temperatures, supply and leaks."""
+    power = snapshot.power
+    joints = snapshot.robot.joints
     if power is None or not power.motor_c:
         return []
-    hottest = max(range(len(joints)), key=lambda i: power.motor_c[i])
+    hottest = max(range(len(joints)), key=lambda joint_index: power.motor_c[joint_index])
     rows = [
         ("hottest motor", f"{escape_text(joints[hottest].name)}: {power.motor_c[hottest]:.1f} °C"),
         ("boards", f"up to {max(power.board_c):.1f} °C"),
         ("supply", f"{min(power.voltage_v):.1f} V at least, {sum(power.current_a):.2f} A in sum"),
     ]
-    wet = [joint.name for joint, leak in zip(joints, power.leak, strict=True) if leak]
-    return [*rows, ("WATER", escape_text(", ".join(wet)))] if wet else rows
+    wet = [joint.name for joint, has_leak in zip(joints, power.leak, strict=True) if has_leak]
+    if wet:
+        rows.append(("WATER", escape_text(", ".join(wet))))
+    return rows
 
 
-def stream_table(snapshot: RobotSnapshot) -> str:
+def format_stream_table(snapshot: RobotSnapshot) -> str:
     """Return a table of the rate and the age of each key."""
-    rows = [
-        (escape_text(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
-        for key, stream in sorted(snapshot.streams.items())
-    ]
-    return table(rows)
+    rows: list[tuple[str, str]] = []
+    for key, stream in sorted(snapshot.streams.items()):
+        text = f"{stream.rate_hz:.0f} Hz"
+        if stream.age_s:
+            text += f", {stream.age_s * 1e3:.0f} ms old"
+        rows.append((escape_text(key), text))
+    return format_table(rows)
 
 
-def log(lines: Iterable[str]) -> str:
+def format_log(lines: Iterable[str]) -> str:
     """Return the lines of the log as HTML, in the order given."""
     items = "".join(f"<div style='padding:.1em 0'>{escape_text(line)}</div>" for line in lines)
     return f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
 
 
-def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
+def format_legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
     """Return the legend of the scene's colors."""
     marks = "".join(
         f"<span style='white-space:nowrap'><span style='color:rgb{color}'>&#9632;</span> {escape_text(what)}</span> "
@@ -210,11 +231,13 @@ def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
     return f"<div style='padding:.2em .6em .9em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
 
 
-def _format_counts(numbers: dict[str, int]) -> str:
-    return escape_text(", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none")
+def _format_counts(counts: dict[str, int]) -> str:
+    """Return how often each reason occurred."""
+    parts = [f"{reason} {count}" for reason, count in sorted(counts.items())]
+    return escape_text(", ".join(parts) or "none")
 
 
-def table(rows: Iterable[tuple[str, str]]) -> str:
+def format_table(rows: Iterable[tuple[str, str]]) -> str:
     """Return a table of names and values; both are HTML already."""
     cells = "".join(
         f"<tr><td style='opacity:.7;padding-right:.8em;white-space:nowrap;vertical-align:top'>{name}</td>"

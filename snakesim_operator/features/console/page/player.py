@@ -1,4 +1,4 @@
-"""The time slider of a recording: play, pause, speed, and a place in time. One for all viewers."""
+"""The player of a recording: play, pause, speed, and a slider for the time. All viewers share one."""
 
 import time
 
@@ -7,59 +7,94 @@ import viser
 from snakesim_operator.features.console.web.server import PageServer
 
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
-SLIDER_EVERY_S = 0.1
+SLIDER_PERIOD_S = 0.1  # between two updates of the slider while the recording plays
 
 
 class Player:
-    """Where in the recording the page is."""
+    """The time in the recording that the page shows.
 
-    def __init__(self, server: PageServer, span_s: tuple[float, float], at_s: float = 0.0) -> None:
-        """span_s: first and last instant; at_s: where to begin, seconds after the first."""
+    The display loop calls `advance`; the threads of viser and of the web server move the time.
+    """
+
+    def __init__(self, server: PageServer, span_s: tuple[float, float], start_s: float = 0.0) -> None:
+        """Add the player to the page, paused.
+
+        Args:
+            server: Serves the page.
+            span_s: Robot time of the first and of the last instant.
+            start_s: Where to begin, in seconds after the first instant.
+        """
         self._begin_s, self._end_s = span_s
-        self.time_s = min(max(self._begin_s + at_s, self._begin_s), self._end_s)
-        self._now_s = self._shown_s = time.monotonic()
-        self._moved = False
+        self.time_s = self._clamp_time(self._begin_s + start_s)  # robot time that is shown
+        self.is_playing = False
+        self._has_jumped = False
+        # Wall clock.
+        now_s = time.monotonic()
+        self._advanced_s = now_s
+        self._slider_updated_s = now_s
+        self._add_controls(server)
+
+    def _add_controls(self, server: PageServer) -> None:
         gui = server.gui
+        last_s = round(max(self._end_s - self._begin_s, 0.01), 2)  # a slider needs some length
         with gui.add_folder("Recording", order=2):
-            last_s = max(self._end_s - self._begin_s, 0.01)
-            self._slider = gui.add_slider("Time, s", 0.0, round(last_s, 2), 0.01, round(self.time_s - self._begin_s, 2))
+            self._slider = gui.add_slider("Time, s", 0.0, last_s, 0.01, round(self.since_begin_s, 2))
             self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
         for control in (self._slider, self._play, self._speed):
             server.admission.admit(control)
-        self.playing = False
-        self._play.on_click(lambda _: self._toggle())
-        self._slider.on_update(lambda event: self._jump() if event.client is not None else None)
+        self._play.on_click(lambda _: self._toggle_playing())
+        self._slider.on_update(self._on_slider)
 
-    def turn(self) -> tuple[float, bool]:
-        """The time to show now, and whether it has jumped."""
+    def advance(self) -> tuple[float, bool]:
+        """Move the time on if the recording plays; called for each frame.
+
+        Returns:
+            The robot time to show now, and whether it was moved by a jump.
+        """
         now_s = time.monotonic()
-        passed_s, self._now_s = now_s - self._now_s, now_s
-        if self.playing:
-            self.time_s = min(self.time_s + passed_s * float(self._speed.value[:-1]), self._end_s)
-            if now_s - self._shown_s > SLIDER_EVERY_S:
-                self._shown_s = now_s
-                self._slider.value = round(self.time_s - self._begin_s, 2)
+        elapsed_s = now_s - self._advanced_s
+        self._advanced_s = now_s
+        if self.is_playing:
+            speed = float(self._speed.value.removesuffix("x"))
+            self.time_s = min(self.time_s + elapsed_s * speed, self._end_s)
+            if now_s - self._slider_updated_s > SLIDER_PERIOD_S:
+                self._slider_updated_s = now_s
+                self._update_slider()
             if self.time_s >= self._end_s:
-                self._toggle()
-        moved, self._moved = self._moved, False
-        return self.time_s, moved
+                self._toggle_playing()
+        has_jumped = self._has_jumped
+        self._has_jumped = False
+        return self.time_s, has_jumped
 
     @property
-    def since_s(self) -> float:
-        """The time shown, after the first instant."""
+    def since_begin_s(self) -> float:
+        """The time shown, in seconds after the first instant."""
         return self.time_s - self._begin_s
 
-    def go(self, since_s: float) -> None:
-        """Show another instant; from any thread."""
-        self.time_s, self._moved = min(max(self._begin_s + since_s, self._begin_s), self._end_s), True
-        self._slider.value = round(self.since_s, 2)
+    def jump_to(self, since_begin_s: float) -> None:
+        """Show another instant, given in seconds after the first one; from any thread."""
+        self._jump_to_time(self._clamp_time(self._begin_s + since_begin_s))
+        self._update_slider()
 
-    def _jump(self) -> None:
-        self.time_s, self._moved = self._begin_s + self._slider.value, True
+    def _jump_to_time(self, time_s: float) -> None:
+        self.time_s = time_s
+        self._has_jumped = True
 
-    def _toggle(self) -> None:
-        self.playing = not self.playing
-        if self.playing and self.time_s >= self._end_s:
-            self.time_s, self._moved = self._begin_s, True
-        self._play.label = "Pause" if self.playing else "Play"
+    def _clamp_time(self, time_s: float) -> float:
+        return min(max(time_s, self._begin_s), self._end_s)
+
+    def _update_slider(self) -> None:
+        self._slider.value = round(self.since_begin_s, 2)
+
+    def _on_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+        """Jump to the time that a viewer chose. An event without a viewer comes from `_update_slider`."""
+        if event.client is not None:
+            self._jump_to_time(self._begin_s + self._slider.value)
+
+    def _toggle_playing(self) -> None:
+        """Play or pause; at the end of the recording, play from the beginning."""
+        self.is_playing = not self.is_playing
+        if self.is_playing and self.time_s >= self._end_s:
+            self._jump_to_time(self._begin_s)
+        self._play.label = "Pause" if self.is_playing else "Play"

@@ -1,6 +1,7 @@
-"""A controller's settings as sliders and boxes, made from its own schema.
+"""A controller's settings as sliders and boxes, made from the controller's own schema.
 
-The schema comes from the network: it decides what is shown, and nothing else; control checks every value again.
+The schema comes from the network. It decides which inputs are shown, and nothing else: control checks every value
+again.
 """
 
 import math
@@ -16,7 +17,7 @@ from snakesim_operator.robot_commands.parameters import Parameter, parameters_of
 
 @dataclass(frozen=True)
 class InputField:
-    """One setting. A number has a range that is sensible to slide over: about its value, and within its bounds."""
+    """The input for one setting. A number has a range that is sensible to slide over."""
 
     name: str
     value: bool | int | float | str
@@ -29,76 +30,120 @@ class InputField:
 
 
 def list_input_fields(settings: ControlSettings) -> list[InputField]:
-    """The settings that can be changed here; others keep their value. Nothing for a schema that cannot be read."""
-    found = [_field(parameter) for parameter in parameters_of(settings)]
-    return [field for field in found if field is not None]
+    """Return the inputs for the settings that a form can change; empty for a schema that cannot be read."""
+    fields: list[InputField] = []
+    for parameter in parameters_of(settings):
+        field = _make_field(parameter)
+        if field is not None:
+            fields.append(field)
+    return fields
 
 
-def _field(of: Parameter) -> InputField | None:
-    name, value = of.name, of.value
-    hint = "; ".join(filter(None, (of.about, of.range and f"{of.range} {of.unit}".removesuffix(" 1").strip())))
+def _make_field(parameter: Parameter) -> InputField | None:
+    """Return the input for a parameter; None if it is of a kind that has no input."""
+    value = parameter.value
     if isinstance(value, bool):
-        return InputField(name, value, hint=of.about)
-    if isinstance(value, str) and value in of.choices:
-        return InputField(name, value, choices=of.choices, hint=of.about)
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        return None
+        return InputField(parameter.name, value, hint=parameter.about)
+    if isinstance(value, str) and value in parameter.choices:
+        return InputField(parameter.name, value, choices=parameter.choices, hint=parameter.about)
+    if isinstance(value, int | float) and math.isfinite(value):
+        return _make_number_field(parameter, value)
+    return None
+
+
+def _make_number_field(parameter: Parameter, value: float) -> InputField:
+    """Return the input for a number: up to four times its value, as far as the parameter's bounds allow."""
     reach = 4.0 * abs(value) or 1.0
-    low = -reach if of.least is None else max(of.least, -reach)
-    high = reach if of.most is None else min(of.most, reach)
-    step = 1.0 if isinstance(value, int) else 10.0 ** math.floor(math.log10(max(high - low, 1e-9) / 100))
-    if of.above_least and low == of.least:
-        low += step
-    return InputField(name, value, of.unit, low=min(low, value), high=max(high, value), step=step, hint=hint)
+    low = -reach
+    if parameter.least is not None:
+        low = max(parameter.least, -reach)
+    high = reach
+    if parameter.most is not None:
+        high = min(parameter.most, reach)
+    step = 1.0
+    if not isinstance(value, int):
+        # The power of ten that divides the range into 100 to 1000 steps.
+        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-9) / 100))
+    if parameter.above_least and low == parameter.least:
+        low += step  # the bound itself is not allowed
+    return InputField(
+        parameter.name,
+        value,
+        parameter.unit,
+        low=min(low, value),
+        high=max(high, value),
+        step=step,
+        hint=_describe_number(parameter),
+    )
+
+
+def _describe_number(parameter: Parameter) -> str:
+    """Return description, bounds and unit of a parameter, as far as it has them."""
+    parts: list[str] = []
+    if parameter.about:
+        parts.append(parameter.about)
+    if parameter.range:
+        parts.append(f"{parameter.range} {parameter.unit}".removesuffix(" 1").strip())
+    return "; ".join(parts)
 
 
 class SettingsForm:
-    """The inputs of one viewer."""
+    """The inputs of one viewer for the settings of one controller."""
 
     def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, settings: ControlSettings) -> None:
         self.controller = settings.controller
-        self._values: dict[str, Any] = msgspec.json.decode(settings.settings, type=dict[str, Any])
-        self._inputs: dict[str, Any] = {}
+        self._values = _decode_values(settings)
+        self._inputs: dict[str, Any] = {}  # handles of viser, by the setting's name
         with folder:
             for field in list_input_fields(settings):
-                self._inputs[field.name] = _input(gui, field)
+                self._inputs[field.name] = _add_input(gui, field)
 
     @property
     def inputs(self) -> list[Any]:
-        """What the viewer can set."""
+        """The inputs, as handles of viser."""
         return list(self._inputs.values())
 
-    def enable(self, enabled: bool) -> None:
-        """Whether the viewer may change them."""
-        for one in self._inputs.values():
-            one.disabled = not enabled
+    def set_enabled(self, enabled: bool) -> None:
+        """Set whether the viewer may change the inputs."""
+        for control in self._inputs.values():
+            control.disabled = not enabled
 
-    def asked(self) -> str:
-        """All settings as JSON, with what the viewer has set."""
-        return msgspec.json.encode({**self._values, **{name: one.value for name, one in self._inputs.items()}}).decode()
+    def encode_settings(self) -> str:
+        """Return all settings as JSON, with the values that the viewer has entered."""
+        entered = {name: control.value for name, control in self._inputs.items()}
+        return msgspec.json.encode({**self._values, **entered}).decode()
 
-    def show(self, settings: ControlSettings) -> bool:
-        """Show the values in force; False when they are of another controller, and the form does not fit."""
+    def show_values(self, settings: ControlSettings) -> bool:
+        """Show the values in force, and return whether this form is for their controller."""
         if settings.controller != self.controller:
             return False
-        self._values = msgspec.json.decode(settings.settings, type=dict[str, Any])
-        for name, one in self._inputs.items():
+        self._values = _decode_values(settings)
+        for name, control in self._inputs.items():
             if name in self._values:
-                one.value = self._values[name]
+                control.value = self._values[name]
         return True
 
     def remove(self) -> None:
-        """Take it off the page."""
-        for one in self._inputs.values():
-            one.remove()
+        """Remove the inputs from the page."""
+        for control in self._inputs.values():
+            control.remove()
 
 
-def _input(gui: viser.GuiApi, field: InputField) -> Any:
-    label = f"{field.name}, {field.unit}" if field.unit not in ("", "1") else field.name
-    if isinstance(field.value, bool):
-        return gui.add_checkbox(label, field.value, hint=field.hint)
-    if isinstance(field.value, str):
-        return gui.add_dropdown(label, field.choices, initial_value=field.value, hint=field.hint)
-    if isinstance(field.value, int):
-        return gui.add_number(label, field.value, min=math.ceil(field.low), step=1, hint=field.hint)
-    return gui.add_slider(label, field.low, field.high, field.step, field.value, hint=field.hint)
+def _decode_values(settings: ControlSettings) -> dict[str, Any]:
+    return msgspec.json.decode(settings.settings, type=dict[str, Any])
+
+
+def _add_input(gui: viser.GuiApi, field: InputField) -> Any:
+    """Add the input for a field to the page, and return its handle."""
+    label = field.name
+    if field.unit not in ("", "1"):
+        label = f"{field.name}, {field.unit}"
+    match field.value:
+        case bool():
+            return gui.add_checkbox(label, field.value, hint=field.hint)
+        case str():
+            return gui.add_dropdown(label, field.choices, initial_value=field.value, hint=field.hint)
+        case int():
+            return gui.add_number(label, field.value, min=math.ceil(field.low), step=1, hint=field.hint)
+        case _:
+            return gui.add_slider(label, field.low, field.high, field.step, field.value, hint=field.hint)

@@ -1,11 +1,11 @@
-"""Signals over time, as a page beside the console's own: what is answered to it. The page itself is `signals.js`.
+"""The page that shows signals over time, and the answers to its requests. The page's script is `signals.js`.
 
 /signals                  the page; with ?within it is a part of the console's page
-/signals/names            units by name
-/signals/values           ?name=...&from_s=...&to_s=...   what can be drawn of each
-/signals/values.csv       the same, every sample
+/signals/names            unit of each signal, by name
+/signals/values           ?name=...&from_s=...&to_s=...   points of each signal, as many as can be drawn
+/signals/values.csv       the same, with every sample
 /signals/now              the time that the console shows
-/signals/go               ?time_s=...   show another one; of a recording
+/signals/go               ?time_s=...   show another time of a recording
 """
 
 import csv
@@ -28,44 +28,58 @@ from snakesim_operator.features.console.robot_data.signals import Signals
 from snakesim_operator.results.page.charts import LIBRARY, rounded, thinned
 from snakesim_operator.results.page.palette import DARK, LIGHT, joint_colors, variables
 
-HERE = Path(__file__).parent
+FOLDER = Path(__file__).parent
 PATH = "/signals"
-MOST_SIGNALS, COLOURS, BUCKETS = 16, 8, 1500
-OURS = "X-Snakesim"  # a header that a page of another origin cannot send unasked
-POLICY = (
+MAX_SIGNALS = 16  # of one request
+LINE_COLORS = 8
+MAX_BUCKETS = 1500  # of time, in each of which a line has at most three points
+OWN_PAGE_HEADER = "X-Snakesim"  # browsers do not let a page of another origin send this header
+CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self' {}; style-src 'unsafe-inline'; connect-src 'self'; "
     "img-src 'self' blob: data:; frame-ancestors 'self'"
 )
 
+Query = dict[str, list[str]]
+Series = tuple[Floats, Floats]  # times in s and values, (n,) each
+
 
 class SignalsPage:
-    """Answers for the paths below PATH. Called by the web server, in its thread."""
+    """Answers the requests for paths below PATH. The web server calls `answer` in its thread."""
 
     def __init__(self, signals: Signals, second_stop: bytes = b"") -> None:
-        """second_stop: of a live robot, for a page that is not within the console's."""
-        self._signals, self._second_stop = signals, second_stop
-        self._policy = POLICY.format(_hash(second_stop))
-        self.now_s: Callable[[], float | None] = lambda: None  # since the first tick
-        self.go: Callable[[float], None] | None = None
+        """Answer from a source of signals.
+
+        Args:
+            signals: The source.
+            second_stop: HTML of the second stop, for a live robot. A page that stands alone has it; a page within the
+                console's page does not need a stop of its own.
+        """
+        self._signals = signals
+        self._second_stop = second_stop
+        self._policy = CONTENT_SECURITY_POLICY.format(_script_hash(second_stop))
+        # Set by the display loop.
+        self.now_s: Callable[[], float | None] = lambda: None  # the time that is shown, since the first tick
+        self.jump_to: Callable[[float], None] | None = None  # None: a live robot
 
     def answer(self, request: Request) -> Response | None:
-        """None: not one of ours."""
+        """Return the answer to a request; None if its path is not one of this page."""
         address = urlsplit(request.path)
         if address.path != PATH and not address.path.startswith(f"{PATH}/"):
             return None
-        asked = parse_qs(address.query, keep_blank_values=True)
+        path = address.path.removeprefix(PATH)
+        query = parse_qs(address.query, keep_blank_values=True)
         try:
-            kind, body = self._found(address.path.removeprefix(PATH), asked, request)
+            content_type, body = self._make_content(path, query, request)
         except KeyError as error:
-            return self._response(HTTPStatus.NOT_FOUND, "text/plain", f"there is no {error}\n".encode())
+            return self._respond(HTTPStatus.NOT_FOUND, "text/plain", f"there is no {error}\n".encode())
         except ValueError as error:
-            return self._response(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
-        return self._response(HTTPStatus.OK, kind, body)
+            return self._respond(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
+        return self._respond(HTTPStatus.OK, content_type, body)
 
-    def _response(self, status: HTTPStatus, kind: str, body: bytes) -> Response:
+    def _respond(self, status: HTTPStatus, content_type: str, body: bytes) -> Response:
         headers = Headers(
             {
-                "Content-Type": f"{kind}; charset=utf-8",
+                "Content-Type": f"{content_type}; charset=utf-8",
                 "Content-Length": str(len(body)),
                 "Cache-Control": "no-store",
                 "Content-Security-Policy": self._policy,
@@ -74,86 +88,118 @@ class SignalsPage:
         )
         return Response(status.value, status.phrase, headers, body)
 
-    def _found(self, path: str, asked: dict[str, list[str]], request: Request) -> tuple[str, bytes]:
+    def _make_content(self, path: str, query: Query, request: Request) -> tuple[str, bytes]:
+        """Return content type and body for a path below PATH.
+
+        Raises:
+            KeyError: There is no such path or signal.
+            ValueError: The query is not valid, or the request is not allowed.
+        """
         match path:
             case "":
-                stop = b"" if "within" in asked else self._second_stop
-                page = (HERE / "signals.html").read_bytes().replace(b"/*themes*/", _themes().encode())
-                return "text/html", page.replace(b"<body>", b"<body>" + stop)
+                return "text/html", self._make_page(is_within_console="within" in query)
             case "/signals.js":
-                return "text/javascript", (HERE / "signals.js").read_bytes()
+                return "text/javascript", (FOLDER / "signals.js").read_bytes()
             case "/plotly.js":
                 return "text/javascript", LIBRARY.read_bytes()
             case "/names":
-                return _json({"recorded": self._signals.recorded, "units": self._signals.units()})
+                return _encode_json({"recorded": self._signals.recorded, "units": self._signals.units()})
             case "/now":
-                return _json({"time_s": self.now_s()})
+                return _encode_json({"time_s": self.now_s()})
             case "/go":
-                if self.go is None or request.headers.get(OURS) is None:
-                    raise ValueError("only the page of a recording goes to another time")
-                self.go(_number(asked, "time_s", math.nan))
-                return _json({})
+                self._jump(query, request)
+                return _encode_json({})
             case "/values":
-                return _json({name: _drawn(*series) for name, series in self._seen(asked).items()})
+                series = self._read_series(query)
+                return _encode_json({name: _thin_for_chart(*one_series) for name, one_series in series.items()})
             case "/values.csv":
-                return "text/csv", _table(self._seen(asked), self._signals.units()).encode()
+                return "text/csv", _write_csv(self._read_series(query), self._signals.units()).encode()
             case _:
                 raise KeyError(path)
 
-    def _seen(self, asked: dict[str, list[str]]) -> dict[str, tuple[Floats, Floats]]:
-        names = list(dict.fromkeys(asked.get("name", [])))
-        if len(names) > MOST_SIGNALS:
-            raise ValueError(f"{len(names)} signals, at most {MOST_SIGNALS} at once")
-        from_s, to_s = _number(asked, "from_s", -math.inf), _number(asked, "to_s", math.inf)
-        found: dict[str, tuple[Floats, Floats]] = {}
+    def _make_page(self, *, is_within_console: bool) -> bytes:
+        page = (FOLDER / "signals.html").read_bytes()
+        page = page.replace(b"/*themes*/", _write_themes().encode())
+        if is_within_console:
+            return page
+        return page.replace(b"<body>", b"<body>" + self._second_stop)
+
+    def _jump(self, query: Query, request: Request) -> None:
+        """Show another time of a recording, if the request comes from this page."""
+        if self.jump_to is None or request.headers.get(OWN_PAGE_HEADER) is None:
+            raise ValueError("only the page of a recording goes to another time")
+        self.jump_to(_parse_number(query, "time_s", math.nan))
+
+    def _read_series(self, query: Query) -> dict[str, Series]:
+        """Return the series that a query names, within the times that it gives, by name."""
+        names = list(dict.fromkeys(query.get("name", [])))
+        if len(names) > MAX_SIGNALS:
+            raise ValueError(f"{len(names)} signals, at most {MAX_SIGNALS} at once")
+        from_s = _parse_number(query, "from_s", -math.inf)
+        to_s = _parse_number(query, "to_s", math.inf)
+        series: dict[str, Series] = {}
         for name in names:
             times_s, values = self._signals.series(name)
-            within = (times_s >= from_s) & (times_s <= to_s)
-            found[name] = times_s[within], values[within]
-        return found
+            is_within = (times_s >= from_s) & (times_s <= to_s)
+            series[name] = times_s[is_within], values[is_within]
+        return series
 
 
-def _number(asked: dict[str, list[str]], name: str, otherwise: float) -> float:
-    value = float(asked[name][0]) if name in asked else otherwise
-    if math.isnan(value):
+def _parse_number(query: Query, name: str, default: float) -> float:
+    """Return a number of seconds from a query. A default of NaN makes it obligatory."""
+    number = float(query[name][0]) if name in query else default
+    if math.isnan(number):
         raise ValueError(f"{name}: must be a number of seconds")
-    return value
+    return number
 
 
-def _drawn(times_s: Floats, values: Floats) -> dict[str, object]:
-    """What a chart needs of it, and its range."""
-    rows, known = thinned(values, BUCKETS), values[np.isfinite(values)]
+def _thin_for_chart(times_s: Floats, values: Floats) -> dict[str, object]:
+    """Return the points of a line that can be drawn, and minimum, mean and maximum of all its values."""
+    rows = thinned(values, MAX_BUCKETS)
+    known = values[np.isfinite(values)]
+    value_range = None
+    if len(known):
+        value_range = [float(known.min()), float(known.mean()), float(known.max())]
     return {
         "time_s": np.round(times_s[rows], 4).tolist(),
         "values": rounded(values[rows]),
-        "range": [float(known.min()), float(known.mean()), float(known.max())] if len(known) else None,
+        "range": value_range,
     }
 
 
-def _table(series: dict[str, tuple[Floats, Floats]], units: dict[str, str]) -> str:
-    """A row for every time at which one of them has a sample; empty where it has none or is unknown."""
+def _write_csv(series: dict[str, Series], units: dict[str, str]) -> str:
+    """Return a table with a row for every time at which a signal has a sample.
+
+    A cell is empty if its signal has no sample at that time, or the value is unknown.
+    """
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(["time_s", *(f"{name} [{units[name]}]" for name in series)])
-    columns = [dict(zip(np.round(t, 6).tolist(), v.tolist(), strict=True)) for t, v in series.values()]
-    for time_s in sorted({time_s for column in columns for time_s in column}):
-        values = (column.get(time_s, math.nan) for column in columns)
-        writer.writerow([time_s, *("" if math.isnan(value) else value for value in values)])
+    columns: list[dict[float, float]] = []  # value by time
+    for times_s, values in series.values():
+        rounded_times_s = np.round(times_s, 6).tolist()
+        columns.append(dict(zip(rounded_times_s, values.tolist(), strict=True)))
+    all_times_s = sorted({time_s for column in columns for time_s in column})
+    for time_s in all_times_s:
+        numbers = [column.get(time_s, math.nan) for column in columns]
+        cells = ["" if math.isnan(number) else number for number in numbers]
+        writer.writerow([time_s, *cells])
     return text.getvalue()
 
 
-def _json(value: object) -> tuple[str, bytes]:
+def _encode_json(value: object) -> tuple[str, bytes]:
     return "application/json", msgspec.json.encode(value)
 
 
-def _themes() -> str:
-    """Both, for a page that is told which one it has."""
-    light = variables(LIGHT | joint_colors(COLOURS, dark=False))
-    dark = variables(DARK | joint_colors(COLOURS, dark=True))
+def _write_themes() -> str:
+    """Return the style of the light and of the dark page; the page's script chooses one."""
+    light = variables(LIGHT | joint_colors(LINE_COLORS, dark=False))
+    dark = variables(DARK | joint_colors(LINE_COLORS, dark=True))
     return f":root{{{light}}}:root.dark{{{dark}color-scheme:dark}}"
 
 
-def _hash(script: bytes) -> str:
-    """What lets a page run this one script of its own."""
-    inside = script.partition(b"<script>")[2].partition(b"</script>")[0]
-    return f"'sha256-{b64encode(sha256(inside).digest()).decode()}'"
+def _script_hash(html: bytes) -> str:
+    """Return the source expression of a content security policy that allows the one script in this HTML."""
+    script = html.partition(b"<script>")[2].partition(b"</script>")[0]
+    digest = b64encode(sha256(script).digest()).decode()
+    return f"'sha256-{digest}'"

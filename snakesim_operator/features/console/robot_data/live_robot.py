@@ -1,7 +1,8 @@
-"""The newest message of each key of one robot. Zenoh's threads only store; decoding happens at `snapshot`.
+"""The newest message of each key of one robot.
 
-Each key keeps a few arrivals, so that neither a slow page nor a flood costs memory, and noise on a key does not hide
-its good messages.
+Zenoh's threads only store what arrives; the display loop decodes it when it takes a snapshot. Each key keeps a few
+arrivals. So neither a slow page nor a flood of messages costs memory, and invalid messages on a key do not hide valid
+ones.
 """
 
 import time
@@ -25,78 +26,109 @@ from snakesim_hal.wire.messages import (
     World,
 )
 from snakesim_hal.wire.own_sample import own_kinds
+from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, Stream
 
-KEPT, IMAGES_KEPT = 64, 2  # arrivals of a key between two looks
-MAX_CAMERAS = 16
-BODIES_KEPT = 128  # joint states, to find that of the instant of a pose
-RATE_PERIOD_S = 1.0
-STATUS_LIMIT_S = 2.0  # a host that has been silent for longer is no impostor, only gone
+# Arrivals of a key that are kept between two snapshots.
+MAX_ARRIVALS = 64
+MAX_IMAGE_ARRIVALS = 2  # images are large
 
-LATCHED = (keys.DESCRIPTION, keys.STATUS, keys.SETTINGS_IN_FORCE, keys.CONFIG)
-STREAMS = (
-    *(keys.CLOCK, keys.JOINTS, keys.POSE, keys.POWER, keys.IMU, keys.CONTACTS, keys.APPLIED),
-    *(keys.WORLD, keys.TRAJECTORY, keys.CONTROL_STATE),
+MAX_CAMERAS = 16
+MAX_JOINT_STATES = 128  # enough to find the joint state of the instant of a pose, which arrives later
+RATE_PERIOD_S = 1.0  # over which the rates of messages are measured
+MAX_STATUS_AGE_S = 2.0  # a host that is silent for longer has ended; it does not count as a second host
+
+LATCHED_KEYS = (keys.DESCRIPTION, keys.STATUS, keys.SETTINGS_IN_FORCE, keys.CONFIG)
+STREAM_KEYS = (
+    keys.CLOCK,
+    keys.JOINTS,
+    keys.POSE,
+    keys.POWER,
+    keys.IMU,
+    keys.CONTACTS,
+    keys.APPLIED,
+    keys.WORLD,
+    keys.TRAJECTORY,
+    keys.CONTROL_STATE,
 )
-IMAGES = (keys.DEPTH_ALL, keys.COLOUR_ALL)
+IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOUR_ALL)
 
 
 class KeyBuffer:
-    """The arrivals of one key."""
+    """The arrivals of one key that are not decoded yet."""
 
-    def __init__(self, message: type[Any], kept: int) -> None:
-        self.arrivals: deque[Arrival] = deque(maxlen=kept)
-        self.count = 0
-        self._decoder: Decoder[Any] = Decoder(message)
+    def __init__(self, message_type: type[Any], max_arrivals: int) -> None:
+        self.count = 0  # of all arrivals
+        self._arrivals: deque[Arrival] = deque(maxlen=max_arrivals)
+        self._decoder: Decoder[Any] = Decoder(message_type)
 
-    def put(self, arrival: Arrival) -> None:
-        """Store one; in Zenoh's threads."""
+    def store(self, arrival: Arrival) -> None:
+        """Store an arrival; called by Zenoh's threads."""
         self.count += 1
-        self.arrivals.append(arrival)
+        self._arrivals.append(arrival)
 
-    def take(self, rejected: Counter[str]) -> list[Any]:
-        """What has arrived since the last call and can be decoded, oldest first."""
-        found: list[Any] = []
-        while self.arrivals:
-            arrival = self.arrivals.popleft()
+    def decode_all(self, rejected: Counter[str]) -> list[Any]:
+        """Return the messages that arrived since the last call, oldest first, and forget them.
+
+        Args:
+            rejected: Counts the arrivals that cannot be decoded, by reason.
+        """
+        messages: list[Any] = []
+        while self._arrivals:
+            arrival = self._arrivals.popleft()
             try:
-                found.append(self._decoder.decode(arrival.payload, arrival.encoding))
+                messages.append(self._decoder.decode(arrival.payload, arrival.encoding))
             except WireError as error:
                 rejected[error.reason] += 1
-        return found
+        return messages
 
 
 class LiveRobot:
-    """Everything that one robot publishes, as far as the console shows it."""
+    """Everything that one robot publishes, as far as the console shows it.
+
+    Zenoh's threads call `_store_described` and the `store` of each buffer; all else belongs to the display loop.
+    """
 
     def __init__(self, session: Session) -> None:
+        now_s = time.monotonic()
+        self.rejected = session.rejected
+        # Messages, by key.
         self._buffers: dict[str, KeyBuffer] = {}
         self._newest: dict[str, Any] = {}
-        self._bodies: deque[JointState] = deque(maxlen=BODIES_KEPT)
-        self._hosts: dict[str, float] = {}
-        self._heard_s = time.monotonic()
-        self._rates: dict[str, float] = {}
-        self._counted: tuple[float, dict[str, int]] = (self._heard_s, {})
-        self.rejected = session.rejected
-        for key in LATCHED:
-            session.on_latched_arrival(key, self._inlet(key, keys.message_at(key), KEPT).put)
-        for key in STREAMS:
-            session.on_arrival(key, self._inlet(key, keys.message_at(key), KEPT).put)
-        for key in (*IMAGES, keys.OWN_ALL):
-            session.on_arrival(key, self._take)
+        self._joint_states: deque[JointState] = deque(maxlen=MAX_JOINT_STATES)
+        # When a status arrived, from any host and from each host.
+        self._status_time_s = now_s
+        self._host_times_s: dict[str, float] = {}
+        # Rates, and the counts of arrivals from which they were measured.
+        self._rates_hz: dict[str, float] = {}
+        self._counted_s = now_s
+        self._counts: dict[str, int] = {}
+        for key in LATCHED_KEYS:
+            buffer = self._add_buffer(key, keys.message_at(key), MAX_ARRIVALS)
+            session.on_latched_arrival(key, buffer.store)
+        for key in STREAM_KEYS:
+            buffer = self._add_buffer(key, keys.message_at(key), MAX_ARRIVALS)
+            session.on_arrival(key, buffer.store)
+        for key in (*IMAGE_ROWS, keys.OWN_ALL):
+            session.on_arrival(key, self._store_described)
 
-    def _inlet(self, key: str, message: Any, kept: int) -> KeyBuffer:
-        buffer = self._buffers[key] = KeyBuffer(message, kept)
+    def _add_buffer(self, key: str, message_type: Any, max_arrivals: int) -> KeyBuffer:
+        buffer = KeyBuffer(message_type, max_arrivals)
+        self._buffers[key] = buffer
         return buffer
 
-    def _take(self, arrival: Arrival) -> None:
-        """In Zenoh's threads: of a camera, each of which has a key of its own, or a sensor that the robot describes."""
+    def _store_described(self, arrival: Arrival) -> None:
+        """Store an arrival of a camera or a custom sensor; called by Zenoh's threads.
+
+        Each camera has a key of its own, and gets a buffer with its first image. A custom sensor has a buffer only if
+        the robot describes it.
+        """
         buffer = self._buffers.get(arrival.key)
-        has_room = len(self._buffers) < len(LATCHED) + len(STREAMS) + MAX_CAMERAS
-        if buffer is None and has_room and keys.row_key(arrival.key) in IMAGES:
-            buffer = self._inlet(arrival.key, keys.message_at(arrival.key), IMAGES_KEPT)
+        has_room = len(self._buffers) < len(LATCHED_KEYS) + len(STREAM_KEYS) + MAX_CAMERAS
+        if buffer is None and has_room and keys.row_key(arrival.key) in IMAGE_ROWS:
+            buffer = self._add_buffer(arrival.key, keys.message_at(arrival.key), MAX_IMAGE_ARRIVALS)
         if buffer is not None:
-            buffer.put(arrival)
+            buffer.store(arrival)
 
     @property
     def robot(self) -> Description | None:
@@ -104,111 +136,156 @@ class LiveRobot:
         return self._newest.get(keys.DESCRIPTION)
 
     def snapshot(self) -> RobotSnapshot | None:
-        """What is known now; None before the robot has described itself."""
-        self._take_in()
+        """Return what is known of the robot now; None before it has described itself."""
+        self._decode_arrivals()
+        self._measure_rates()
         robot = self.robot
         if robot is None:
             return None
-        now_s, newest = time.monotonic(), self._newest.get
+        now_s = time.monotonic()
+        newest = self._newest.get
         clock: Clock | None = newest(keys.CLOCK)
         world: World | None = newest(keys.WORLD)
-        body, base = self._body(world)
+        body, base = self._find_body(world)
         return RobotSnapshot(
             robot=robot,
+            # Host.
             time_s=None if clock is None else clock.timestamp_ns * 1e-9,
-            silent_s=now_s - self._heard_s,
+            silent_s=now_s - self._status_time_s,
             status=newest(keys.STATUS),
+            configuration=self._find_configuration(robot),
+            hosts=self._list_hosts(now_s),
+            # Robot.
             joints=newest(keys.JOINTS),
             body=body,
             base=base,
-            world=world,
             contacts=newest(keys.CONTACTS),
-            trajectory=newest(keys.TRAJECTORY),
-            control=newest(keys.CONTROL_STATE),
             applied=newest(keys.APPLIED),
-            settings=newest(keys.SETTINGS_IN_FORCE),
-            configuration=self._configuration(robot),
             power=newest(keys.POWER),
             imu=newest(keys.IMU),
-            images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColorImage)},
-            own={key: found for key, found in self._newest.items() if isinstance(found, OwnSample)},
-            streams=self._streams(clock),
-            hosts=frozenset(host for host, at_s in self._hosts.items() if now_s - at_s < STATUS_LIMIT_S),
+            images={key: image for key, image in self._newest.items() if isinstance(image, DepthImage | ColorImage)},
+            own={key: sample for key, sample in self._newest.items() if isinstance(sample, OwnSample)},
+            # Controller.
+            world=world,
+            trajectory=newest(keys.TRAJECTORY),
+            control=newest(keys.CONTROL_STATE),
+            settings=newest(keys.SETTINGS_IN_FORCE),
+            # Network.
+            streams=self._list_streams(clock),
         )
 
-    def _configuration(self, robot: Description) -> Configuration | None:
-        """Of the host that describes itself, whichever of the two came first."""
-        configured: Configuration | None = self._newest.get(keys.CONFIG)
-        return configured if configured is not None and configured.config_hash == robot.config_hash else None
+    # --- arrivals --------------------------------------------------------------------------------------------
 
-    def _take_in(self) -> None:
-        """Decode what has arrived; what does not fit the robot is counted and dropped."""
+    def _decode_arrivals(self) -> None:
+        """Decode what has arrived. A message that does not fit the robot is counted and dropped."""
         for key, buffer in list(self._buffers.items()):
-            for message in buffer.take(self.rejected):
+            for message in buffer.decode_all(self.rejected):
                 if key == keys.DESCRIPTION:
-                    self._meet(message)
-                elif self.robot is not None and (wrong := mismatch(message, self.robot)) is not None:
-                    self.rejected[wrong.reason] += 1
+                    self._update_description(message)
+                    continue
+                difference = None if self.robot is None else mismatch(message, self.robot)
+                if difference is not None:
+                    self.rejected[difference.reason] += 1
                 else:
-                    self._keep(key, message)
-        self._count()
+                    self._keep_message(key, message)
 
-    def _keep(self, key: str, message: Any) -> None:
+    def _keep_message(self, key: str, message: Any) -> None:
         if keys.row_key(key) == keys.OWN_ALL and key not in self._buffers:
-            return  # of another host's, which described it
+            return  # a custom sensor of a former host, whose description this host has just replaced
         self._newest[key] = message
         if key == keys.STATUS:
-            self._heard_s = time.monotonic()
-            self._hosts[message.host or ""] = self._heard_s
+            self._status_time_s = time.monotonic()
+            self._host_times_s[message.host or ""] = self._status_time_s
         elif key == keys.JOINTS:
-            self._bodies.append(message)
+            self._joint_states.append(message)
 
-    def _meet(self, robot: Description) -> None:
-        """Another host: nothing of the one before is of this robot's time."""
-        if self.robot is not None and self.robot.host != robot.host:
-            self._newest = {key: one for key, one in self._newest.items() if key == keys.CONFIG}  # which has a hash
-            self._bodies.clear()
-            self._hosts.clear()
-        if self.robot is None or self.robot.own != robot.own:
-            for key in [key for key in self._buffers if keys.row_key(key) == keys.OWN_ALL]:
-                del self._buffers[key]
-                self._newest.pop(key, None)
-            for key, kind in own_kinds(robot).items():
-                self._inlet(key, kind.message, KEPT)
+    def _update_description(self, robot: Description) -> None:
+        """Keep a description. One of another host makes the messages of the former host void."""
+        former = self.robot
+        if former is not None and former.host != robot.host:
+            # The configuration has a hash, by which `_find_configuration` knows whether it is of this host.
+            self._newest = {key: message for key, message in self._newest.items() if key == keys.CONFIG}
+            self._joint_states.clear()
+            self._host_times_s.clear()
+        if former is None or former.own != robot.own:
+            self._replace_sensor_buffers(robot)
         self._newest[keys.DESCRIPTION] = robot
 
-    def _body(self, world: World | None) -> tuple[JointState | None, Any]:
-        """The joint state of the instant of the pose, and the pose: by guidance, else by motion capture."""
+    def _replace_sensor_buffers(self, robot: Description) -> None:
+        """Add a buffer for each custom sensor that the robot describes, in the place of the former ones."""
+        former_keys = [key for key in self._buffers if keys.row_key(key) == keys.OWN_ALL]
+        for key in former_keys:
+            del self._buffers[key]
+            self._newest.pop(key, None)
+        for key, kind in own_kinds(robot).items():
+            self._add_buffer(key, kind.message, MAX_ARRIVALS)
+
+    # --- parts of a snapshot ---------------------------------------------------------------------------------
+
+    def _find_configuration(self, robot: Description) -> Configuration | None:
+        """Return the configuration of the host that describes itself, whichever of the two messages came first."""
+        configuration: Configuration | None = self._newest.get(keys.CONFIG)
+        if configuration is None or configuration.config_hash != robot.config_hash:
+            return None
+        return configuration
+
+    def _list_hosts(self, now_s: float) -> frozenset[str]:
+        """Return the ids of all hosts that have published a status lately."""
+        return frozenset(host for host, time_s in self._host_times_s.items() if now_s - time_s < MAX_STATUS_AGE_S)
+
+    def _find_body(self, world: World | None) -> tuple[JointState | None, tuple[Vector, Quaternion] | None]:
+        """Return the pose of the base, and the joint state that was measured nearest to the pose's time.
+
+        The pose is that of guidance, else that of motion capture. Without a pose, the joint state is the newest one.
+        """
         pose: Pose | None = self._newest.get(keys.POSE)
         if world is not None:
-            of_ns = (
-                world.timestamp_ns
-                if world.base_position_sd_m is not None
-                else world.pose_timestamp_ns or world.timestamp_ns
-            )
+            pose_ns = _find_base_time_ns(world)
             base = (world.base_position_w, world.base_orientation_wxyz)
         elif pose is not None:
-            of_ns, base = pose.timestamp_ns, (pose.position_w, pose.orientation_wxyz)
+            pose_ns = pose.timestamp_ns
+            base = (pose.position_w, pose.orientation_wxyz)
         else:
-            return (self._bodies[-1] if self._bodies else None), None
-        return min(self._bodies, key=lambda joints: abs(joints.timestamp_ns - of_ns), default=None), base
+            newest = self._joint_states[-1] if self._joint_states else None
+            return newest, None
+        body = min(self._joint_states, key=lambda joints: abs(joints.timestamp_ns - pose_ns), default=None)
+        return body, base
 
-    def _count(self) -> None:
-        now_s, (since_s, before) = time.monotonic(), self._counted
-        if now_s - since_s < RATE_PERIOD_S:
+    def _measure_rates(self) -> None:
+        """Measure the rate of each key, once a period."""
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._counted_s
+        if elapsed_s < RATE_PERIOD_S:
             return
         counts = {key: buffer.count for key, buffer in list(self._buffers.items())}
-        self._rates = {key: (count - before.get(key, 0)) / (now_s - since_s) for key, count in counts.items()}
-        self._counted = now_s, counts
+        self._rates_hz = {key: (count - self._counts.get(key, 0)) / elapsed_s for key, count in counts.items()}
+        self._counted_s = now_s
+        self._counts = counts
 
-    def _streams(self, clock: Clock | None) -> dict[str, Stream]:
-        return {
-            key: Stream(self._rates.get(key, 0.0), _age_s(self._newest.get(key), clock))
-            for key in self._buffers
-            if key in self._newest and key not in LATCHED
-        }
+    def _list_streams(self, clock: Clock | None) -> dict[str, Stream]:
+        """Return rate and age of each key that has published a message and is not latched."""
+        streams: dict[str, Stream] = {}
+        for key in list(self._buffers):
+            message = self._newest.get(key)
+            if message is not None and key not in LATCHED_KEYS:
+                streams[key] = Stream(self._rates_hz.get(key, 0.0), _find_age_s(message, clock))
+        return streams
 
 
-def _age_s(message: Any, clock: Clock | None) -> float | None:
+def _find_base_time_ns(world: World) -> int:
+    """Return the robot time of the base's pose in a world.
+
+    If guidance gives a standard deviation, it has moved the pose on to the world's own timestamp by dead reckoning.
+    Else the pose is that of the newest sample of motion capture.
+    """
+    if world.base_position_sd_m is not None:
+        return world.timestamp_ns
+    return world.pose_timestamp_ns or world.timestamp_ns
+
+
+def _find_age_s(message: Any, clock: Clock | None) -> float | None:
+    """Return the age of a message in robot time; None if the time is not known, or the message has no timestamp."""
     timestamp_ns = getattr(message, "timestamp_ns", None)
-    return None if clock is None or timestamp_ns is None else (clock.timestamp_ns - timestamp_ns) * 1e-9
+    if clock is None or timestamp_ns is None:
+        return None
+    return (clock.timestamp_ns - timestamp_ns) * 1e-9

@@ -1,4 +1,4 @@
-"""What a recording holds besides a record's rows, by time: kept as bytes, and decoded when it is looked at."""
+"""The messages of a recording by time. They are kept as bytes, and decoded when they are shown."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -14,85 +14,121 @@ from snakesim_hal.wire.own_sample import message_of
 from snakesim_operator.features.console.robot_data.snapshot import Stream
 from snakesim_operator.recording.message import RecordedMessage
 
-IMAGES = (keys.DEPTH_ALL, keys.COLOUR_ALL)
-KEPT = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.SETTINGS_IN_FORCE, keys.OWN_ALL, *IMAGES})
-STREAMS = frozenset(
-    {keys.CLOCK, keys.JOINTS, keys.POSE, keys.CONTACTS, keys.APPLIED, keys.WORLD, keys.TRAJECTORY, keys.CONTROL_STATE}
-)  # of which rates and ages are shown
-MOST_BYTES = 256_000_000  # of images; of more every second one is forgotten
+IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOUR_ALL)
+
+# Rows of the key space whose messages are kept, because the rows of a run's record do not have them.
+KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.SETTINGS_IN_FORCE, keys.OWN_ALL, *IMAGE_ROWS})
+
+# Rows of which only the times are kept, to show their rates and ages.
+TIMED_ROWS = frozenset(
+    {
+        keys.CLOCK,
+        keys.JOINTS,
+        keys.POSE,
+        keys.CONTACTS,
+        keys.APPLIED,
+        keys.WORLD,
+        keys.TRAJECTORY,
+        keys.CONTROL_STATE,
+    }
+)
+LATCHED_KEYS = (keys.STATUS, keys.SETTINGS_IN_FORCE)  # published on change, so they have no rate
+MAX_IMAGE_BYTES = 256_000_000  # of all images together; beyond this, every second image is dropped
+MAX_DECODED = 256  # messages that stay decoded
 RATE_PERIOD_S = 1.0
 
 
 @dataclass
-class _Messages:
+class _KeyMessages:
+    """The messages of one key, in the order of the file."""
+
     times_s: list[float] = field(default_factory=list[float])
-    kept: list[RecordedMessage] = field(default_factory=list[RecordedMessage])  # of some keys none
+    kept: list[RecordedMessage] = field(default_factory=list[RecordedMessage])  # empty for a key of TIMED_ROWS
 
 
 class MessageHistory:
-    """Every message of a recording, given in the order of the file."""
+    """Every message of a recording that the console shows."""
 
     def __init__(self) -> None:
-        self._by_key: dict[str, _Messages] = {}
+        self._messages: dict[str, _KeyMessages] = {}  # by key
         self._image_bytes = 0
-        self.thinned = 1  # of so many images one is kept
-        self.robot: Description | None = None
-        self._decoded = lru_cache(256)(self._decode)
+        self.image_decimation = 1  # one of so many images is kept
+        self.robot: Description | None = None  # describes custom sensors
+        self._decode_cached = lru_cache(MAX_DECODED)(self._decode)
 
-    def take(self, message: RecordedMessage) -> None:
-        """One more."""
+    def add(self, message: RecordedMessage) -> None:
+        """Add the next message of the recording, if the console shows its key."""
         row = keys.row_key(message.key)
-        if row not in KEPT and row not in STREAMS:
+        if row not in KEPT_ROWS and row not in TIMED_ROWS:
             return
-        of_key = self._by_key.setdefault(message.key, _Messages())
-        of_key.times_s.append(max(message.time_ns * 1e-9, of_key.times_s[-1] if of_key.times_s else 0.0))
-        if row in KEPT:
-            of_key.kept.append(message)
-        if row in IMAGES:
+        messages = self._messages.setdefault(message.key, _KeyMessages())
+        previous_s = messages.times_s[-1] if messages.times_s else 0.0
+        messages.times_s.append(max(message.time_ns * 1e-9, previous_s))  # times are sorted, to be searched
+        if row in KEPT_ROWS:
+            messages.kept.append(message)
+        if row in IMAGE_ROWS:
             self._image_bytes += len(message.payload)
-            if self._image_bytes > MOST_BYTES:
-                self._thin()
+            if self._image_bytes > MAX_IMAGE_BYTES:
+                self._drop_every_second_image()
 
-    def _thin(self) -> None:
-        self.thinned *= 2
-        for key, of_key in self._by_key.items():
-            if keys.row_key(key) in IMAGES:
-                of_key.kept, of_key.times_s = of_key.kept[::2], of_key.times_s[::2]
+    def _drop_every_second_image(self) -> None:
+        self.image_decimation *= 2
+        for key, messages in self._messages.items():
+            if keys.row_key(key) in IMAGE_ROWS:
+                messages.kept = messages.kept[::2]
+                messages.times_s = messages.times_s[::2]
         self._image_bytes //= 2
 
-    def newest(self, key: str, time_s: float) -> Any:
-        """The message at a key that was the newest then; None: there was none, or nobody can read it."""
-        of_key = self._by_key.get(key)
-        i = -1 if of_key is None else bisect_right(of_key.times_s, time_s) - 1
-        return None if of_key is None or i < 0 else self._decoded(key, i)
+    def find_newest(self, key: str, time_s: float) -> Any:
+        """Return the newest message of a key at a time; None if there is none, or it cannot be decoded."""
+        messages = self._messages.get(key)
+        if messages is None:
+            return None
+        index = bisect_right(messages.times_s, time_s) - 1
+        if index < 0:
+            return None
+        return self._decode_cached(key, index)
 
-    def all_newest(self, row: str, time_s: float) -> dict[str, Any]:
-        """By key, of all keys of a line of the key space."""
-        found = {key: self.newest(key, time_s) for key in sorted(self._by_key) if keys.row_key(key) == row}
-        return {key: message for key, message in found.items() if message is not None}
+    def find_all_newest(self, row: str, time_s: float) -> dict[str, Any]:
+        """Return the newest message at a time of each key in a row of the key space, by key."""
+        newest: dict[str, Any] = {}
+        for key in sorted(self._messages):
+            if keys.row_key(key) != row:
+                continue
+            message = self.find_newest(key, time_s)
+            if message is not None:
+                newest[key] = message
+        return newest
 
-    def every(self, key: str) -> Iterator[tuple[float, Any]]:
-        """All that can be read at a key, with their times."""
-        of_key = self._by_key.get(key, _Messages())
-        for i, time_s in enumerate(of_key.times_s):
-            if (message := self._decode(key, i)) is not None:
+    def iterate_messages(self, key: str) -> Iterator[tuple[float, Any]]:
+        """Yield the time in s and the message, for each message of a key that can be decoded."""
+        messages = self._messages.get(key)
+        if messages is None:
+            return
+        for index, time_s in enumerate(messages.times_s):
+            message = self._decode(key, index)
+            if message is not None:
                 yield time_s, message
 
-    def streams(self, time_s: float) -> dict[str, Stream]:
-        """Rate over the last second and age of each key then."""
-        found: dict[str, Stream] = {}
-        for key, of_key in sorted(self._by_key.items()):
-            i = bisect_right(of_key.times_s, time_s)
-            if i > 0 and keys.row_key(key) not in (keys.STATUS, keys.SETTINGS_IN_FORCE):
-                count = i - bisect_right(of_key.times_s, time_s - RATE_PERIOD_S)
-                found[key] = Stream(count / RATE_PERIOD_S, time_s - of_key.times_s[i - 1])
-        return found
+    def measure_streams(self, time_s: float) -> dict[str, Stream]:
+        """Return the rate over the last second and the age of each key at a time, by key."""
+        streams: dict[str, Stream] = {}
+        for key, messages in sorted(self._messages.items()):
+            count = bisect_right(messages.times_s, time_s)
+            if count == 0 or keys.row_key(key) in LATCHED_KEYS:
+                continue
+            recent_count = count - bisect_right(messages.times_s, time_s - RATE_PERIOD_S)
+            age_s = time_s - messages.times_s[count - 1]
+            streams[key] = Stream(recent_count / RATE_PERIOD_S, age_s)
+        return streams
 
-    def _decode(self, key: str, i: int) -> Any:
-        kept, kind = self._by_key[key].kept[i], message_of(key, self.robot)
-        if kind is None:
+    def _decode(self, key: str, index: int) -> Any:
+        """Return a message of a key; None if its type is not known, or it cannot be decoded."""
+        kept = self._messages[key].kept[index]
+        message_type = message_of(key, self.robot)
+        if message_type is None:
             return None
         try:
-            return Decoder(kind).decode(kept.payload, kept.encoding)
+            return Decoder(message_type).decode(kept.payload, kept.encoding)
         except WireError:
             return None

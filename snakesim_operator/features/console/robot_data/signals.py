@@ -1,11 +1,13 @@
-"""Every number of a robot over time, by name and unit; and those of the last minute of a live one.
+"""Every number of a robot over time, by name and unit, and the last minute of these numbers for a live robot.
 
-Names are those of `snakesim plot` and `export`; what these do not have has the name of its message before it:
-`control.reference_rad.joint_3`, `power.voltage_v.joint_1`, `imu.acceleration_m_s2.0.x`.
+Names are those of `snakesim plot` and `snakesim export`. A number that these commands do not have has the name of its
+message in front: `control.reference_rad.joint_3`, `power.voltage_v.joint_1`, `imu.acceleration_m_s2.0.x`.
 """
 
 import threading
 from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
 
@@ -19,131 +21,222 @@ from snakesim_hal.wire.messages import AppliedCommand, ControlState, Description
 from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
-LIVE_S, LIVE_EVERY_S = 60.0, 0.05
-OF_JOINTS: dict[type[Message], tuple[str, ...]] = {
+LIVE_HISTORY_S = 60.0
+LIVE_PERIOD_S = 0.05  # between two samples of a live robot
+
+# Fields with a number for each joint, whose names have no message in front.
+JOINT_FIELDS: dict[type[Message], tuple[str, ...]] = {
     JointState: ("angle_rad", "velocity_rad_s", "torque_nm"),
     AppliedCommand: ("mode", "target", "torque_limit_nm"),
 }
-OTHERS = {"mode": "1", "position_w_m": "m", "orientation_wxyz": "1", "contact_peak_n": "N", "contact_count": "1"}
-PREFIXED: dict[str, type[Message]] = {keys.CONTROL_STATE: ControlState, keys.POWER: Power, keys.IMU: Imu}
+# Units of signals whose message does not have a unit for them.
+OTHER_UNITS = {"mode": "1", "position_w_m": "m", "orientation_wxyz": "1", "contact_peak_n": "N", "contact_count": "1"}
+# Messages whose signals have the name of the message in front.
+PREFIXED_MESSAGES: dict[str, type[Message]] = {
+    keys.CONTROL_STATE: ControlState,
+    keys.POWER: Power,
+    keys.IMU: Imu,
+}
 
 
 class Signals(Protocol):
-    """Where signals come from. From any thread."""
+    """A source of signals. Every method may be called from any thread."""
 
     recorded: bool
 
     def units(self) -> dict[str, str]:
-        """Of every signal there is, by name."""
+        """Return the unit of every signal, by the signal's name."""
         ...
 
     def series(self, name: str) -> tuple[Floats, Floats]:
-        """Times in s since the first tick, and values, (n,) each; NaN where unknown. Raises KeyError."""
+        """Return the times and the values of a signal.
+
+        Returns:
+            Times in s since the first tick, (n,), and values, (n,); NaN where the value is unknown.
+
+        Raises:
+            KeyError: There is no signal of this name.
+        """
         ...
 
 
+@dataclass(frozen=True)
+class _Sample:
+    """The numbers of a live robot at one time."""
+
+    time_s: float
+    names: tuple[str, ...]
+    values: Floats  # (names,)
+
+
 class LiveSignals:
-    """Of a live robot: the last minute that the page has seen, twenty times a second."""
+    """The signals of a live robot: the last minute that the page has seen, twenty times a second."""
 
     recorded = False
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._kept: deque[tuple[float, tuple[str, ...], Floats]] = deque(maxlen=round(LIVE_S / LIVE_EVERY_S))
+        self._samples: deque[_Sample] = deque(maxlen=round(LIVE_HISTORY_S / LIVE_PERIOD_S))
         self._units: dict[str, str] = {}
 
-    def take(self, snapshot: RobotSnapshot) -> None:
-        """Keep what is known now; each frame."""
+    def add_snapshot(self, snapshot: RobotSnapshot) -> None:
+        """Keep the numbers of a snapshot, unless it follows the last one too closely; called for each frame."""
         time_s = snapshot.time_s
-        if time_s is None or (self._kept and 0 <= time_s - self._kept[-1][0] < LIVE_EVERY_S):
+        if time_s is None:
             return
-        now, of_units = _live(snapshot)
+        if self._samples and 0 <= time_s - self._samples[-1].time_s < LIVE_PERIOD_S:
+            return
+        numbers = collect_numbers(snapshot)
+        values = np.fromiter(numbers.values.values(), dtype=float, count=len(numbers.values))
         with self._lock:
-            if self._kept and time_s < self._kept[-1][0]:
-                self._kept.clear()
+            if self._samples and time_s < self._samples[-1].time_s:  # the robot was reset, or is another one
+                self._samples.clear()
                 self._units.clear()
-            self._units |= of_units
-            self._kept.append((time_s, tuple(now), np.fromiter(now.values(), dtype=float, count=len(now))))
+            self._units |= numbers.units
+            self._samples.append(_Sample(time_s, tuple(numbers.values), values))
 
     def now_s(self) -> float | None:
-        """Robot time of the newest."""
+        """Return the robot time of the newest sample, if there is one."""
         with self._lock:
-            return self._kept[-1][0] if self._kept else None
+            return self._samples[-1].time_s if self._samples else None
 
     def units(self) -> dict[str, str]:
-        """Of every signal there is, by name."""
         with self._lock:
             return dict(self._units)
 
     def series(self, name: str) -> tuple[Floats, Floats]:
-        """Robot times and values of one. Raises KeyError."""
         with self._lock:
             if name not in self._units:
                 raise KeyError(name)
-            kept = list(self._kept)
-        values = [row[names.index(name)] if name in names else np.nan for _, names, row in kept]
-        return np.array([time_s for time_s, _, _ in kept]), np.array(values)
+            samples = list(self._samples)
+        values: list[float] = []
+        for sample in samples:
+            is_known = name in sample.names
+            values.append(sample.values[sample.names.index(name)] if is_known else np.nan)
+        return np.array([sample.time_s for sample in samples]), np.array(values)
 
 
-def numbers(message: Message, robot: Description) -> dict[str, float]:
-    """Of a message, by signal."""
-    found: dict[str, float] = {}
+def list_message_numbers(message: Message, robot: Description) -> dict[str, float]:
+    """Return the numbers of a message that have a unit, by signal."""
+    numbers: dict[str, float] = {}
     prefix = type(message).__name__.removesuffix("State").lower()
-    for field in units(type(message)):
-        _spread(f"{prefix}.{field}", getattr(message, field), robot, found)
-    return found
+    for field_name in find_units(type(message)):
+        _flatten(f"{prefix}.{field_name}", getattr(message, field_name), robot, numbers)
+    return numbers
 
 
 @cache
-def units(kind: type[Message]) -> dict[str, str]:
-    """Of each field that holds numbers with a unit."""
-    fields = msgspec.json.schema(kind)["$defs"][kind.__name__]["properties"]
-    found = {name: _unit(about) for name, about in fields.items() if name != "timestamp_ns"}
-    return {name: unit for name, unit in found.items() if unit is not None}
+def find_units(message_type: type[Message]) -> dict[str, str]:
+    """Return the unit of each field of a message that holds numbers with a unit, by the field's name."""
+    properties = msgspec.json.schema(message_type)["$defs"][message_type.__name__]["properties"]
+    units: dict[str, str] = {}
+    for field_name, schema in properties.items():
+        unit = _find_unit(schema)
+        if unit is not None and field_name != "timestamp_ns":
+            units[field_name] = unit
+    return units
 
 
-def _unit(about: Any) -> str | None:
-    if isinstance(about, dict):
-        return about["unit"] if "unit" in about else _unit(list(about.values()))
-    if isinstance(about, list):
-        return next((unit for one in about if (unit := _unit(one)) is not None), None)
+def _find_unit(schema: Any) -> str | None:
+    """Return the first unit in a JSON schema, which may be nested."""
+    if isinstance(schema, dict):
+        if "unit" in schema:
+            return schema["unit"]
+        return _find_first_unit(schema.values())
+    if isinstance(schema, list):
+        return _find_first_unit(schema)
     return None
 
 
-def _spread(name: str, value: Any, robot: Description, found: dict[str, float]) -> None:
-    if isinstance(value, list | tuple):
-        of_joints = isinstance(value, list) and len(value) == len(robot.joints)
-        parts = [joint.name for joint in robot.joints] if of_joints else range(len(value))
-        for part, one in zip("xyz" if isinstance(value, tuple) and len(value) == 3 else parts, value, strict=True):
-            _spread(f"{name}.{part}", one, robot, found)
-    else:
-        found[name] = np.nan if value is None else float(value)
+def _find_first_unit(schemas: Iterable[Any]) -> str | None:
+    for schema in schemas:
+        unit = _find_unit(schema)
+        if unit is not None:
+            return unit
+    return None
 
 
-def _live(snapshot: RobotSnapshot) -> tuple[dict[str, float], dict[str, str]]:
-    """Values and units, by signal, under the names of a recording's."""
-    robot, found, of_units = snapshot.robot, dict[str, float](), dict[str, str]()
-    for message in (snapshot.joints, snapshot.applied):
-        for name in () if message is None else OF_JOINTS[type(message)]:
-            unit = {**OTHERS, **units(type(message))}[name]
-            for joint, value in zip(robot.joints, getattr(message, name), strict=False):
-                found[f"{name}.{joint.name}"], of_units[f"{name}.{joint.name}"] = float(value), unit
+def _flatten(name: str, value: Any, robot: Description, numbers: dict[str, float]) -> None:
+    """Add each number of a field to `numbers`, under the field's name and the name of each part."""
+    if not isinstance(value, list | tuple):
+        numbers[name] = np.nan if value is None else float(value)
+        return
+    for part, element in zip(_name_parts(value, robot), value, strict=True):
+        _flatten(f"{name}.{part}", element, robot, numbers)
+
+
+def _name_parts(values: list[Any] | tuple[Any, ...], robot: Description) -> Iterable[object]:
+    """Return the names of a field's parts: axes of a vector, joints of a list with one value for each, else indices."""
+    if isinstance(values, tuple) and len(values) == 3:
+        return "xyz"
+    if isinstance(values, list) and len(values) == len(robot.joints):
+        return [joint.name for joint in robot.joints]
+    return range(len(values))
+
+
+@dataclass
+class Numbers:
+    """Values and units, by signal."""
+
+    values: dict[str, float] = field(default_factory=dict[str, float])
+    units: dict[str, str] = field(default_factory=dict[str, str])
+
+    def add(self, name: str, value: float, unit: str) -> None:
+        """Add a signal."""
+        self.values[name] = value
+        self.units[name] = unit
+
+    def add_axes(self, name: str, axes: str, values: Iterable[float]) -> None:
+        """Add a signal for each axis of a vector. name: a key of OTHER_UNITS."""
+        for axis, value in zip(axes, values, strict=True):
+            self.add(f"{name}.{axis}", value, OTHER_UNITS[name])
+
+
+def collect_numbers(snapshot: RobotSnapshot) -> Numbers:
+    """Return all numbers of a snapshot, under the names that they have in a recording."""
+    numbers = Numbers()
+    _add_joint_numbers(numbers, snapshot)
     if snapshot.base is not None:
-        found |= {f"position_w_m.{axis}": value for axis, value in zip("xyz", snapshot.base[0], strict=True)}
-        found |= {f"orientation_wxyz.{axis}": value for axis, value in zip("wxyz", snapshot.base[1], strict=True)}
+        position_w, orientation_wxyz = snapshot.base
+        numbers.add_axes("position_w_m", "xyz", position_w)
+        numbers.add_axes("orientation_wxyz", "wxyz", orientation_wxyz)
     if snapshot.contacts is not None:
         peak_n, count = touching(snapshot.contacts)
-        found |= {"contact_peak_n": peak_n, "contact_count": float(count)}
-    of_units |= {name: OTHERS[name.partition(".")[0]] for name in found if name not in of_units}
+        numbers.add("contact_peak_n", peak_n, OTHER_UNITS["contact_peak_n"])
+        numbers.add("contact_count", float(count), OTHER_UNITS["contact_count"])
     for message in (snapshot.control, snapshot.power, snapshot.imu):
         if message is not None:
-            more = numbers(message, robot)
-            found |= more
-            of_units |= {name: units(type(message))[name.split(".")[1]] for name in more}
-    for key, kind in own_kinds(robot).items():
-        if (sample := snapshot.own.get(key)) is not None:
-            for name, value in kind.numbers(sample).items():
-                field, dot, part = name.partition(".")
-                full = f"{field}.{key.rpartition('/')[2]}{dot}{part}"
-                found[full], of_units[full] = value, kind.units[field]
-    return found, of_units
+            message_numbers = list_message_numbers(message, snapshot.robot)
+            units = find_units(type(message))
+            for name, value in message_numbers.items():
+                numbers.add(name, value, units[field_of_signal(name)])
+    _add_sensor_numbers(numbers, snapshot)
+    return numbers
+
+
+def field_of_signal(name: str) -> str:
+    """Return the field of a signal whose name begins with that of a message."""
+    return name.split(".")[1]
+
+
+def _add_joint_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
+    for message in (snapshot.joints, snapshot.applied):
+        if message is None:
+            continue
+        units: Mapping[str, str] = {**OTHER_UNITS, **find_units(type(message))}
+        for field_name in JOINT_FIELDS[type(message)]:
+            values = getattr(message, field_name)
+            for joint, value in zip(snapshot.robot.joints, values, strict=False):
+                numbers.add(f"{field_name}.{joint.name}", float(value), units[field_name])
+
+
+def _add_sensor_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
+    """Add the numbers of custom sensors: field, sensor, and part of a list."""
+    for key, kind in own_kinds(snapshot.robot).items():
+        sample = snapshot.own.get(key)
+        if sample is None:
+            continue
+        sensor = key.rpartition("/")[2]
+        for name, value in kind.numbers(sample).items():
+            field_name, dot, part = name.partition(".")
+            numbers.add(f"{field_name}.{sensor}{dot}{part}", value, kind.units[field_name])

@@ -1,4 +1,4 @@
-"""What the console shows of one instant of a robot, live or recorded."""
+"""One instant of a robot, live or recorded, with everything that the console shows of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -28,42 +28,50 @@ from snakesim_hal.wire.quantities import Quaternion, Vector
 
 @dataclass(frozen=True)
 class Stream:
-    """One key: how many messages a second arrive, and how old its data is in robot time (None: it has no stamp)."""
+    """Rate and age of the messages of one key."""
 
     rate_hz: float
-    age_s: float | None
+    age_s: float | None  # of the newest message, in robot time; None: the message has no timestamp
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSnapshot:
-    """One instant. Whatever is None is not known."""
+    """One instant of a robot. None means that a value is not known."""
 
     robot: Description
-    expected: bool = False  # not a robot's: its run is starting
+
+    # Host.
+    expected: bool = False  # True: the run is starting, and no host has described the robot yet
     time_s: float | None = None  # robot time
-    silent_s: float = 0.0  # since the host was heard
+    silent_s: float = 0.0  # since the newest status of the host arrived
     status: Status | None = None
+    configuration: Configuration | None = None
+    hosts: frozenset[str] = frozenset()  # ids of all hosts that publish a status; more than one: an impostor
+
+    # Robot.
     joints: JointState | None = None  # the newest
     body: JointState | None = None  # of the instant of `base`
     base: tuple[Vector, Quaternion] | None = None  # position_w and orientation wxyz of the tail end
-    world: World | None = None
     contacts: Contacts | None = None
-    trajectory: Trajectory | None = None
-    control: ControlState | None = None
     applied: AppliedCommand | None = None
-    settings: ControlSettings | None = None
-    configuration: Configuration | None = None
     power: Power | None = None
     imu: Imu | None = None
     images: dict[str, DepthImage | ColorImage] = field(default_factory=dict)  # by key
-    own: dict[str, OwnSample] = field(default_factory=dict[str, OwnSample])  # of own sensors, by key
+    own: dict[str, OwnSample] = field(default_factory=dict[str, OwnSample])  # of custom sensors, by key
+
+    # Controller.
+    world: World | None = None
+    trajectory: Trajectory | None = None
+    control: ControlState | None = None
+    settings: ControlSettings | None = None
+
+    # Network and log.
     streams: dict[str, Stream] = field(default_factory=dict)  # by key
-    log: Sequence[str] = ()  # of a recording: what had become of the robot by then, newest first
-    hosts: frozenset[str] = frozenset()  # ids of all that publish a status; more than one: an impostor
+    log: Sequence[str] = ()  # of a recording: changes of the robot's state until then, newest first
 
 
 def expected_snapshot(config: RunConfig) -> RobotSnapshot:
-    """The robot of a run that is starting, as its scenario places it on flat ground."""
+    """Return the robot of a run that is starting, as its scenario places it on flat ground."""
     robot = describe(
         config.robot,
         backend=config.backend,
@@ -72,15 +80,16 @@ def expected_snapshot(config: RunConfig) -> RobotSnapshot:
         config_hash=config_hash(config),
     )
     start = start_of(config)
-    zero = [0.0] * len(robot.joints)
+    zeros = [0.0] * len(robot.joints)
     joints = JointState(
         tick=0,
         timestamp_ns=0,
         angle_rad=start.angles_rad.tolist(),
-        velocity_rad_s=zero,
-        torque_nm=zero,
-        valid=[True] * len(zero),
-        age_ns=[0] * len(zero),
+        velocity_rad_s=zeros,
+        torque_nm=zeros,
+        valid=[True] * len(robot.joints),
+        age_ns=[0] * len(robot.joints),
     )
-    base = (*start.position_w, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad)
+    position_w = (*start.position_w, config.robot.module.radius_m)
+    base = position_w, quaternion_from_yaw(start.yaw_rad)
     return RobotSnapshot(robot=robot, expected=True, joints=joints, body=joints, base=base)

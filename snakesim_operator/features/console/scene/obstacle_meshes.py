@@ -10,7 +10,14 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.features.console.scene.batches import add_batch, to_float32
 from snakesim_operator.features.console.scene.drawing import Drawing
-from snakesim_operator.features.console.scene.meshes import Mesh, box, circle, cylinder, hoops, sphere
+from snakesim_operator.features.console.scene.meshes import (
+    Mesh,
+    make_box,
+    make_circle,
+    make_cylinder,
+    make_hoops,
+    make_sphere,
+)
 from snakesim_operator.features.console.scene.scene_colors import (
     OBSTACLE,
     OBSTACLE_AHEAD,
@@ -21,12 +28,12 @@ from snakesim_operator.features.console.scene.scene_colors import (
 )
 
 SQUARE = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-TRUE_SHAPES: dict[str, Mesh] = {"cylinder": cylinder(1.0, 1.0), "box": box(1.0), "sphere": sphere(1.0)}
+TRUE_SHAPES: dict[str, Mesh] = {"cylinder": make_cylinder(1.0, 1.0), "box": make_box(1.0), "sphere": make_sphere(1.0)}
 # Perceived obstacles are hoops about the believed place, so that the true obstacle stays visible within them.
 PERCEIVED_SHAPES: dict[str, Mesh] = {
-    "cylinder": hoops(circle(), 0.5, 0.13),
-    "box": hoops(SQUARE, 1.0, 0.26),
-    "sphere": hoops(circle(), 0.13, 0.26),
+    "cylinder": make_hoops(make_circle(), 0.5, 0.13),
+    "box": make_hoops(SQUARE, 1.0, 0.26),
+    "sphere": make_hoops(make_circle(), 0.13, 0.26),
 }
 TRUE_OPACITY = 0.5  # no obstacle may hide the snake or a force
 PERCEIVED_SCALE = 1.05  # hoops are a little larger than the obstacle within them

@@ -16,7 +16,7 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.features.console.scene import scene_colors
 from snakesim_operator.features.console.scene.batches import add_batch, to_float32
 from snakesim_operator.features.console.scene.drawing import CameraFrustum, Drawing, Surroundings
-from snakesim_operator.features.console.scene.meshes import capsule, cylinder
+from snakesim_operator.features.console.scene.meshes import make_capsule, make_cylinder
 from snakesim_operator.features.console.scene.obstacle_meshes import PerceivedObstacles, TrueObstacles
 from snakesim_operator.features.console.scene.scene_colors import Color, linear_colors
 
@@ -44,7 +44,7 @@ class RobotScene:
 
         # Nodes that exist from the start.
         self._links = self._add_links()
-        hinge = cylinder(0.5 * self._body_radius_m, 2.12 * self._body_radius_m)
+        hinge = make_cylinder(0.5 * self._body_radius_m, 2.12 * self._body_radius_m)
         self._hinges = add_batch(scene, "snake/hinges", hinge, len(robot.joints), scene_colors.HINGE)
         self._contacts = self._add_contact_points()
         self._trail_line = scene.add_line_segments(
@@ -89,7 +89,7 @@ class RobotScene:
         batches: list[tuple[viser.BatchedMeshHandle, list[int]]] = []
         for (length_m, radius_m), indices in links_by_size.items():
             name = f"snake/links_{len(batches)}"
-            batch = add_batch(self._scene, name, capsule(length_m, radius_m), len(indices), scene_colors.LINK)
+            batch = add_batch(self._scene, name, make_capsule(length_m, radius_m), len(indices), scene_colors.LINK)
             batch.batched_scales = to_float32([_link_scale(i) for i in indices])
             batch.batched_colors = linear_colors([self._link_color(i) for i in indices])
             batches.append((batch, indices))

@@ -1,12 +1,12 @@
-"""What a browser may say to the console; everything else is dropped before viser sees it.
+"""Decides which messages of a browser viser gets to read; all others are dropped.
 
-viser believes its pages: a message may set any attribute of a control that all viewers share. So a message has to be of
-a known type with known fields, for a control that was admitted for this viewer, and has to carry the one value that the
-control is there for. Whatever a later viser adds is refused until it is written down here. What is passed on is encoded
-anew from what was checked.
+viser trusts its pages: a message may set any attribute of a control that all viewers share. Therefore a message has to
+be of a known type with known fields. It has to be for a control that was admitted for this viewer, and has to carry the
+one value that the control is there for. A message type that a later version of viser adds is refused until it is listed
+here. viser gets a new encoding of the checked fields, never the browser's own bytes.
 
-What stops a robot, and what moves it while it is held, is acted on here and never reaches viser, whose queues and
-threads would add a delay that nobody knows. What a page says in order to move a robot is checked for its age as well.
+Messages that stop the robot, and messages that move it while a button is held, are handled here and never reach viser:
+its queues and threads would add an unknown delay. Messages that move a robot are also checked for their age.
 """
 
 import math
@@ -26,13 +26,14 @@ from snakesim_operator.features.console.web.message_age import MessageAge, PageA
 
 Identifier = Annotated[str, Meta(max_length=64)]
 Text = Annotated[str, Meta(max_length=500)]
-Number = Annotated[float, Meta(ge=-1e9, le=1e9)]  # which refuses NaN as well
+Number = Annotated[float, Meta(ge=-1e9, le=1e9)]  # these bounds refuse NaN as well
 Pixels = Annotated[float, Meta(ge=0, le=100_000)]
 Vector = tuple[Number, Number, Number]
 HandleT = TypeVar("HandleT")
-LONGEST_SHOWN = 200
+
+MAX_REPORTED_CHARACTERS = 200  # of a dropped message, so that a browser cannot fill the log
 MAX_PRESS_AGE_S = 5.0  # of a press that may move the robot: an older one was meant for another moment
-MAX_HOLD_AGE_S = 0.5  # of a sign that something is held
+MAX_HOLD_AGE_S = 0.5  # of a message that a button or key is held: the finger may be up by now
 
 
 class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
@@ -40,7 +41,7 @@ class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, ta
 
 
 class ViewerCamera(_Message, frozen=True, tag="ViewerCameraMessage"):
-    """Where the viewer looks from."""
+    """The position and direction from which a viewer looks at the scene."""
 
     wxyz: tuple[Number, Number, Number, Number]
     position: Vector
@@ -54,7 +55,7 @@ class ViewerCamera(_Message, frozen=True, tag="ViewerCameraMessage"):
 
 
 class Value(Struct, frozen=True, forbid_unknown_fields=True):
-    """Of a control."""
+    """The one attribute of a control that a browser may set."""
 
     value: bool | int | Number | Text
 
@@ -79,57 +80,59 @@ class Trigger(_Message, frozen=True, tag="CommandTriggerMessage"):
     uuid: Identifier
 
 
-class Shown(_Message, frozen=True, tag="LocalStorageGetItemResponseMessage"):
-    """The answer that `pacing` asks for."""
+class QuestionAnswer(_Message, frozen=True, tag="LocalStorageGetItemResponseMessage"):
+    """A page's answer to a question of `pacing`."""
 
     request_uuid: Identifier
     value: Text | None
     error: Text | None
 
 
-Said = Update | Hold | Trigger
-Act = Callable[[int, PageAction], None]  # of which viewer, and when
+ControlMessage = Update | Hold | Trigger
+Handler = Callable[[int, PageAction], None]  # called with the viewer and the time of the action
 
 
 @dataclass(frozen=True)
-class _Control:
+class _AdmittedControl:
+    """A control, and the rules for the messages that may change it."""
+
     name: str
-    viewer: int | None  # None: every viewer has it
-    may: Callable[[], bool]
-    takes: Callable[[Said], bool]
-    act: Act | None
+    viewer: int | None  # the only viewer that has it; None: every viewer has it
+    is_allowed: Callable[[], bool]
+    accepts: Callable[[ControlMessage], bool]
+    handler: Handler | None
     max_age_s: float
     at_any_age: frozenset[str]
     on_late: Callable[[float], None]
 
-    def is_late(self, said: Said, action: PageAction) -> bool:
-        """Whether a message is too old to be acted on."""
-        if isinstance(said, Update) and said.updates.value in self.at_any_age:
+    def is_late(self, message: ControlMessage, action: PageAction) -> bool:
+        """Return whether a message is too old to be handled."""
+        if isinstance(message, Update) and message.updates.value in self.at_any_age:
             return False
         return action.age_s > self.max_age_s
 
 
 class Admission:
-    """The controls that viewers may use, each with its value. From any thread."""
+    """Holds the controls that viewers may use, and checks each message of a browser. Thread-safe."""
 
     def __init__(self, report: Callable[[str], None] = lambda _: None) -> None:
-        """report: told once of each kind of refusal."""
+        """Admit no control yet. report: called with a text for the first message dropped of each kind."""
         self.report = report
         self.dropped: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._controls: dict[str, _Control] = {}
-        self._decoder: msgspec.msgpack.Decoder[ViewerCamera | Said | Shown] = msgspec.msgpack.Decoder(
-            ViewerCamera | Said | Shown
+        self._controls: dict[str, _AdmittedControl] = {}
+        self._decoder: msgspec.msgpack.Decoder[ViewerCamera | ControlMessage | QuestionAnswer] = (
+            msgspec.msgpack.Decoder(ViewerCamera | ControlMessage | QuestionAnswer)
         )
 
     def admit(
         self,
         handle: HandleT,
         viewer: int | None = None,
-        may: Callable[[], bool] = lambda: True,
+        is_allowed: Callable[[], bool] = lambda: True,
         hold_hz: float = 0.0,
         *,
-        act: Act | None = None,
+        handler: Handler | None = None,
         max_age_s: float = math.inf,
         at_any_age: Collection[str] = (),
         on_late: Callable[[float], None] = lambda _age_s: None,
@@ -138,27 +141,32 @@ class Admission:
 
         Args:
             handle: The control.
-            viewer: Who alone has it; None: every viewer.
-            may: Whether it may be used now.
+            viewer: The only viewer that may use it; None: every viewer.
+            is_allowed: Returns whether the control may be used now.
             hold_hz: How often its page repeats that it is held, for a button.
-            act: Called for each message that is admitted, in the thread that receives: it must not wait. None: viser
-                gets the message.
+            handler: Called for each message that is admitted, in the thread that receives: it must not wait. None:
+                viser gets the message.
             max_age_s: An older message is dropped.
             at_any_age: Values of the control that are never too old, because they stop something.
-            on_late: Called with the age of a message that is dropped for it.
+            on_late: Called with the age of a message that is dropped because of its age.
 
         Returns:
             The control.
+
+        Raises:
+            TypeError: It is not known which values this kind of control takes.
         """
         control: Any = handle
-        named = isinstance(control, viser.GuiButtonHandle | viser.CommandHandle)
-        name = control.label if named else type(handle).__name__
-        admitted = _Control(
-            name=str(name),
+        if isinstance(control, viser.GuiButtonHandle | viser.CommandHandle):
+            name = str(control.label)
+        else:
+            name = type(handle).__name__
+        admitted = _AdmittedControl(
+            name=name,
             viewer=viewer,
-            may=may,
-            takes=_takes(control, hold_hz),
-            act=act,
+            is_allowed=is_allowed,
+            accepts=_make_value_check(control, hold_hz),
+            handler=handler,
             max_age_s=max_age_s,
             at_any_age=frozenset(at_any_age),
             on_late=on_late,
@@ -168,90 +176,124 @@ class Admission:
         return handle
 
     def forget(self, handle: Any) -> None:
-        """A control is no longer there."""
+        """Refuse messages for a control from now on, because it is removed from the page."""
         with self._lock:
             self._controls.pop(handle._impl.uuid, None)
 
     def forget_viewer(self, viewer: int) -> None:
-        """A viewer's page is gone."""
+        """Forget all controls of a viewer whose page is closed."""
         with self._lock:
-            self._controls = {key: one for key, one in self._controls.items() if one.viewer != viewer}
+            self._controls = {uuid: control for uuid, control in self._controls.items() if control.viewer != viewer}
 
-    def checked(self, viewer: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
-        """What viser may read of a message; None: nothing. age: the questions to the page that it comes from."""
+    def check_message(self, viewer: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
+        """Check a message of a browser, and handle it if its control has a handler.
+
+        Args:
+            viewer: The viewer that sent it; None while viser has not numbered the viewer.
+            data: The message as it was received.
+            age: The questions to the page that sent it.
+
+        Returns:
+            The message that viser may read, encoded anew; None if viser gets nothing.
+        """
         if viewer is None or isinstance(data, str):
-            return self.drop(viewer, "no message", "a text, or of no viewer")
+            self.drop(viewer, "no message", "a text, or of no viewer")
+            return None
         try:
             message = self._decoder.decode(data)
-        except (msgspec.DecodeError, RecursionError) as error:  # a ValidationError too
-            return self.drop(viewer, "unknown", str(error))
-        if isinstance(message, Update | Hold | Trigger):
-            with self._lock:
-                control = self._controls.get(message.uuid)
-            if control is None or control.viewer not in (None, viewer):
-                return self.drop(viewer, "no control of this viewer", type(message).__name__)
-            if not control.may():
-                return self.drop(viewer, "without control of the robot", control.name)
-            if not control.takes(message):
-                return self.drop(viewer, "not what the control is for", f"{control.name}: {message}")
-            action = age.action(time.monotonic())
+        except (msgspec.DecodeError, RecursionError) as error:  # a ValidationError is a DecodeError
+            self.drop(viewer, "unknown", str(error))
+            return None
+        if isinstance(message, QuestionAnswer):
+            age.note_answer(message.request_uuid)
+        elif isinstance(message, Update | Hold | Trigger):
+            control = self._find_control(viewer, message)
+            if control is None:
+                return None
+            action = age.date_action(time.monotonic())
             if control.is_late(message, action):
                 control.on_late(action.age_s)
-                return self.drop(viewer, "too old", f"{control.name}: {in_words(action.age_s)}")
-            if control.act is not None:
-                control.act(viewer, action)
+                self.drop(viewer, "too old", f"{control.name}: {format_age(action.age_s)}")
                 return None
-        elif isinstance(message, Shown):
-            age.answer(message.request_uuid)
+            if control.handler is not None:
+                control.handler(viewer, action)
+                return None
         return msgspec.msgpack.encode(message)
 
-    def drop(self, viewer: int | None, kind: str, what: str) -> None:
-        """Count a message that is not passed on, and report the first of its kind."""
+    def _find_control(self, viewer: int, message: ControlMessage) -> _AdmittedControl | None:
+        """Return the control that a viewer may change now with this message; None if the message was dropped."""
+        with self._lock:
+            control = self._controls.get(message.uuid)
+        if control is None or control.viewer not in (None, viewer):
+            self.drop(viewer, "no control of this viewer", type(message).__name__)
+            return None
+        if not control.is_allowed():
+            self.drop(viewer, "without control of the robot", control.name)
+            return None
+        if not control.accepts(message):
+            self.drop(viewer, "not what the control is for", f"{control.name}: {message}")
+            return None
+        return control
+
+    def drop(self, viewer: int | None, kind: str, detail: str) -> None:
+        """Count a message or connection that is not passed on, and report the first of its kind."""
         with self._lock:
             self.dropped[kind] += 1
-            first = self.dropped[kind] == 1
-        if first:
-            who = "a page" if viewer is None else f"viewer {viewer + 1}"
-            self.report(f"dropped a message of {who}: {kind}: {printable(what)[:LONGEST_SHOWN]}; more are only counted")
+            is_first = self.dropped[kind] == 1
+        if is_first:
+            sender = "a page" if viewer is None else f"viewer {viewer + 1}"
+            shown = printable(detail)[:MAX_REPORTED_CHARACTERS]
+            self.report(f"dropped a message of {sender}: {kind}: {shown}; more are only counted")
 
 
-def in_words(age_s: float) -> str:
-    """Return the age of a message in words."""
+def format_age(age_s: float) -> str:
+    """Return the age of a message as a phrase for the viewer."""
     if math.isinf(age_s):
         return "its age is not known: the page has not answered yet"
     return f"it came {age_s:.1f} s late"
 
 
-def _takes(handle: Any, hold_hz: float) -> Callable[[Said], bool]:
-    """Whether a message is what a control is for. Raises TypeError for a kind of control that is not known here."""
+def _make_value_check(handle: Any, hold_hz: float) -> Callable[[ControlMessage], bool]:
+    """Return a function that reports whether a message is what this control is for.
+
+    Raises:
+        TypeError: It is not known which values this kind of control takes.
+    """
     match handle:
         case viser.CommandHandle():
-            return lambda said: isinstance(said, Trigger)
+            return lambda message: isinstance(message, Trigger)
         case viser.GuiButtonHandle():
-            return lambda said: (
-                said.updates.value is True
-                if isinstance(said, Update)
-                else isinstance(said, Hold) and hold_hz > 0 and said.frequency == hold_hz
-            )
+            return lambda message: _is_press_or_hold(message, hold_hz)
         case viser.GuiCheckboxHandle():
-            return _value(lambda value: isinstance(value, bool))
+            return _check_value(lambda value: isinstance(value, bool))
         case viser.GuiTextHandle():
-            return _value(lambda value: isinstance(value, str))
+            return _check_value(lambda value: isinstance(value, str))
         case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
             options = frozenset(handle.options)
-            return _value(lambda value: isinstance(value, str) and value in options)
+            return _check_value(lambda value: isinstance(value, str) and value in options)
         case viser.GuiSliderHandle() | viser.GuiNumberHandle():
-            whole, low, high = isinstance(handle.value, int), handle.min, handle.max
-            return _value(
-                lambda value: (
-                    isinstance(value, int if whole else int | float)
-                    and not isinstance(value, bool)
-                    and (low is None or value >= low)
-                    and (high is None or value <= high)
-                )
-            )
+            number_types = (int,) if isinstance(handle.value, int) else (int, float)
+            low = handle.min
+            high = handle.max
+            return _check_value(lambda value: _is_number_within(value, number_types, low, high))
     raise TypeError(f"{type(handle).__name__}: which values viewers may give it is not known")
 
 
-def _value(right: Callable[[Any], bool]) -> Callable[[Said], bool]:
-    return lambda said: isinstance(said, Update) and right(said.updates.value)
+def _check_value(is_valid: Callable[[Any], bool]) -> Callable[[ControlMessage], bool]:
+    """Return a function that accepts updates whose value is valid, and no other messages."""
+    return lambda message: isinstance(message, Update) and is_valid(message.updates.value)
+
+
+def _is_press_or_hold(message: ControlMessage, hold_hz: float) -> bool:
+    """Return whether a button was pressed, or is held and repeats that at `hold_hz` (0: it cannot be held)."""
+    if isinstance(message, Update):
+        return message.updates.value is True
+    return isinstance(message, Hold) and hold_hz > 0 and message.frequency == hold_hz
+
+
+def _is_number_within(value: Any, number_types: tuple[type, ...], low: float | None, high: float | None) -> bool:
+    if isinstance(value, bool) or not isinstance(value, number_types):
+        return False
+    is_above_low = low is None or value >= low
+    is_below_high = high is None or value <= high
+    return is_above_low and is_below_high

@@ -1,10 +1,13 @@
-"""How old a message of a page is, at most. Pure, but for a lock.
+"""The maximum age of a page's message.
 
-A network that stalls keeps what a page has sent, and delivers it all at once when it recovers: also that a button was
-held, long after the finger was lifted. A page's own clock would have to be compared with ours over the same network.
-So the console asks the page numbered questions, several a second, and the page answers each on the connection on which
-everything else comes, in order. A message that follows an answer was sent after the page had got that question. It is
-no older than the question, by the console's clock alone, and whichever direction of the network stalls.
+A network that stalls keeps what a page has sent, and delivers it all at once when it recovers. This includes messages
+that a button is held, long after the finger was lifted. The page's clock cannot date them, because it would have to be
+compared with the console's clock over the same network.
+
+So the console asks the page numbered questions, several a second. The page answers each one on the connection that
+carries all its other messages, in order. A message that follows an answer was sent after the page had received that
+question. It is therefore no older than the question. This needs only the console's clock, and holds whichever direction
+of the network stalls.
 """
 
 import math
@@ -16,9 +19,9 @@ MAX_UNANSWERED = 20  # questions; a page that hangs gets no more until it answer
 
 @dataclass(frozen=True)
 class PageAction:
-    """What is known of the time at which an operator acted on a page."""
+    """The time at which an operator acted on a page, as far as it is known."""
 
-    age_s: float  # at most so long ago; infinite when the page has not answered yet
+    age_s: float  # the operator acted at most this long ago; infinite: the page has not answered yet
     robot_ns: int | None = None  # the robot's time then, at the earliest; None: not known
 
 
@@ -28,38 +31,49 @@ class _Question:
     robot_ns: int | None
 
 
-NEVER = _Question(-math.inf, None)
+NO_QUESTION = _Question(-math.inf, None)  # before the page has answered any
 
 
 class MessageAge:
-    """The questions to one page, and the newest one that it has answered."""
+    """The questions to one page, and the newest one that the page has answered.
+
+    Other threads ask; the thread that receives the page's messages notes the answers.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._unanswered: dict[str, _Question] = {}
-        self._answered = NEVER
+        self._answered = NO_QUESTION
 
     def may_ask(self) -> bool:
-        """Whether there is room for another question."""
+        """Return whether there is room for another question."""
         return len(self._unanswered) < MAX_UNANSWERED
 
-    def ask(self, question: str, now_s: float, robot_ns: int | None) -> None:
-        """Note a question before it is sent. robot_ns: the robot's time now, if it is known."""
+    def note_question(self, question: str, now_s: float, robot_ns: int | None) -> None:
+        """Note a question; called before it is sent.
+
+        Args:
+            question: A name that no other question has, and that the page cannot guess.
+            now_s: The console's time.
+            robot_ns: The robot's time, if it is known.
+        """
         with self._lock:
             self._unanswered[question] = _Question(now_s, robot_ns)
 
-    def answer(self, question: str) -> None:
-        """Note an answer; one to a question that was not asked counts for nothing."""
+    def note_answer(self, question: str) -> None:
+        """Note an answer. An answer to a question that was not asked is ignored."""
         with self._lock:
             answered = self._unanswered.pop(question, None)
             if answered is None:
                 return
-            for earlier in [key for key, one in self._unanswered.items() if one.asked_s < answered.asked_s]:
-                del self._unanswered[earlier]
+            # Answers come in order, so those to earlier questions are not expected any more.
+            earlier = [name for name, other in self._unanswered.items() if other.asked_s < answered.asked_s]
+            for name in earlier:
+                del self._unanswered[name]
             if answered.asked_s > self._answered.asked_s:
                 self._answered = answered
 
-    def action(self, now_s: float) -> PageAction:
-        """Return what is known of a message that comes now."""
+    def date_action(self, now_s: float) -> PageAction:
+        """Return the time of the action that a message reports which arrives now."""
         answered = self._answered
         return PageAction(now_s - answered.asked_s, answered.robot_ns)

@@ -1,6 +1,7 @@
-"""The web server of the console: viser, on loopback only, closed to other pages, and behind our checks.
+"""The web server of the console: viser on loopback only, closed to other pages, and behind the console's checks.
 
-`front` accepts, and has the second stop; `admission` decides what viser gets to read.
+`connection_acceptor` accepts the connections, and has the second stop. `admission` decides which messages viser gets to
+read.
 """
 
 import contextlib
@@ -10,8 +11,9 @@ import logging
 import socket
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -26,30 +28,36 @@ from snakesim_operator.base.console_port import LOOPBACK, address_of
 from snakesim_operator.base.page_origin import why_refused
 from snakesim_operator.features.console.web.admission import Admission
 from snakesim_operator.features.console.web.browser_connection import MAX_MESSAGE_BYTES, BrowserConnection
-from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, HandoffListener, StopPath
+from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, StopPath
+from snakesim_operator.features.console.web.handoff_listener import HandoffListener
 from snakesim_operator.features.console.web.pacing import ask_page, pace_pages
 
-MOST_VIEWERS = 64
-PAGES = ("/", "/index.html")
+MAX_VIEWERS = 64
+CONSOLE_PATHS = ("/", "/index.html")
+TRY_AGAIN_LATER = 1013  # code with which a websocket is closed
+
+# A cookie, which the browser sends as it connects: viser's page has no message for this.
+DARK_COOKIE = "snakesim-dark=true"
+
+# What is added to viser's page.
 SECOND_STOP = Path(__file__).with_name("second_stop.html").read_bytes()
-DARK = "snakesim-dark=true"  # a cookie, which the browser sends as it connects: viser's page has no message for this
-PREFERENCE = (
+DARK_COOKIE_SCRIPT = (
     b'<script>document.cookie = "snakesim-dark=" + matchMedia("(prefers-color-scheme: dark)").matches'
     b' + "; path=/; SameSite=Strict"</script>'
 )
-STATE_IN_SIGHT = (  # of `page_html.header`: what is below is scrolled behind it
+STICKY_HEADER_STYLE = (  # of `page_html.format_header`: what is below is scrolled behind it
     b"<style>div:has(> [data-robot]) {position: sticky; top: 0; z-index: 5; background: var(--mantine-color-body);"
     b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important; min-width: 0}"
     b' @media (max-width: 480px) {div[style*="width: 20em"] {width: 100% !important}}</style>'  # a phone's panel
 )
-TABS_IN_ONE_LINE = (  # on a phone they wrap; viser's tabs have no class, but a style of their own
+TABS_IN_ONE_LINE_STYLE = (  # on a phone they wrap; viser's tabs have no class, but a style of their own
     b"<style>@media (min-width: 481px) {"
     b'div[style*="background-size: 100% 2.4em"] {flex-wrap: nowrap !important; overflow-x: auto !important}'
     b' div[style*="padding: 0px 0.9em"][style*="max-width: 14em"] {padding: 0 0.3em !important; flex-shrink: 0}'
     b"}</style>"
 )
-# A button that was held is let go when its page loses the keyboard, or is hidden: the finger may come up elsewhere.
-HOLD_ENDS = b"""<script>(() => {
+# Releases a held button when its page loses the keyboard, or is hidden: the finger may come up elsewhere.
+RELEASE_HELD_BUTTON_SCRIPT = b"""<script>(() => {
   let held = null;
   addEventListener("pointerdown", event => { held = event.target; }, true);
   const end = () => { held?.dispatchEvent(new PointerEvent("pointercancel", {bubbles: true})); held = null; };
@@ -57,56 +65,65 @@ HOLD_ENDS = b"""<script>(() => {
   addEventListener("pagehide", end);
   document.addEventListener("visibilitychange", () => { if (document.hidden) end(); });
 })()</script>"""
-Answer = Callable[[ServerConnection, Request], Response | None]
-More = Callable[[Request], Response | None]
-_connecting: ContextVar[BrowserConnection] = ContextVar("connecting")
+
+ProcessRequest = Callable[[ServerConnection, Request], Response | None]
+AnswerRequest = Callable[[Request], Response | None]
+
+_connecting: ContextVar[BrowserConnection] = ContextVar("connecting")  # the browser that viser is numbering
 
 
 class PageServer(viser.ViserServer):
-    """Without viser's tunnel to the public internet, which any viewer could open."""
+    """viser's server, without its tunnel to the public internet, which any viewer could open.
+
+    viser counts only pages that can draw the scene; this server knows all of them by their connections.
+    """
 
     admission: Admission
 
-    def __init__(self, *arguments: Any, **more: Any) -> None:
-        super().__init__(*arguments, **more)
-        self._browsers: WeakValueDictionary[int, BrowserConnection] = WeakValueDictionary()
-        self._websock_server.on_client_connect(self._number)
-        self._websock_server.on_client_disconnect(self._forget)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._browsers: WeakValueDictionary[int, BrowserConnection] = WeakValueDictionary()  # by viewer
+        self._websock_server.on_client_connect(self._on_viewer_numbered)
+        self._websock_server.on_client_disconnect(self._on_viewer_gone)
 
-    def _number(self, viewer: Any) -> None:
-        """viser has numbered a viewer: until then nothing that its browser says is passed on."""
+    def _on_viewer_numbered(self, client: Any) -> None:
+        """Note the number that viser gave a viewer. Until then nothing that its browser sends is passed on."""
         browser = _connecting.get()
-        browser.viewer = viewer.client_id
-        self._browsers[viewer.client_id] = browser
+        browser.viewer = client.client_id
+        self._browsers[client.client_id] = browser
 
-    def _forget(self, viewer: Any) -> None:
-        self._browsers.pop(viewer.client_id, None)
+    def _on_viewer_gone(self, client: Any) -> None:
+        self._browsers.pop(client.client_id, None)
 
     def prefers_dark(self, viewer: int) -> bool:
-        """Whether a viewer's browser or system is set to dark pages, as it said when it connected."""
+        """Return whether a viewer's browser was set to dark pages when it connected."""
         browser = self._browsers.get(viewer)
         if browser is None or browser.request is None:
             return False
-        return DARK in "; ".join(browser.request.headers.get_all("Cookie")).split("; ")
+        cookies = "; ".join(browser.request.headers.get_all("Cookie"))
+        return DARK_COOKIE in cookies.split("; ")
 
     def viewers(self) -> int:
         """Return how many pages are open, also of those that cannot draw the scene."""
         return len(self._browsers)
 
     def ask_for_age(self, viewer: int, robot_ns: int | None) -> None:
-        """Ask a viewer's page the next question by which the age of its messages is known.
+        """Send a viewer's page the next question by which the age of its messages is known.
 
-        robot_ns: the robot's time now, if it is known.
+        Args:
+            viewer: The viewer to ask.
+            robot_ns: The robot's time now, if it is known.
         """
-        browser, page = self._browsers.get(viewer), self.get_clients().get(viewer)
+        browser = self._browsers.get(viewer)
+        page = self.get_clients().get(viewer)
         if browser is None or page is None or not browser.age.may_ask():
             return
         question = uuid.uuid4().hex
-        browser.age.ask(question, time.monotonic(), robot_ns)
+        browser.age.note_question(question, time.monotonic(), robot_ns)
         ask_page(page, question)
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refused."""
+        """Refuse to open a tunnel."""
         return None
 
 
@@ -115,93 +132,128 @@ def page_server(
     listening: socket.socket,
     report: Callable[[str], None] = lambda _: None,
     stop: StopPath | None = None,
-    more: More = lambda _: None,
+    answer_first: AnswerRequest = lambda _: None,
 ) -> Iterator[tuple[PageServer, str]]:
-    """The server on a socket of `port.open_port`, and its address.
+    """Run the web server, and yield it and its address.
 
     Args:
-        listening: Where browsers connect.
+        listening: Where browsers connect: a socket of `console_port.open_port`.
         report: Called with what was refused, once of each kind.
-        stop: Stops the robot for the pages' backup stop; None for a recording.
-        more: Answers requests for pages beside the console's; returns None for one that it does not have.
+        stop: Stops the robot for the pages' second stop; None for a recording.
+        answer_first: Answers requests for pages beside the console's; returns None for a page that it does not have.
     """
-    admission, handed_on = Admission(report), HandoffListener(listening.getsockname())
-    with _on_our_terms(handed_on, admission, stop is not None, more), contextlib.redirect_stdout(io.StringIO()):
-        server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)  # prints a banner
+    admission = Admission(report)
+    handoff = HandoffListener(listening.getsockname())
+    added_html = DARK_COOKIE_SCRIPT + STICKY_HEADER_STYLE + TABS_IN_ONE_LINE_STYLE
+    if stop is not None:
+        added_html = SECOND_STOP + RELEASE_HELD_BUTTON_SCRIPT + added_html
+    with _patch_websocket_server(handoff, admission, answer_first, added_html), _ignore_output():
+        server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)
     server.admission = admission
     pace_pages(server)
-    with ConnectionAcceptor(listening, handed_on, stop, lambda kind, why: admission.drop(None, kind, why)):
+    with ConnectionAcceptor(listening, handoff, stop, lambda kind, reason: admission.drop(None, kind, reason)):
         try:
             yield server, address_of(listening)
         finally:
-            with contextlib.redirect_stdout(io.StringIO()):
+            with _ignore_output():
                 server.stop()
 
 
+def _ignore_output() -> contextlib.AbstractContextManager[Any]:
+    """Drop what viser prints as it starts and stops."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
 @contextlib.contextmanager
-def _on_our_terms(handed_on: HandoffListener, admission: Admission, stops: bool, more: More) -> Iterator[None]:
-    """Have viser's server take connections from the front, with our checks; viser has no option for either."""
-    serve = websockets.asyncio.server.serve
-    quiet = logging.getLogger(f"{__name__}.websockets")  # a stranger's bytes are counted, and are no errors of ours
-    quiet.addHandler(logging.NullHandler())
-    quiet.propagate = False
+def _patch_websocket_server(
+    handoff: HandoffListener, admission: Admission, answer_first: AnswerRequest, added_html: bytes
+) -> Iterator[None]:
+    """Have viser start its server with the console's listener and checks, for which viser has no option."""
+    original_serve = websockets.asyncio.server.serve
+    # Bytes that are no websocket are counted by `admission`; they are no errors of the console.
+    quiet_logger = logging.getLogger(f"{__name__}.websockets")
+    quiet_logger.addHandler(logging.NullHandler())
+    quiet_logger.propagate = False
 
-    def serve_here(handler: Any, _host: str, _port: int, **options: Any) -> Any:
-        viewers: set[BrowserConnection] = set()
-
-        async def let_in(connection: Any) -> None:  # a Browser, as made below
-            if len(viewers) >= MOST_VIEWERS:
-                admission.drop(None, "too many viewers", f"more than {MOST_VIEWERS} pages are open")
-                await connection.close(1013, f"more than {MOST_VIEWERS} pages are open")
-                return
-            viewers.add(connection)
-            _connecting.set(connection)
-            try:
-                await handler(connection)
-            finally:
-                viewers.discard(connection)
-
-        def made(*arguments: Any, **more: Any) -> BrowserConnection:
-            return BrowserConnection(admission, *arguments, **more)
-
-        ours = {
+    def serve_with_checks(handler: Any, _host: str, _port: int, **options: Any) -> Any:
+        process_request = _check_requests(options["process_request"], admission, answer_first, added_html)
+        console_options = {
             "max_size": MAX_MESSAGE_BYTES,
-            "create_connection": made,
-            "logger": quiet,
-            "process_request": _checked(options["process_request"], admission, stops, more),
+            "create_connection": partial(BrowserConnection, admission),
+            "logger": quiet_logger,
+            "process_request": process_request,
         }
-        return serve(let_in, sock=handed_on, **(options | ours))
+        return original_serve(_limit_viewers(handler, admission), sock=handoff, **(options | console_options))
 
-    websockets.asyncio.server.serve = serve_here  # pyright: ignore[reportAttributeAccessIssue]
+    websockets.asyncio.server.serve = serve_with_checks  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+        websockets.asyncio.server.serve = original_serve  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _checked(answer: Answer, admission: Admission, stops: bool, more: More) -> Answer:
-    """Answer requests of our own pages only. viser's page gets our scripts, and cannot be framed by others."""
+def _limit_viewers(handler: Any, admission: Admission) -> Callable[[Any], Awaitable[None]]:
+    """Return viser's handler of a connection, for no more than MAX_VIEWERS connections at a time."""
+    open_connections: set[BrowserConnection] = set()
 
-    def check(connection: ServerConnection, request: Request) -> Response | None:
-        why = why_refused(request.headers.get("Host"), request.headers.get("Origin"))
-        if why is not None:
-            admission.drop(None, "another origin", why)
-            return connection.respond(403, f"{why}\n")
-        if "Upgrade" not in request.headers and (found := more(request)) is not None:
-            return found
-        if request.path.partition("?")[0] not in PAGES or "Upgrade" in request.headers:
-            return answer(connection, request)
-        page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression
+    async def handle_connection(connection: Any) -> None:  # a BrowserConnection
+        if len(open_connections) >= MAX_VIEWERS:
+            reason = f"more than {MAX_VIEWERS} pages are open"
+            admission.drop(None, "too many viewers", reason)
+            await connection.close(TRY_AGAIN_LATER, reason)
+            return
+        open_connections.add(connection)
+        _connecting.set(connection)
+        try:
+            await handler(connection)
+        finally:
+            open_connections.discard(connection)
+
+    return handle_connection
+
+
+def _check_requests(
+    viser_answer: ProcessRequest, admission: Admission, answer_first: AnswerRequest, added_html: bytes
+) -> ProcessRequest:
+    """Return a function that answers the requests of the console's own pages only.
+
+    Args:
+        viser_answer: viser's own answer to a request; None lets a websocket connect.
+        admission: Counts requests that are refused.
+        answer_first: Answers requests for pages beside the console's.
+        added_html: Added to viser's page.
+    """
+
+    def process_request(connection: ServerConnection, request: Request) -> Response | None:
+        refusal = why_refused(request.headers.get("Host"), request.headers.get("Origin"))
+        if refusal is not None:
+            admission.drop(None, "another origin", refusal)
+            return connection.respond(403, f"{refusal}\n")
+        if "Upgrade" in request.headers:  # a websocket
+            return viser_answer(connection, request)
+        response = answer_first(request)
+        if response is not None:
+            return response
+        path = request.path.partition("?")[0]
+        if path not in CONSOLE_PATHS:
+            return viser_answer(connection, request)
+        request_without_compression = dataclasses.replace(request, headers=Headers())
+        page = viser_answer(connection, request_without_compression)
         assert page is not None
-        return _with((SECOND_STOP + HOLD_ENDS if stops else b"") + PREFERENCE + STATE_IN_SIGHT + TABS_IN_ONE_LINE, page)
+        return _add_html(added_html, page)
 
-    return check
+    return process_request
 
 
-def _with(ours: bytes, page: Response) -> Response:
-    """First of all in the page: then nothing of viser's can keep it from running."""
+def _add_html(added_html: bytes, page: Response) -> Response:
+    """Return a page with HTML added before all else, where no script of viser can keep it from running.
+
+    Pages of other origins cannot show the page in a frame.
+    """
     before, head, after = page.body.partition(b"<head>")
-    body = before + head + ours + after if head else ours + page.body
+    body = added_html + page.body
+    if head:
+        body = before + head + added_html + after
     headers = Headers(
         {
             "Content-Type": page.headers["Content-Type"],

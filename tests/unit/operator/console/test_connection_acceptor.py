@@ -13,13 +13,14 @@ from contextlib import contextmanager
 import pytest
 
 from snakesim_operator.base.console_port import open_port
-from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, HandoffListener
+from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor
 from snakesim_operator.features.console.web.connection_limits import (
     ConnectionLimits,
     PendingRequests,
     choose_limits,
     why_no_page,
 )
+from snakesim_operator.features.console.web.handoff_listener import HandoffListener
 from snakesim_operator.features.console.web.peer_user import PeerUsers
 from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 from tests.harness.wait import wait_until
@@ -127,7 +128,7 @@ def test_a_full_file_table_costs_a_reserved_descriptor_or_the_oldest_request_and
         FullTable.fails = 2
         assert at.ask("POST") == (200, "stopped")
         with at.send(HALF[1]) as oldest:
-            wait_until(lambda: len(front._waiting) == 1, "a request that waits", 5.0)
+            wait_until(lambda: len(front._pending) == 1, "a request that waits", 5.0)
             FullTable.fails = 1
             assert at.ask("POST") == (200, "stopped")
             wait_until(lambda: is_closed(oldest), "the end of the one that waited", 5.0)

@@ -5,16 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_operator.features.console.scene.meshes import Mesh, box, capsule, cylinder, sphere
+from snakesim_operator.features.console.scene.meshes import Mesh, make_box, make_capsule, make_cylinder, make_sphere
 
 
 @pytest.mark.parametrize(
     ("mesh", "half_m", "volume_m3"),
     [
-        (capsule(0.1, 0.03), (0.08, 0.03, 0.03), math.pi * 0.03**2 * (0.1 + 4 / 3 * 0.03)),
-        (sphere(1.0), (1.0, 1.0, 1.0), 4 / 3 * math.pi),
-        (cylinder(1.0, 2.0), (1.0, 1.0, 1.0), 2 * math.pi),
-        (box(1.0), (1.0, 1.0, 1.0), 8.0),
+        (make_capsule(0.1, 0.03), (0.08, 0.03, 0.03), math.pi * 0.03**2 * (0.1 + 4 / 3 * 0.03)),
+        (make_sphere(1.0), (1.0, 1.0, 1.0), 4 / 3 * math.pi),
+        (make_cylinder(1.0, 2.0), (1.0, 1.0, 1.0), 2 * math.pi),
+        (make_box(1.0), (1.0, 1.0, 1.0), 8.0),
     ],
 )
 def test_a_shape_has_its_size_and_faces_outwards(mesh: Mesh, half_m: tuple[float, ...], volume_m3: float):

@@ -36,7 +36,7 @@ class Link:
         """A tenth of a second; returns the ages of the "held" messages that reach the console."""
         if self.age.may_ask():
             question = str(next(self._numbers))
-            self.age.ask(question, now_s, round(now_s * 1e9))
+            self.age.note_question(question, now_s, round(now_s * 1e9))
             self._to_page.append(question)
         if not down_stalls:
             self._to_console += self._to_page
@@ -47,9 +47,9 @@ class Link:
         while self._to_console and not up_stalls:
             message = self._to_console.pop(0)
             if message is None:
-                found.append(self.age.action(now_s).age_s)
+                found.append(self.age.date_action(now_s).age_s)
             else:
-                self.age.answer(message)
+                self.age.note_answer(message)
         return found
 
 
@@ -83,16 +83,16 @@ def test_what_was_held_before_or_in_a_stall_is_too_old_after_it(
 
 def test_answers_that_nobody_asked_for_make_nothing_younger() -> None:
     age = MessageAge()
-    age.answer("guessed")
-    assert age.action(5.0) == PageAction(math.inf)
-    age.ask("a", 1.0, 100)
-    age.ask("b", 2.0, 200)
-    age.answer("b")
-    age.answer("a")
-    assert age.action(5.0) == PageAction(3.0, 200)
+    age.note_answer("guessed")
+    assert age.date_action(5.0) == PageAction(math.inf)
+    age.note_question("a", 1.0, 100)
+    age.note_question("b", 2.0, 200)
+    age.note_answer("b")
+    age.note_answer("a")
+    assert age.date_action(5.0) == PageAction(3.0, 200)
     for number in range(MAX_UNANSWERED):
         assert age.may_ask()
-        age.ask(str(number), 6.0, None)
+        age.note_question(str(number), 6.0, None)
     assert not age.may_ask(), "a page that hangs"
 
 
@@ -109,10 +109,10 @@ def test_what_may_move_a_robot_is_not_done_late_and_what_stops_it_is() -> None:
             return lambda viewer, _action: done.append(f"{what} {viewer}")
 
         admission.admit(
-            group, VIEWER, act=note("group"), max_age_s=MAX_PRESS_AGE_S, at_any_age=("Disarm",), on_late=late.append
+            group, VIEWER, handler=note("group"), max_age_s=MAX_PRESS_AGE_S, at_any_age=("Disarm",), on_late=late.append
         )
-        admission.admit(hold, VIEWER, hold_hz=HZ, act=note("hold"), max_age_s=MAX_HOLD_AGE_S)
-        admission.admit(stop, act=note("stop"))
+        admission.admit(hold, VIEWER, hold_hz=HZ, handler=note("hold"), max_age_s=MAX_HOLD_AGE_S)
+        admission.admit(stop, handler=note("stop"))
         messages = {
             "arm": _update(group, "Arm"),
             "disarm": _update(group, "Disarm"),
@@ -122,17 +122,17 @@ def test_what_may_move_a_robot_is_not_done_late_and_what_stops_it_is() -> None:
         raw = {name: msgspec.msgpack.encode(message) for name, message in messages.items()}
         old, fresh = MessageAge(), MessageAge()
         for age, asked_s in ((old, time.monotonic() - 14.0), (fresh, time.monotonic())):
-            age.ask("question", asked_s, 0)
+            age.note_question("question", asked_s, 0)
             answer = {"type": "LocalStorageGetItemResponseMessage", "request_uuid": "question"}
-            admission.checked(VIEWER, msgspec.msgpack.encode(answer | {"value": None, "error": None}), age)
+            admission.check_message(VIEWER, msgspec.msgpack.encode(answer | {"value": None, "error": None}), age)
         for name in raw:
-            assert admission.checked(VIEWER, raw[name], old) is None
+            assert admission.check_message(VIEWER, raw[name], old) is None
         assert done == [f"group {VIEWER}", f"stop {VIEWER}"], "to disarm and to stop"
         assert len(late) == 1 and late[0] == pytest.approx(14.0, abs=1.0)
         assert admission.dropped["too old"] == 2
         done.clear()
         for name in raw:
-            assert admission.checked(VIEWER, raw[name], fresh) is None
+            assert admission.check_message(VIEWER, raw[name], fresh) is None
         assert [name.split()[0] for name in done] == ["group", "group", "hold", "stop"]
 
 
@@ -144,7 +144,7 @@ def test_a_page_without_a_scene_is_a_viewer_and_may_stop() -> None:
     stopped: list[int] = []
     with page_server(open_port(None), stop=ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")
-        server.admission.admit(button, act=lambda viewer, _action: stopped.append(viewer))
+        server.admission.admit(button, handler=lambda viewer, _action: stopped.append(viewer))
         with Page(address, draws=False) as page:
             page.click("EMERGENCY STOP  (Esc)")
             wait_until(lambda: stopped == [0], "the stop", 10.0)
@@ -162,7 +162,7 @@ def test_a_real_page_answers_what_it_is_asked(capfd: pytest.CaptureFixture[str])
 
     with page_server(open_port(None), stop=ReadyStop()) as (server, address):
         button = server.gui.add_button("Go")
-        server.admission.admit(button, act=act)
+        server.admission.admit(button, handler=act)
         with Page(address) as page:
             wait_until(lambda: server.get_clients(), "a viewer", 10.0)
             page.click("Go")

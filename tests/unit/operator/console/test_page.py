@@ -62,11 +62,11 @@ def test_nobody_can_open_a_tunnel_to_the_internet():
 
 def test_control_is_taken_while_free_and_never_taken_away():
     token = ControlToken()
-    assert token.take(1) and token.take(1)
-    assert not token.take(2) and token.holder == 1
+    assert token.acquire(1) and token.acquire(1)
+    assert not token.acquire(2) and token.holder == 1
     assert not token.release(2) and token.holder == 1
     assert token.release(1) and token.holder is None
-    assert token.take(2) and token.holder == 2
+    assert token.acquire(2) and token.holder == 2
 
 
 def test_text_from_the_network_is_no_markup():
@@ -75,14 +75,14 @@ def test_text_from_the_network_is_no_markup():
     named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
     reported = status(lifecycle="fault", why=evil, commands_rejected={evil[:40]: 1}, **named)
     snapshot = RobotSnapshot(robot=robot, status=reported)
-    shown = page_html.header(snapshot) + page_html.state_table(snapshot) + page_html.log([evil])
+    shown = page_html.format_header(snapshot) + page_html.format_state_table(snapshot) + page_html.format_log([evil])
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
 
 
 def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
-    shown = page_html.header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
+    shown = page_html.format_header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
     assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
-    assert "PAUSED" not in page_html.header(RobotSnapshot(robot=description(), status=status()))
+    assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=description(), status=status()))
 
 
 def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
@@ -93,7 +93,9 @@ def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_
     start = capsules_at_start(config)
     middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
     assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
-    assert "WAITING FOR THE ROBOT" in page_html.header(snapshot) and "SIMULATOR" not in page_html.header(snapshot)
+    assert "WAITING FOR THE ROBOT" in page_html.format_header(snapshot) and "SIMULATOR" not in page_html.format_header(
+        snapshot
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +109,7 @@ def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_
 )
 def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
     robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
-    assert f">{words}<" in page_html.header(RobotSnapshot(robot=robot))
+    assert f">{words}<" in page_html.format_header(RobotSnapshot(robot=robot))
 
 
 def test_the_legend_has_a_colour_for_each_thing():

@@ -1,0 +1,123 @@
+"""The controls of one viewer in the Commission tab, with which the viewer in control runs a step."""
+
+from collections.abc import Callable
+from functools import partial
+
+import viser
+
+from snakesim_hal.wire.quantities import MAX_JOINTS
+from snakesim_operator.features.console.joint_step import BACKWARDS, ENTER, FORWARDS
+from snakesim_operator.features.console.page.commissioning_tab import STEPS, Commissioning
+from snakesim_operator.features.console.page.page_html import escape_text
+from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
+from snakesim_operator.features.console.web.message_age import PageAction
+
+HOLD_REPEAT_HZ = 20.0  # `snakesim joints jog` counts a key as held for 0.15 s
+
+
+class CommissioningControls:
+    """The buttons of one viewer with which it runs a step."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        tab: viser.GuiFolderHandle,
+        commissioning: Commissioning,
+        admission: Admission,
+        is_in_control: Callable[[], bool],
+        run_operation: Callable[[str, Callable[[], str]], object],
+        on_late_press: Callable[[float], None],
+    ) -> None:
+        """Add the controls to the viewer's page.
+
+        Args:
+            client: The viewer's page.
+            tab: The place of the controls.
+            commissioning: Runs the step.
+            admission: Decides which messages of the page count.
+            is_in_control: Returns whether this viewer has control.
+            run_operation: Runs an operation, and shows its title and its result to the viewer.
+            on_late_press: Called with the age of a press that was too old.
+        """
+        self._viewer = client.client_id
+        self._commissioning = commissioning
+        self._is_in_control = is_in_control
+        self._run_operation = run_operation
+        with tab:
+            self._folder = client.gui.add_folder("Do it here", order=2, visible=False)
+        with self._folder:
+            self._add_controls(client.gui)
+        self._admit_controls(admission, on_late_press)
+        self._verb.on_update(lambda _: self._show_chosen_step())
+        self._start_button.on_click(lambda _: self._start())
+        self._enter.on_click(lambda _: commissioning.press_key(self._viewer, ENTER))
+        self._end_button.on_click(lambda _: self._end())
+        self._show_chosen_step()
+
+    def _add_controls(self, gui: viser.GuiApi) -> None:
+        self._verb = gui.add_dropdown("Step", tuple(STEPS), initial_value="direction")
+        self._description = gui.add_html("")
+        self._joint = gui.add_number("Joint (0: all)", 0, min=0, max=MAX_JOINTS, step=1)
+        # Limits of a jog.
+        self._speed_rad_s = gui.add_slider("Speed, rad/s", 0.01, 0.5, 0.01, 0.1)
+        self._travel_rad = gui.add_slider("Travel, rad", 0.05, 3.2, 0.05, 0.2)
+        self._torque_fraction = gui.add_slider("Share of torque", 0.05, 1.0, 0.05, 0.3)
+        # Buttons.
+        self._start_button = gui.add_button("Start step", color="blue")
+        self._enter = gui.add_button("Enter")
+        self._forwards = gui.add_button("Hold: forwards (+)", color="green")
+        self._backwards = gui.add_button("Hold: backwards (-)", color="green")
+        self._end_button = gui.add_button("End step", color="gray")
+
+    def _admit_controls(self, admission: Admission, on_late_press: Callable[[float], None]) -> None:
+        """Let this viewer's page use the controls. A step ends at any age of the press; nothing else may be old."""
+        jog_limits = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
+        for control in (self._verb, self._joint, *jog_limits, self._end_button):
+            admission.admit(control, self._viewer, self._is_in_control)
+        for button in (self._start_button, self._enter):
+            admission.admit(button, self._viewer, self._is_in_control, max_age_s=MAX_PRESS_AGE_S, on_late=on_late_press)
+        for button, key in ((self._forwards, FORWARDS), (self._backwards, BACKWARDS)):
+            # The page repeats that a button is held only if viser has a callback for it.
+            button.on_hold(lambda _: None, callback_hz=HOLD_REPEAT_HZ)
+            admission.admit(
+                button,
+                self._viewer,
+                self._is_in_control,
+                HOLD_REPEAT_HZ,
+                handler=partial(self._on_jog_held, key),
+                max_age_s=MAX_HOLD_AGE_S,
+            )
+
+    def refresh(self) -> None:
+        """Show the controls if this viewer may use them now."""
+        self._folder.visible = self._commissioning.robot_file is not None and self._is_in_control()
+
+    def _show_chosen_step(self) -> None:
+        """Describe the chosen step, and show only the inputs that it has."""
+        verb = self._verb.value
+        description = escape_text(STEPS[verb])
+        self._description.content = f"<div style='padding:.2em .6em;font-size:.85em'>{description}</div>"
+        self._joint.visible = verb != "zero"
+        self._enter.visible = verb != "jog"
+        jog_limits = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
+        for control in (*jog_limits, self._forwards, self._backwards):
+            control.visible = verb == "jog"
+
+    def _on_jog_held(self, key: bytes, _viewer: int, _action: PageAction) -> None:
+        """Send the step the key of a button that is held; admission has checked the message's age."""
+        self._commissioning.press_key(self._viewer, key)
+
+    def _start(self) -> None:
+        verb = self._verb.value
+        joint = int(self._joint.value)
+        options: list[str] = []
+        if verb == "jog":
+            options += ["--speed", f"{self._speed_rad_s.value:g}"]
+            options += ["--travel", f"{self._travel_rad.value:g}"]
+            options += ["--torque", f"{self._torque_fraction.value:g}"]
+        if self._is_in_control():
+            self._run_operation("Joints", lambda: self._commissioning.start(self._viewer, verb, joint, options))
+
+    def _end(self) -> None:
+        if self._is_in_control():
+            self._commissioning.end()
