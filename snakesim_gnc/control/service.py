@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 
 from snakesim_gnc.control.controller import Senses, Task, View
-from snakesim_gnc.control.freshness import Limits
+from snakesim_gnc.control.freshness import AgeLimits
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.live_settings import LiveSettings
 from snakesim_gnc.control.state_reports import StateReports
@@ -89,7 +89,7 @@ class Control(Service):
             raise ControllerError(f"robot {robot.robot!r}: {missing}")
         self._settings.configure(robot)
         self._commander = Commander(self._client, robot)
-        self._limits = Limits.of(self._config, robot)
+        self._age_limits = AgeLimits.from_config(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
         self._times = UpdateTimes(robot)
         self._controller: Guarded | None = None
@@ -114,7 +114,7 @@ class Control(Service):
         if not holds_lease:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
             return _state_messages(self._reports.state(clock, armed=is_armed, missing=why))
-        why_late = self._limits.against_joints(joints, clock.timestamp_ns)
+        why_late = self._age_limits.check_joints(joints, clock.timestamp_ns)
         if why_late:
             self._log_late_streams(clock, [why_late], "no commands")
             return _state_messages(self._reports.state(clock, armed=is_armed, missing=why_late))
@@ -185,17 +185,17 @@ class Control(Service):
         return _state_messages(state)
 
     def _read_fresh_plan(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
-        """Return the newest world model and trajectory, and why they are too old; what is too old or missing is None."""
+        """Return the newest world model and trajectory, None for what is missing or too old, and why it is too old."""
         world = self._client.read(self._world)
         trajectory = self._client.read(self._trajectory)
         late: list[str] = []
         if world is not None:
-            why_late = self._limits.against_world(world, clock.timestamp_ns)
+            why_late = self._age_limits.check_world(world, clock.timestamp_ns)
             if why_late:
                 late.append(why_late)
                 world = None
         if trajectory is not None:
-            why_late = self._limits.against_trajectory(trajectory, clock.timestamp_ns)
+            why_late = self._age_limits.check_trajectory(trajectory, clock.timestamp_ns)
             if why_late:
                 late.append(why_late)
                 trajectory = None
@@ -213,7 +213,7 @@ class Control(Service):
             if sample is not None:
                 self._sensor_samples[key] = sample
         timestamps_ns = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensor_samples.items()}
-        late = self._limits.of_sensors(timestamps_ns, clock.timestamp_ns)
+        late = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
         return Senses(dict(self._sensor_samples), late, self._task)
 
     def _prepare_controller(self, clock: Clock) -> Guarded:
