@@ -141,9 +141,9 @@ class Control(Service):
             silent = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
             return _state_messages(self._reports.state(clock, silent=silent))
         status = statuses[-1]
-        stands = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
+        why_paused = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
         is_armed = status.lifecycle == "armed"
-        return _state_messages(self._reports.state(clock, armed=is_armed, stands=f"time stands: {stands}"))
+        return _state_messages(self._reports.state(clock, armed=is_armed, paused=f"time stands: {why_paused}"))
 
     def _apply_new_settings(self, clock: Clock) -> None:
         """Answer requests for other settings. If the settings have changed, the controller is constructed again."""
