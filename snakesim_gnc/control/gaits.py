@@ -95,8 +95,8 @@ class Sidewinding(_Gait):
             Swing, about("amplitude of the joints that turn up and down; negative: to the other side")
         ] = 0.2
         lag_rad: Annotated[Lag, about("phase of a joint behind the one ahead of it")] = 0.45
-        period_s: Annotated[Seconds, about("of the wave")] = 2.0
-        blend_s: Annotated[Seconds, about("over which the command changes smoothly to a new reference")] = 1.0
+        period_s: Annotated[Seconds, about("period of the wave")] = 2.0
+        blend_s: Annotated[Seconds, about("time over which the command changes smoothly to a new reference")] = 1.0
 
     def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
         lag_rad = self._set.lag_rad
@@ -114,8 +114,8 @@ class Rolling(_Gait):
         """The arc; a negative `bend_rad` of the pitch joints rolls to the other side."""
 
         bend_rad: Annotated[Swing, about("bend of every joint; negative: to the other side")] = 0.25
-        period_s: Annotated[Seconds, about("of a turn")] = 2.0
-        blend_s: Annotated[Seconds, about("over which the command changes smoothly to a new reference")] = 1.0
+        period_s: Annotated[Seconds, about("period of a turn")] = 2.0
+        blend_s: Annotated[Seconds, about("time over which the command changes smoothly to a new reference")] = 1.0
 
     def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
         reference_rad[self._yaw] = abs(self._set.bend_rad) * math.sin(phase_rad)
@@ -137,8 +137,8 @@ class RaisedHead(_Gait):
         look_rad: Annotated[Swing, about("how far the foremost yaw joint looks to each side")] = 0.4
         stance_rad: Annotated[Swing, about("amplitude of the wave in which the body behind lies")] = 0.5
         lag_rad: Annotated[Lag, about("phase of that wave from joint to joint")] = 0.6
-        period_s: Annotated[Seconds, about("of looking to both sides")] = 6.0
-        blend_s: Annotated[Seconds, about("over which the command changes smoothly to a new reference")] = 2.0
+        period_s: Annotated[Seconds, about("period of looking to both sides")] = 6.0
+        blend_s: Annotated[Seconds, about("time over which the command changes smoothly to a new reference")] = 2.0
 
     def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
         # Positive pitch bends the head down. With one pitch joint only, nothing keeps the head level.

@@ -50,11 +50,15 @@ class Identify:
         """How far and how fast."""
 
         swing_rad: Annotated[float, bounded(0.01, 0.5, "rad"), about("slow motion to either side")] = 0.25
-        swing_s: Annotated[float, bounded(0.5, 60.0, "s"), about("of the shortest slow motion there and back")] = 2.0
-        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad"), about("sum of all tones, at most")] = 0.05
+        swing_s: Annotated[
+            float, bounded(0.5, 60.0, "s"), about("period of the fastest slow motion, there and back")
+        ] = 2.0
+        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad"), about("maximum of the sum of all tones")] = 0.05
         shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz"), about("highest tone; the lowest is a tenth")] = 6.0
-        shake_after_s: Annotated[float, bounded(0.0, 600.0, "s"), about("slow motion alone, before")] = 6.0
-        fade_s: Annotated[float, bounded(0.1, 10.0, "s"), about("until each reaches its full size")] = 0.5
+        shake_after_s: Annotated[
+            float, bounded(0.0, 600.0, "s"), about("time with the slow motion alone, before the shaking")
+        ] = 6.0
+        fade_s: Annotated[float, bounded(0.1, 10.0, "s"), about("time until each motion reaches its full size")] = 0.5
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot

@@ -32,13 +32,15 @@ class JointCheck:
         """How far, how fast, and when to give up."""
 
         move_rad: Annotated[float, bounded(0.01, 0.2, "rad"), about("how far each joint moves to either side")] = 0.06
-        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("of a target")] = 0.3
+        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("speed of a target")] = 0.3
         give_up_rad: Annotated[
             float,
             bounded(0.02, 0.5, "rad"),
             about("a joint that has not moved when its target is so far away is left, and the next one follows"),
         ] = 0.15
-        rest_s: Annotated[float, bounded(0.02, 5.0, "s"), about("before each of its two motions, and after")] = 0.15
+        rest_s: Annotated[
+            float, bounded(0.02, 5.0, "s"), about("rest before each of its two motions, and after them")
+        ] = 0.15
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
