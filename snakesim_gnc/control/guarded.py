@@ -20,7 +20,7 @@ MODES = ", ".join(f"Mode.{mode.name}" for mode in Mode)
 MAX_SHOWN = 60  # characters of a value in an error message
 
 
-class Guarded:
+class GuardedController:
     """A checked controller, constructed for one arm session. Every call may raise ControllerError."""
 
     def __init__(self, name: str, plugin: type[Controller], robot: Description, settings: Any) -> None:
@@ -45,10 +45,10 @@ class Guarded:
         try:
             check(action, self._joints)
         except ValueError as error:
-            raise self.wrong(str(error)) from None
+            raise self.make_error(str(error)) from None
         return action
 
-    def wrong(self, what: str) -> ControllerError:
+    def make_error(self, what: str) -> ControllerError:
         """Return an error that names the controller. `what` names the field, its value, and what is allowed."""
         return ControllerError(f"{self._label}: {what}")
 
@@ -59,10 +59,10 @@ class Guarded:
             yield
         except ControllerError as error:
             # Its text already says which returned value is not allowed, so that no traceback is needed.
-            raise self.wrong(str(error)) from error.__cause__
+            raise self.make_error(str(error)) from error.__cause__
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise self.wrong(f"{method}() {raised(error, self._module)}") from error
+            raise self.make_error(f"{method}() {raised(error, self._module)}") from error
 
 
 def check(action: Action, described: Sequence[JointDescription]) -> None:

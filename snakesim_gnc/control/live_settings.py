@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from snakesim_gnc.control.controller import Controller
-from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
@@ -64,11 +64,11 @@ class LiveSettings:
         self._robot = robot
         self._published_change = -1
 
-    def controller(self) -> Guarded:
+    def construct_controller(self) -> GuardedController:
         """Construct a controller with the settings in force. Raises ControllerError."""
-        return self._construct_controller(self._settings)
+        return self._construct(self._settings)
 
-    def turn(self, clock: Clock) -> bool:
+    def answer_requests(self, clock: Clock) -> bool:
         """Answer all waiting requests, and publish the settings if they are new.
 
         Returns:
@@ -96,7 +96,7 @@ class LiveSettings:
         try:
             section = msgspec.json.decode(request.settings, type=dict[str, Any])
             settings = self._check_settings(section, f"request of {request.who!r}")
-            self._construct_controller(settings)  # a trial: a constructor may refuse more than the schema does
+            self._construct(settings)  # a trial: a constructor may refuse more than the schema does
         except (ConfigError, ControllerError, *UNDECODABLE) as error:
             return Answer(ok=False, reason=str(error)[:MAX_REASON], refusal="bad_settings")
         self._settings = settings
@@ -109,10 +109,10 @@ class LiveSettings:
         """Return the controller's settings from a section of TOML or JSON; `source` is named in a ConfigError."""
         return plugin_settings(self.plugin, section, source, self._config.control_section)
 
-    def _construct_controller(self, settings: Any) -> Guarded:
+    def _construct(self, settings: Any) -> GuardedController:
         if self._robot is None:
             raise ControllerError("control has not met the robot yet")
-        return Guarded(self._config.controller, self.plugin, self._robot, settings)
+        return GuardedController(self._config.controller, self.plugin, self._robot, settings)
 
     def _publish(self, clock: Clock) -> None:
         """Publish the settings in force, unless they or their schema are too long for a message.

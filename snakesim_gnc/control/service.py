@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.freshness import AgeLimits
-from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.live_settings import LiveSettings
 from snakesim_gnc.control.state_reports import StateReports
 from snakesim_gnc.control.update_times import UpdateTimes
@@ -92,7 +92,7 @@ class Control(Service):
         self._age_limits = AgeLimits.from_config(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
         self._times = UpdateTimes(robot)
-        self._controller: Guarded | None = None
+        self._controller: GuardedController | None = None
         self._sensor_samples.clear()
 
     def outputs(self, clock: Clock) -> Outputs | None:
@@ -113,15 +113,15 @@ class Control(Service):
             self._controller = None
         if not holds_lease:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
-            return _state_messages(self._reports.state(clock, armed=is_armed, missing=why))
+            return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why))
         why_late = self._age_limits.check_joints(joints, clock.timestamp_ns)
         if why_late:
             self._log_late_streams(clock, [why_late], "no commands")
-            return _state_messages(self._reports.state(clock, armed=is_armed, missing=why_late))
+            return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why_late))
         if not is_armed:
             self._log_late_streams(clock)
             self._commander.send(clock, joints, self._commander.stay(joints))
-            return _state_messages(self._reports.state(clock))
+            return _state_messages(self._reports.make_state(clock))
         return self._run_controller(clock, joints)
 
     def pause(self, clock: Clock) -> None:
@@ -139,15 +139,15 @@ class Control(Service):
         statuses = self._statuses.drain()
         if not statuses:
             silent = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
-            return _state_messages(self._reports.state(clock, silent=silent))
+            return _state_messages(self._reports.make_state(clock, silent=silent))
         status = statuses[-1]
         why_paused = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
         is_armed = status.lifecycle == "armed"
-        return _state_messages(self._reports.state(clock, armed=is_armed, paused=f"time stands: {why_paused}"))
+        return _state_messages(self._reports.make_state(clock, armed=is_armed, paused=f"time stands: {why_paused}"))
 
     def _apply_new_settings(self, clock: Clock) -> None:
         """Answer requests for other settings. If the settings have changed, the controller is constructed again."""
-        if self._settings.turn(clock):
+        if self._settings.answer_requests(clock):
             self._controller = None
 
     def _run_controller(self, clock: Clock, joints: JointState) -> Outputs:
@@ -176,11 +176,11 @@ class Control(Service):
             self._commander.send(clock, joints, action.setpoints)
             rests = _explain_rest(trajectory)
             try:
-                state = self._reports.state(clock, action.report, armed=True, missing=missing, rests=rests)
+                state = self._reports.make_state(clock, action.report, armed=True, missing=missing, rests=rests)
             except ValueError as error:
-                raise controller.wrong(str(error)) from None
+                raise controller.make_error(str(error)) from None
         except ControllerError as error:
-            self._client.put(keys.CONTROL_STATE, self._reports.failure(clock, str(error)))
+            self._client.put(keys.CONTROL_STATE, self._reports.make_failure(clock, str(error)))
             raise
         return _state_messages(state)
 
@@ -201,7 +201,7 @@ class Control(Service):
                 trajectory = None
         self._log_late_streams(clock, late, "the controller holds")
         if world is not None:
-            self._reports.follow(world)
+            self._reports.add_world(world)
         return world, trajectory, "; ".join(late)
 
     def _read_senses(self, clock: Clock) -> Senses | None:
@@ -216,11 +216,11 @@ class Control(Service):
         late = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
         return Senses(dict(self._sensor_samples), late, self._task)
 
-    def _prepare_controller(self, clock: Clock) -> Guarded:
+    def _prepare_controller(self, clock: Clock) -> GuardedController:
         """Return the controller of this arm session, which is new after an arming and after a change of settings."""
         is_new_session = clock.arm_session != self._arm_session
         if self._controller is None or is_new_session:
-            self._controller = self._settings.controller()
+            self._controller = self._settings.construct_controller()
             if is_new_session:
                 self._arm_session = clock.arm_session
                 self._armed_at_ns = clock.timestamp_ns

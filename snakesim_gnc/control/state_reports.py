@@ -38,13 +38,13 @@ class StateReports:
 
         self._decoder = msgspec.msgpack.Decoder(ControlState)
 
-    def follow(self, world: World) -> None:
+    def add_world(self, world: World) -> None:
         """Add the position of the body and its contact forces from a world model that is fresh."""
         self._measured_contacts.add_world(world)
         if world.center_w is not None:
             self._advance.add(world.timestamp_ns * 1e-9, world.center_w)
 
-    def state(
+    def make_state(
         self,
         clock: Clock,
         report: Report | None = None,
@@ -103,7 +103,7 @@ class StateReports:
         self._next_ns = clock.timestamp_ns + round(TELEMETRY_S * 1e9)
         return self._make_message(clock, state, reason, report)
 
-    def failure(self, clock: Clock, why: str) -> ControlState:
+    def make_failure(self, clock: Clock, why: str) -> ControlState:
         """Return the last message of a controller that has failed."""
         message = self._make_message(clock, "NotLocomoting", why, Report())
         return msgspec.structs.replace(message, failed=True)
