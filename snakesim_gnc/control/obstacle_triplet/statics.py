@@ -162,9 +162,12 @@ def compute_torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w
         normal_3_w: (2,) unit vector, n_3.
         joint_w: (2,) m, where the torque acts.
     """
-    # Unpacked by hand: this runs for each triplet in every tick.
-    (x, y), (nx, ny), (joint_x, joint_y) = point_3_w, normal_3_w, joint_w
-    return float(-unit_force_3 * ((x - joint_x) * ny - (y - joint_y) * nx))
+    # Single numbers instead of arrays: this runs for each triplet in every tick.
+    x, y = point_3_w
+    nx, ny = normal_3_w
+    joint_x, joint_y = joint_w
+    r_cross_n = (x - joint_x) * ny - (y - joint_y) * nx
+    return float(-unit_force_3 * r_cross_n)
 
 
 def explain_missing_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, authority_min: float) -> str:
@@ -172,9 +175,12 @@ def explain_missing_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Pl
 
     With r from the joint to o_3, the joint has authority if |r x n_3| >= authority_min |r|.
     """
-    (x, y), (nx, ny), (joint_x, joint_y) = point_3_w, normal_3_w, joint_w
+    x, y = point_3_w
+    nx, ny = normal_3_w
+    joint_x, joint_y = joint_w
     lever_m = math.hypot(x - joint_x, y - joint_y)
-    if lever_m > 0 and abs((x - joint_x) * ny - (y - joint_y) * nx) >= authority_min * lever_m:
+    r_cross_n = (x - joint_x) * ny - (y - joint_y) * nx
+    if lever_m > 0 and abs(r_cross_n) >= authority_min * lever_m:
         return ""
     return "no authority: the line from the joint to o_3 is parallel to the normal there"
 
