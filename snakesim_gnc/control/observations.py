@@ -32,7 +32,7 @@ Read = Callable[[View, GoalProgress], Sequence[float]]
 
 
 @dataclass(frozen=True)
-class Part:
+class ObservationPart:
     """A group of numbers in an observation, such as the angles of all joints."""
 
     names: Sequence[str]
@@ -45,19 +45,19 @@ class Part:
 
 def _symmetric(
     names: Sequence[str], unit: str, maximum: float | Sequence[float], read: Read, sensor: str | None = None
-) -> Part:
+) -> ObservationPart:
     """Return a part whose numbers are bounded by -maximum and maximum; one maximum for all numbers, or one for each."""
     high = [maximum] * len(names) if isinstance(maximum, int | float) else list(maximum)
     low = [-value for value in high]
-    return Part(names, unit, low, high, read, sensor)
+    return ObservationPart(names, unit, low, high, read, sensor)
 
 
-def parts_of(robot: Description) -> dict[str, Part]:
+def make_parts(robot: Description) -> dict[str, ObservationPart]:
     """Return all parts that a robot with every sensor can observe, by name."""
     return _joint_parts(robot) | _goal_parts() | _contact_parts(robot) | _pose_parts()
 
 
-def _joint_parts(robot: Description) -> dict[str, Part]:
+def _joint_parts(robot: Description) -> dict[str, ObservationPart]:
     """Return the time and what the joints measure."""
     joints = robot.joints
     names = [joint.name for joint in joints]
@@ -65,31 +65,35 @@ def _joint_parts(robot: Description) -> dict[str, Part]:
     speeds_rad_s = [SPEED_MARGIN * joint.speed_limit_rad_s for joint in joints]
     torques_nm = [TORQUE_MARGIN * joint.torque_limit_nm for joint in joints]
     return {
-        "time_s": Part(["since_arming"], "s", [0.0], [MAX_TIME_S], lambda view, _: [view.time_s]),
+        "time_s": ObservationPart(["since_arming"], "s", [0.0], [MAX_TIME_S], lambda view, _: [view.time_s]),
         "angle_rad": _symmetric(names, "rad", angles_rad, lambda view, _: view.joints.angle_rad),
         "velocity_rad_s": _symmetric(names, "rad/s", speeds_rad_s, lambda view, _: view.joints.velocity_rad_s),
         "torque_nm": _symmetric(names, "N·m", torques_nm, lambda view, _: view.joints.torque_nm),
     }
 
 
-def _goal_parts() -> dict[str, Part]:
+def _goal_parts() -> dict[str, ObservationPart]:
     """Return the bearing of the goal from the body's heading, and the distance that is left."""
     return {
         "goal_bearing": _symmetric(["cos", "sin"], "1", 1.0, _read_bearing, keys.POSE),
-        "goal_m": Part(["left"], "m", [0.0], [MAX_DISTANCE_M], lambda _, progress: [progress.left_m], keys.POSE),
+        "goal_m": ObservationPart(
+            ["left"], "m", [0.0], [MAX_DISTANCE_M], lambda _, progress: [progress.left_m], keys.POSE
+        ),
     }
 
 
-def _contact_parts(robot: Description) -> dict[str, Part]:
+def _contact_parts(robot: Description) -> dict[str, ObservationPart]:
     """Return the size of the contact force on every link."""
     names = [link.name for link in robot.links]
     count = len(names)
     low = [0.0] * count
     high = [MAX_FORCE_N] * count
-    return {"contact_n": Part(names, "N", low, high, lambda view, _: _read_forces(view, count), keys.CONTACTS)}
+    return {
+        "contact_n": ObservationPart(names, "N", low, high, lambda view, _: _read_forces(view, count), keys.CONTACTS)
+    }
 
 
-def _pose_parts() -> dict[str, Part]:
+def _pose_parts() -> dict[str, ObservationPart]:
     """Return what the pose sensor measures, in the world frame."""
     axes = ["x", "y", "z"]
     return {
@@ -103,7 +107,7 @@ def _pose_parts() -> dict[str, Part]:
 DEFAULT = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n")
 
 
-def chosen(robot: Description, observe: Sequence[str] | None) -> dict[str, Part]:
+def chosen(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
     """Return parts of an observation by their names.
 
     Args:
@@ -113,7 +117,7 @@ def chosen(robot: Description, observe: Sequence[str] | None) -> dict[str, Part]
     Raises:
         ConfigError: there is no part with a name, or the robot does not have its sensor.
     """
-    parts = parts_of(robot)
+    parts = make_parts(robot)
     sensors = {sensor.key for sensor in robot.sensors}
     observable = {name: part for name, part in parts.items() if part.sensor is None or part.sensor in sensors}
     if observe is None:
@@ -132,7 +136,7 @@ def chosen(robot: Description, observe: Sequence[str] | None) -> dict[str, Part]
 class Observer:
     """Makes the observation of an episode, tick by tick."""
 
-    def __init__(self, robot: Description, parts: Mapping[str, Part]) -> None:
+    def __init__(self, robot: Description, parts: Mapping[str, ObservationPart]) -> None:
         """Start an episode.
 
         Args:

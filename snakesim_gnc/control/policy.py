@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_gnc.control.observations import Observer, Part, chosen, parts_of
+from snakesim_gnc.control.observations import ObservationPart, Observer, chosen, make_parts
 from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import SHIPPED, FileStruct, expanded
 from snakesim_hal.model.plugins import pip_install
@@ -82,7 +82,7 @@ class Model:
         return targets[0].tolist()
 
 
-def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts: Mapping[str, Part]) -> None:
+def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts: Mapping[str, ObservationPart]) -> None:
     """Check that the robot has the joints that the model commands and observes. Raises ConfigError."""
     joint_count = len(robot.joints)
     expected_count = metadata.read_integer(JOINTS)
@@ -171,9 +171,9 @@ class _Metadata:
         self._file = short(file)
         self._properties = properties
 
-    def read_parts(self, robot: Description) -> dict[str, Part]:
+    def read_parts(self, robot: Description) -> dict[str, ObservationPart]:
         """Return the parts of the observation, in the order in which the model expects them."""
-        available = parts_of(robot)
+        available = make_parts(robot)
         allowed = f"names out of {', '.join(available)}, each once, with commas between"
         text = self._read_text(OBSERVATIONS, allowed)
         names = [name.strip() for name in text.split(",")]
