@@ -1,8 +1,25 @@
 """Control: from trajectory and world model to setpoints of every joint. Controllers are plug-ins.
 
-`controller`        the interface of a controller
-`hold`, `path_following`, `obstacle_triplet`   the shipped controllers
-`body_on_path`, `progress`, `planar_body`, `bumpless`   shared parts: a chain on a path, its position along it, the
-                    body that bends at its yaw joints, and mode changes without a jump
-`states`            the four states of the paper's Figure 6
+The interface:
+
+`controller`      what a controller is: its observation, its command and its telemetry
+
+Controllers, one per module:
+
+`hold`, `path_following`, `obstacle_triplet`, `obstacle_aided`, `undulation`, `force_feedback_wave`, `gaits`, `policy`
+`joint_check`, `identify`   motions whose recordings are evaluated afterwards
+
+Parts that controllers share:
+
+`progress`        position and speed along the path
+`bumpless`        changes of mode and reference without a jump
+`climb`           pitch angles over platforms
+`contact_forces`, `contact_search`, `push`, `push_report`, `standstill`   contacts, and what they can push
+`observations`, `goal_progress`   what a learned policy observes
+
+The process that runs a controller:
+
+`service`         calls the controller once a tick, and sends its setpoints
+`guarded`, `freshness`, `live_settings`, `update_times`   check its output, its inputs, its settings and its speed
+`state_reports`, `states`, `advance`   the messages of `control/state`, with the four states of the paper's Figure 6
 """

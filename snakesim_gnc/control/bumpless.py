@@ -21,7 +21,7 @@ from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 MIN_STIFFNESS_NM_PER_RAD = 1e-9  # avoids a division by zero for joints without a position loop
 
-Blend = Annotated[float, above(10, "s"), about("over which the command changes smoothly to a new reference")]
+Blend = Annotated[float, above(10, "s"), about("time over which the command changes smoothly to a new reference")]
 
 
 class HandOver:

@@ -1,9 +1,9 @@
-"""The joints that turn up and down, of a body whose path leads over platforms. Pure.
+"""Bends the pitch joints of a body whose path leads over platforms.
 
 The path gets a height over its arc length: the highest of all platforms' tops, with a ramp before and behind each.
-Every joint takes the bend of that line where it is, so the shape stays in its place in the world while the body slides
-on through it: the head is lifted before the edge, each link follows it, and the tail comes down last. Links are
-straight and servos give way under the weight of what they lift, so the line is a little higher than the top.
+Every joint bends as that line does where the joint is, so that the shape stays in its place in the world while the body
+slides through it: the head is lifted before the edge, each link follows it, and the tail comes down last. Links are
+straight, and servos give way under the weight of what they lift, so the line is a little higher than the top.
 """
 
 from collections.abc import Sequence
@@ -13,33 +13,52 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Rise
 
-STEEPEST = 0.35  # of a ramp: height over length
-ABOVE_M = 0.02  # of the line over a platform's top
+MAX_SLOPE = 0.35  # height over length of a ramp
+ABOVE_M = 0.02  # height of the line over the top of a platform
 
 
 def line_height_m(rises: Sequence[Rise], s_m: float) -> float:
-    """Of the path at an arc length, above the ground."""
+    """Return the height of the path above the ground at an arc length.
+
+    With the height h_i of each platform and the distance d_i to it along the path, it is
+    max(0, max_i (h_i + ABOVE_M - MAX_SLOPE d_i)).
+    """
     height_m = 0.0
     for rise in rises:
-        off_m = max(rise.from_s_m - s_m, s_m - rise.to_s_m, 0.0)
-        height_m = max(height_m, rise.height_m + ABOVE_M - STEEPEST * off_m)
+        distance_m = max(rise.from_s_m - s_m, s_m - rise.to_s_m, 0.0)
+        height_m = max(height_m, rise.height_m + ABOVE_M - MAX_SLOPE * distance_m)
     return height_m
 
 
 class Climb:
-    """Of one robot."""
+    """Computes the pitch angles of one robot."""
 
     def __init__(self, robot: Description) -> None:
         joints_s_m = np.cumsum([link.length_m for link in robot.links])
-        self._pitches = [i for i, joint in enumerate(robot.joints) if joint.axis == "pitch"]
-        self._nodes_s_m = np.concatenate(([0.0], joints_s_m[self._pitches], joints_s_m[-1:]))
-        self._count = len(robot.joints)
+        self._joint_count = len(robot.joints)
+        self._pitch_joints = [i for i, joint in enumerate(robot.joints) if joint.axis == "pitch"]
+
+        # Arc lengths of the tail end, the pitch joints and the head end on the body.
+        self._nodes_s_m = np.concatenate(([0.0], joints_s_m[self._pitch_joints], joints_s_m[-1:]))
 
     def angles_rad(self, rises: list[Rise], tail_s_m: float) -> Floats:
-        """Angles of all joints, (n_joints,), with the tail at an arc length: 0 of those that turn left and right."""
-        angles = np.zeros(self._count)
-        if rises and self._pitches:
-            line_m = np.array([line_height_m(rises, tail_s_m + s_m) for s_m in self._nodes_s_m])
-            slopes_rad = np.arcsin(np.clip(np.diff(line_m) / np.diff(self._nodes_s_m), -1.0, 1.0))
-            angles[self._pitches] = -np.diff(slopes_rad)  # down is positive
-        return angles
+        """Return the angles of all joints while the body climbs; those of yaw joints are 0.
+
+        Between two pitch joints at the line's heights z_i and z_{i+1}, a distance l_i apart, the body has the slope
+        arcsin((z_{i+1} - z_i) / l_i). The angle of a pitch joint is the negative difference of the slopes at it.
+
+        Args:
+            rises: platforms along the path.
+            tail_s_m: arc length of the tail end.
+
+        Returns:
+            (n_joints,) rad, tail to head; positive angles bend down.
+        """
+        angles_rad = np.zeros(self._joint_count)
+        if not rises or not self._pitch_joints:
+            return angles_rad
+        heights_m = np.array([line_height_m(rises, tail_s_m + s_m) for s_m in self._nodes_s_m])
+        sines = np.clip(np.diff(heights_m) / np.diff(self._nodes_s_m), -1.0, 1.0)
+        slopes_rad = np.arcsin(sines)
+        angles_rad[self._pitch_joints] = -np.diff(slopes_rad)
+        return angles_rad

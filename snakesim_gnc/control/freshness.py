@@ -1,16 +1,16 @@
-"""Whether control's inputs are fresh enough, by their stamps. Pure.
+"""Decides by their timestamps whether the inputs of control are fresh enough.
 
-Ages are in robot time, from the time of measurement. The limits are the scenario's `[max_age]`; the
-defaults follow from the normal rate of a stream:
+Ages are in robot time, from the time of measurement. The limits are the scenario's `[max_age]`. The defaults follow
+from the normal rate of a stream. "Missed" are the longer of three missed samples and 0.2 s:
 
-joints      as in the limiter: three periods or 30 ms, and the sensor's delay; at most a lease
-world       guidance's lag, and three of its turns missed, or 0.2 s
-pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s; so of a pose that the
-contacts    service `sensor` tells, by its schedule
-depth       as the pose, for the newest of all images and ranges, when the map is perceived
-trajectory  guidance's turn and lag, navigation's lag, and three of its turns missed, or 0.2 s
+joints      as in the command limiter: three periods or 30 ms, and the sensor's delay; at most one lease
+world       guidance's latency, and missed cycles of guidance
+pose,       the sensor's delay, guidance's cycle and latency, and missed samples; likewise for a pose that the
+contacts    service `sensor` publishes, by its schedule
+depth       as for the pose, for the newest of all images and ranges, if the map is perceived
+trajectory  guidance's cycle and latency, navigation's latency, and missed cycles of navigation
 
-A stamp that is further ahead of the clock than its limit is rejected as well: it is of another host, or forged.
+A timestamp that is further ahead of the clock than its limit is rejected as well: it is another host's, or forged.
 """
 
 from collections.abc import Mapping
@@ -21,88 +21,126 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.freshness import oldest_state_ns
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
-MISSED = 3
-LOOKING = (keys.DEPTH_ALL.rstrip("*"), keys.RANGE_ALL.rstrip("*"))  # sensors that a map is made from
-DEPTH = "sensor/depth or sensor/range"
+MISSED_SAMPLES = 3  # in a row that are tolerated; the fourth means that the publisher has stopped
 MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer delays them
+
+# Sensors that a map is made from: the beginnings of their keys, and their name in messages.
+DEPTH_PREFIXES = (keys.DEPTH_ALL.rstrip("*"), keys.RANGE_ALL.rstrip("*"))
+DEPTH = "sensor/depth or sensor/range"
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Maximum ages, in s; none for an absent sensor."""
+class AgeLimits:
+    """Maximum ages of the inputs of control."""
 
     joints_s: float
     world_s: float
     trajectory_s: float
-    sensors_s: dict[str, float]  # by key: inputs of a world model
+    sensors_s: dict[str, float]  # by key: the sensors that a world model is made from; none for an absent sensor
 
     @staticmethod
-    def of(config: RunConfig, robot: Description) -> "Limits":
-        """Those of a run: from its scenario, or the defaults."""
-        period_s, own = robot.period_ns * 1e-9, config.max_age
+    def from_config(config: RunConfig, robot: Description) -> "AgeLimits":
+        """Return the limits of a run: those in its scenario, or else the defaults."""
+        max_age = config.max_age
+        period_s = robot.period_ns * 1e-9
         guidance = config.services.get("guidance", Service())
         navigation = config.services.get("navigation", Service())
-        turn_s, lag_s = guidance.decimation * period_s, guidance.latency_ticks * period_s
-        plan_s = navigation.decimation * period_s
-        planned_s = turn_s + lag_s + navigation.latency_ticks * period_s
-        said = {keys.POSE: own.pose_s, keys.CONTACTS: own.contacts_s}
-        sensors_s = {
-            sensor.key: said[sensor.key] or sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz)
-            for sensor in robot.sensors
-            if sensor.key in said
-        }
-        if config.dead_reckons(robot):
-            sensors_s.pop(keys.POSE, None)
-        elif keys.POSE not in sensors_s and SENSOR in config.services and config.mission.map == "known":
-            teller = config.services[SENSOR]  # what it tells is in no description
-            told_s = teller.latency_ticks * period_s + _margin_s(teller.decimation * period_s)
-            sensors_s[keys.POSE] = own.pose_s or turn_s + lag_s + told_s
-        looking = [sensor for sensor in robot.sensors if sensor.key.startswith(LOOKING)]
-        if looking and config.mission.map == "perceived":
-            ages_s = [sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz) for sensor in looking]
-            sensors_s[DEPTH] = own.depth_s or min(ages_s)
-        return Limits(
-            joints_s=own.joints_s or oldest_state_ns(robot) * 1e-9,
-            world_s=own.world_s or lag_s + _margin_s(turn_s),
-            trajectory_s=own.trajectory_s or planned_s + _margin_s(plan_s),
-            sensors_s=sensors_s,
+        guidance_cycle_s = guidance.decimation * period_s
+        guidance_latency_s = guidance.latency_ticks * period_s
+        navigation_cycle_s = navigation.decimation * period_s
+        planned_s = guidance_cycle_s + guidance_latency_s + navigation.latency_ticks * period_s
+        return AgeLimits(
+            joints_s=max_age.joints_s or oldest_state_ns(robot) * 1e-9,
+            world_s=max_age.world_s or guidance_latency_s + _margin_s(guidance_cycle_s),
+            trajectory_s=max_age.trajectory_s or planned_s + _margin_s(navigation_cycle_s),
+            sensors_s=_sensor_limits_s(config, robot, guidance_cycle_s, guidance_latency_s),
         )
 
-    def against_joints(self, joints: JointState, now_ns: int) -> str:
-        """Why a joint state is rejected; empty when it is fresh. now_ns: robot time."""
-        return _off(keys.JOINTS, joints.timestamp_ns, now_ns, self.joints_s)
+    def check_joints(self, joints: JointState, now_ns: int) -> str:
+        """Return why a joint state is rejected at a robot time; empty if it is fresh."""
+        return _check_age(keys.JOINTS, joints.timestamp_ns, now_ns, self.joints_s)
 
-    def against_world(self, world: World, now_ns: int) -> str:
-        """Why a world model is rejected; empty when it is fresh."""
-        off = _off(keys.WORLD, world.timestamp_ns, now_ns, self.world_s)
-        if off:
-            return off
-        stamps = {
+    def check_world(self, world: World, now_ns: int) -> str:
+        """Return why a world model is rejected at a robot time; empty if it and the samples in it are fresh."""
+        why = _check_age(keys.WORLD, world.timestamp_ns, now_ns, self.world_s)
+        if why:
+            return why
+        timestamps_ns = {
             keys.POSE: world.pose_timestamp_ns,
             keys.CONTACTS: world.contacts_timestamp_ns,
             DEPTH: world.depth_timestamp_ns,
         }
-        found = [_off(key, stamps[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
-        return "; ".join(filter(None, found))
+        reasons = [_check_age(key, timestamps_ns[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
+        return "; ".join(filter(None, reasons))
 
-    def of_sensors(self, timestamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
-        """Why samples are rejected, by key. timestamps_ns: of the newest sample of each key that has had one."""
-        limits = {key: self.sensors_s[key] for key in timestamps_ns if key in self.sensors_s}
-        found = {key: _off(key, timestamps_ns[key], now_ns, limit_s) for key, limit_s in limits.items()}
-        return {key: why for key, why in found.items() if why}
+    def check_sensors(self, timestamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
+        """Check the samples that a controller gets itself.
 
-    def against_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
-        """Why a trajectory is rejected; empty when it is fresh."""
+        Args:
+            timestamps_ns: timestamp of the newest sample by key, for every key that has had one.
+            now_ns: robot time.
+
+        Returns:
+            Why samples are rejected, by key; fresh ones are left out.
+        """
+        rejected: dict[str, str] = {}
+        for key, timestamp_ns in timestamps_ns.items():
+            if key not in self.sensors_s:
+                continue
+            why = _check_age(key, timestamp_ns, now_ns, self.sensors_s[key])
+            if why:
+                rejected[key] = why
+        return rejected
+
+    def check_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
+        """Return why a trajectory is rejected at a robot time; empty if it is fresh."""
         if trajectory.timestamp_ns is None:
             return f"{keys.TRAJECTORY} was planned without a world model"
-        return _off(keys.TRAJECTORY, trajectory.timestamp_ns, now_ns, self.trajectory_s)
+        return _check_age(keys.TRAJECTORY, trajectory.timestamp_ns, now_ns, self.trajectory_s)
 
 
-def _margin_s(turn_s: float) -> float:
-    return max(MISSED * turn_s, MIN_MARGIN_S)
+def _sensor_limits_s(
+    config: RunConfig, robot: Description, guidance_cycle_s: float, guidance_latency_s: float
+) -> dict[str, float]:
+    """Return the maximum age of each sensor's sample in a world model, by key.
+
+    A sample waits for the next cycle of guidance, and the world model is published after guidance's latency.
+    """
+    max_age = config.max_age
+    configured_s = {keys.POSE: max_age.pose_s, keys.CONTACTS: max_age.contacts_s}
+    limits_s: dict[str, float] = {}
+    for sensor in robot.sensors:
+        if sensor.key in configured_s:
+            default_s = sensor.delay_s + guidance_cycle_s + guidance_latency_s + _margin_s(1.0 / sensor.rate_hz)
+            limits_s[sensor.key] = configured_s[sensor.key] or default_s
+
+    if config.dead_reckons(robot):
+        limits_s.pop(keys.POSE, None)
+    elif keys.POSE not in limits_s and SENSOR in config.services and config.mission.map == "known":
+        # The robot's description does not list what this service publishes.
+        publisher = config.services[SENSOR]
+        period_s = robot.period_ns * 1e-9
+        published_s = publisher.latency_ticks * period_s + _margin_s(publisher.decimation * period_s)
+        limits_s[keys.POSE] = max_age.pose_s or guidance_cycle_s + guidance_latency_s + published_s
+
+    if config.mission.map == "perceived":
+        depth_sensors = [sensor for sensor in robot.sensors if sensor.key.startswith(DEPTH_PREFIXES)]
+        if depth_sensors:
+            ages_s = [
+                sensor.delay_s + guidance_cycle_s + guidance_latency_s + _margin_s(1.0 / sensor.rate_hz)
+                for sensor in depth_sensors
+            ]
+            limits_s[DEPTH] = max_age.depth_s or min(ages_s)
+    return limits_s
 
 
-def _off(key: str, timestamp_ns: int | None, now_ns: int, limit_s: float) -> str:
+def _margin_s(cycle_s: float) -> float:
+    """Return how long a publisher with this cycle may be silent beyond its normal delays."""
+    return max(MISSED_SAMPLES * cycle_s, MIN_MARGIN_S)
+
+
+def _check_age(key: str, timestamp_ns: int | None, now_ns: int, limit_s: float) -> str:
+    """Return why a sample is rejected; empty if its age is within the limit. None: the world model lacks the sample."""
     if timestamp_ns is None:
         return f"{keys.WORLD} was made without {key}"
     age_s = (now_ns - timestamp_ns) * 1e-9

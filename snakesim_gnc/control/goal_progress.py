@@ -1,4 +1,4 @@
-"""Where the body is, and how far it has come: from the pose sensor and the joints, as a robot knows it."""
+"""Measures how far the body has advanced towards its goal, from the pose sensor and the joints alone."""
 
 import math
 
@@ -10,82 +10,113 @@ from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose
 
 
-class Progress:
-    """The advance of one episode, as a run's summary counts it: towards the goal, or else along the first heading."""
+class GoalProgress:
+    """The advance of one episode, as a run's summary counts it: towards the goal, or else along the first heading.
+
+    For a goal with a heading, and without a goal, the advance is the displacement of the center of mass, c, along the
+    direction d: `(c - c_0) . d`. For waypoints it is the decrease of the way from the head through all points left.
+    """
 
     def __init__(self, robot: Description, task: Task) -> None:
+        """Start at the scenario's start pose.
+
+        Args:
+            robot: description of the robot.
+            task: start pose and goal.
+        """
         self._robot = robot
-        masses = np.array([link.mass_kg for link in robot.links])
-        self._shares = masses / masses.sum()
+        masses_kg = np.array([link.mass_kg for link in robot.links])
+        self._mass_ratios = masses_kg / masses_kg.sum()  # (n_links,), of the whole
+
+        # The goal.
         self._goal = task.goal
-        self._points_m = self._goal.points_m if isinstance(self._goal, WaypointGoal) else []
-        self._next = 0
-        self._begun = False
+        self._points_m: list[tuple[float, float]] = []
+        if isinstance(self._goal, WaypointGoal):
+            self._points_m = self._goal.points_m
+        self._next_point = 0
+        self._has_started = False
+
+        # Results.
         self.pose = task.start_position_w, task.start_wxyz  # position and quaternion of the tail end
-        self.along_m = 0.0  # towards the goal, since the start
-        self.goal_m: float | None = None  # how far the goal is from the start; None: there is none
+        self.along_m = 0.0  # advance towards the goal since the start
+        self.goal_m: float | None = None  # distance of the goal from the start; None: there is no goal
 
     def update(self, joints: JointState, pose: Pose | None) -> None:
-        """Take the newest samples. Before the first pose the scenario's start is used."""
+        """Measure the advance with the newest samples. Before the first pose the scenario's start is used."""
         if pose is not None:
             self.pose = pose.position_w, pose.orientation_wxyz
-        position_w, wxyz = self.pose
-        nodes = nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
-        origins, self._head_w = nodes[:-1, :2], nodes[-1, :2]
-        halves = 0.5 * (origins[1:] + origins[:-1])
-        self.center_w = self._shares[:-1] @ halves + self._shares[-1] * 0.5 * (origins[-1] + self._head_w)
-        self.height_m = float(nodes[:-1, 2].mean())
-        forward = self._head_w - origins[0]
-        self._heading_rad = math.atan2(forward[1], forward[0])
-        if not self._begun:
-            self._begin()
-        before = self._goal_bearing()
-        self.bearing_rad = before - self._heading_rad
-        self.along_m = self._along()
+        self._locate_body(joints)
+        if not self._has_started:
+            self._has_started = True
+            self._start()
+        # The waypoint that was next until now is the goal of the bearing, also if the head has just reached it.
+        self.bearing_rad = self._goal_direction_rad() - self._heading_rad
+        self.along_m = self._measure_advance_m()
 
     @property
     def left_m(self) -> float:
-        """To the goal; 0 without one."""
-        return 0.0 if self.goal_m is None else max(self.goal_m - self.along_m, 0.0)
+        """Distance that is left to the goal; 0 without a goal."""
+        if self.goal_m is None:
+            return 0.0
+        return max(self.goal_m - self.along_m, 0.0)
 
     @property
     def reached(self) -> bool:
         """Whether there is a goal, and it has been reached."""
         return self.goal_m is not None and self.along_m >= self.goal_m
 
-    def _begin(self) -> None:
-        self._begun = True
-        self._origin_w = self.center_w
-        heading_rad = self._heading_rad
+    def _locate_body(self, joints: JointState) -> None:
+        """Compute head, center of mass, height and heading of the body from its pose and joint angles."""
+        position_w, wxyz = self.pose
+        nodes = nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
+        tail_w = nodes[0, :2]
+        self._head_w = nodes[-1, :2]
+
+        # The mass of every link is at its middle. The last link reaches from its origin to the head.
+        origins_w = nodes[:-1, :2]
+        middles_w = 0.5 * (origins_w[1:] + origins_w[:-1])
+        last_moment_w = self._mass_ratios[-1] * 0.5 * (origins_w[-1] + self._head_w)
+        self.center_w = self._mass_ratios[:-1] @ middles_w + last_moment_w
+
+        self.height_m = float(nodes[:-1, 2].mean())
+        forward_w = self._head_w - tail_w
+        self._heading_rad = math.atan2(forward_w[1], forward_w[0])
+
+    def _start(self) -> None:
+        """Fix where the advance begins, its direction, and how far the goal is."""
+        self._start_w = self.center_w
+        direction_rad = self._heading_rad
         match self._goal:
             case HeadingGoal():
-                heading_rad, self.goal_m = self._goal.heading_rad, self._goal.distance_m
+                direction_rad = self._goal.heading_rad
+                self.goal_m = self._goal.distance_m
             case WaypointGoal():
-                self.goal_m = self._to_go()
+                self.goal_m = self._measure_way_left_m()
             case None:
-                to_head = self._head_w - self.center_w
-                heading_rad = math.atan2(to_head[1], to_head[0])
-        self._direction_rad = heading_rad
-        self._forward = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+                center_to_head_w = self._head_w - self.center_w
+                direction_rad = math.atan2(center_to_head_w[1], center_to_head_w[0])
+        self._direction_rad = direction_rad
+        self._direction_w = np.array([math.cos(direction_rad), math.sin(direction_rad)])
 
-    def _goal_bearing(self) -> float:
-        """Direction of the goal in the world; of the next point while there is one."""
-        if self._next < len(self._points_m):
-            x, y = np.subtract(self._points_m[self._next], self._head_w)
+    def _goal_direction_rad(self) -> float:
+        """Return the direction in the world of the next waypoint from the head, or else that of the goal."""
+        if self._next_point < len(self._points_m):
+            x, y = np.subtract(self._points_m[self._next_point], self._head_w)
             return math.atan2(y, x)
         return self._direction_rad
 
-    def _along(self) -> float:
+    def _measure_advance_m(self) -> float:
         if not isinstance(self._goal, WaypointGoal):
-            return float((self.center_w - self._origin_w) @ self._forward)
-        while self._next < len(self._points_m) and self._head_to(self._next) <= self._goal.within_m:
-            self._next += 1
-        return (self.goal_m or 0.0) - self._to_go()
+            return float((self.center_w - self._start_w) @ self._direction_w)
+        while self._next_point < len(self._points_m) and self._distance_to_next_m() <= self._goal.within_m:
+            self._next_point += 1
+        return (self.goal_m or 0.0) - self._measure_way_left_m()
 
-    def _to_go(self) -> float:
-        points = self._points_m[self._next :]
-        legs = np.diff(np.vstack([self._head_w, *points]), axis=0)
-        return float(np.hypot(*legs.T).sum())
+    def _measure_way_left_m(self) -> float:
+        """Return the length of the way from the head through all waypoints that it has not reached yet."""
+        points_m = self._points_m[self._next_point :]
+        legs_m = np.diff(np.vstack([self._head_w, *points_m]), axis=0)
+        return float(np.hypot(*legs_m.T).sum())
 
-    def _head_to(self, point: int) -> float:
-        return float(np.hypot(*np.subtract(self._points_m[point], self._head_w)))
+    def _distance_to_next_m(self) -> float:
+        return float(np.hypot(*np.subtract(self._points_m[self._next_point], self._head_w)))

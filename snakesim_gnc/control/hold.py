@@ -1,4 +1,4 @@
-"""Hold: every joint stays at its angle at arming. The control experiment, and the safest controller."""
+"""Holds every joint at its angle at arming. This is the control condition of experiments, and the safest controller."""
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.model.files import FileStruct
@@ -6,7 +6,7 @@ from snakesim_hal.wire.messages import Description
 
 
 class Hold:
-    """Keeps the pose."""
+    """Keeps the pose of the first view."""
 
     NEEDS = "joints"
 
@@ -15,10 +15,10 @@ class Hold:
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
-        self._angles_rad: list[float] | None = None
+        self._angles_rad: list[float] | None = None  # None: there has been no view yet
 
     def update(self, view: View) -> Action:
-        """The angles of the first view, for ever."""
+        """Return the angles of the first view."""
         if self._angles_rad is None:
             self._angles_rad = list(view.joints.angle_rad)
         return Action(positions(self._robot, self._angles_rad), Report(why="holding", reference_rad=self._angles_rad))

@@ -1,13 +1,14 @@
-"""Moves all joints at once so that a record tells friction, rotor inertia, torque constant and response of each.
+"""Moves all joints at once, so that a recording shows friction, rotor inertia, torque constant and response of each.
 
-For a robot that hangs by its tail, head down: on the ground, friction under the body would be taken for that of joints.
-Each joint goes slowly back and forth, for dry friction, and on top shakes at frequencies of its own, none of which
-another joint has. Neighbors start in opposite directions, so that the body stays near the vertical. The record is
-judged by `snakesim identify`.
+The robot hangs by its tail, head down: on the ground, friction under the body would count as friction of the joints.
+Each joint moves slowly back and forth, which shows dry friction, and on top of that shakes at frequencies that no other
+joint has. Neighbors start in opposite directions, so that the body stays near the vertical. `snakesim identify`
+evaluates the recording.
 """
 
 import math
 import random
+from dataclasses import dataclass
 from typing import Annotated
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
@@ -15,14 +16,32 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, bounded
 
-MARGIN_RAD = 0.02  # left before a limit
-SPEED_SHARE = 0.8  # of the joint's limit
-SPREAD = 4  # tones of a joint; each within its quarter of the band
-SEED = 25
+MARGIN_RAD = 0.02  # between a target and the joint's limit
+SPEED_RATIO = 0.8  # of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself
+TONES_PER_JOINT = 4  # one in each quarter of the band
+BAND_RATIO = 10  # of the highest to the lowest frequency
+SEED = 25  # of the phases, so that every run moves alike
+
+
+@dataclass(frozen=True)
+class Tone:
+    """One of the sine waves that a joint shakes with."""
+
+    frequency_hz: float
+    amplitude: float  # as a fraction of the joint's whole shaking
+    phase_rad: float
 
 
 class Identify:
-    """A slow triangle and four tones for each joint, faded in; by position targets."""
+    """Sends position targets: for each joint a slow triangle wave and four tones, which fade in.
+
+    With the triangle wave w of period T_i, and with the tones' frequencies f_ik, amplitudes a_ik and phases p_ik, the
+    target of joint i at time t is its start angle plus
+
+        sign_i swing w(t / T_i) + shake sum_k a_ik sin(2 pi f_ik (t - t_shake) + p_ik)
+
+    Targets stay within the joint's limits of angle and speed.
+    """
 
     NEEDS = "joints"
     MEASURES = ("torque",)
@@ -31,58 +50,94 @@ class Identify:
         """How far and how fast."""
 
         swing_rad: Annotated[float, bounded(0.01, 0.5, "rad"), about("slow motion to either side")] = 0.25
-        swing_s: Annotated[float, bounded(0.5, 60.0, "s"), about("of the shortest slow motion there and back")] = 2.0
-        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad"), about("sum of all tones, at most")] = 0.05
+        swing_s: Annotated[
+            float, bounded(0.5, 60.0, "s"), about("period of the fastest slow motion, there and back")
+        ] = 2.0
+        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad"), about("maximum of the sum of all tones")] = 0.05
         shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz"), about("highest tone; the lowest is a tenth")] = 6.0
-        shake_after_s: Annotated[float, bounded(0.0, 600.0, "s"), about("slow motion alone, before")] = 6.0
-        fade_s: Annotated[float, bounded(0.1, 10.0, "s"), about("until each reaches its full size")] = 0.5
+        shake_after_s: Annotated[
+            float, bounded(0.0, 600.0, "s"), about("time with the slow motion alone, before the shaking")
+        ] = 6.0
+        fade_s: Annotated[float, bounded(0.1, 10.0, "s"), about("time until each motion reaches its full size")] = 0.5
 
     def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot, self._settings = robot, settings
-        self._start_rad: list[float] = []
-        self._last_rad: list[float] = []
-        self._tones = tones(len(robot.joints), settings.shake_to_hz)
+        self._robot = robot
+        self._settings = settings
+        self._tones = make_tones(len(robot.joints), settings.shake_to_hz)
+        self._start_rad: list[float] = []  # empty: there has been no view yet
+        self._last_rad: list[float] = []  # targets of the tick before
 
     def update(self, view: View) -> Action:
-        """The next targets; they stay within the limits of every joint."""
-        settings = self._settings
+        """Return the next targets, within the limits of every joint."""
         if not self._start_rad:
             self._start_rad = list(view.joints.angle_rad)
-        slow = settings.swing_rad * min(view.time_s / settings.fade_s, 1.0)
-        shaking_s = view.time_s - settings.shake_after_s
-        fast = settings.shake_rad * min(max(shaking_s / settings.fade_s, 0.0), 1.0)
-        targets: list[float] = []
+        swing_rad = self._settings.swing_rad * self._fade_in(view.time_s)
+        shaking_s = view.time_s - self._settings.shake_after_s
+        shake_rad = self._settings.shake_rad * self._fade_in(shaking_s)
+        targets_rad: list[float] = []
         for i, joint in enumerate(self._robot.joints):
-            period_s = settings.swing_s * (1 + i / (2 * len(self._robot.joints)))
-            tone = sum(share * math.sin(math.tau * hz * shaking_s + phase) for hz, share, phase in self._tones[i])
-            offset = (-1) ** (i // 2 + i) * slow * triangle(view.time_s / period_s) + fast * tone
-            least, most = joint.angle_min_rad + MARGIN_RAD, joint.angle_max_rad - MARGIN_RAD
-            targets.append(min(max(self._start_rad[i] + offset, least), most))
+            offset_rad = self._swing(i, view.time_s, swing_rad) + self._shake(i, shaking_s, shake_rad)
+            min_rad = joint.angle_min_rad + MARGIN_RAD
+            max_rad = joint.angle_max_rad - MARGIN_RAD
+            targets_rad.append(min(max(self._start_rad[i] + offset_rad, min_rad), max_rad))
         if self._last_rad:
-            steps = [SPEED_SHARE * joint.speed_limit_rad_s * view.period_s for joint in self._robot.joints]
-            targets = [
-                min(max(target, before - step), before + step)
-                for target, before, step in zip(targets, self._last_rad, steps, strict=True)
-            ]
-        self._last_rad = targets
-        why = "shaking every joint" if fast else "slowly back and forth, every joint"
-        return Action(positions(self._robot, targets), Report(why=why, reference_rad=targets))
+            targets_rad = self._limit_speed(targets_rad, view.period_s)
+        self._last_rad = targets_rad
+        why = "shaking every joint" if shake_rad else "slowly back and forth, every joint"
+        return Action(positions(self._robot, targets_rad), Report(why=why, reference_rad=targets_rad))
+
+    def _fade_in(self, time_s: float) -> float:
+        """Return the fraction of the full size at a time after the beginning of a motion, 0 to 1."""
+        return min(max(time_s / self._settings.fade_s, 0.0), 1.0)
+
+    def _swing(self, i: int, time_s: float, swing_rad: float) -> float:
+        """Return the slow motion of a joint. The period grows towards the head, to one and a half times the first."""
+        period_s = self._settings.swing_s * (1 + i / (2 * len(self._robot.joints)))
+        sign = (-1) ** (i // 2 + i)
+        return sign * swing_rad * triangle_wave(time_s / period_s)
+
+    def _shake(self, i: int, shaking_s: float, shake_rad: float) -> float:
+        """Return the shaking of a joint."""
+        total = sum(
+            tone.amplitude * math.sin(math.tau * tone.frequency_hz * shaking_s + tone.phase_rad)
+            for tone in self._tones[i]
+        )
+        return shake_rad * total
+
+    def _limit_speed(self, targets_rad: list[float], period_s: float) -> list[float]:
+        """Return targets that no joint has to move too fast for."""
+        limited_rad: list[float] = []
+        for joint, target_rad, last_rad in zip(self._robot.joints, targets_rad, self._last_rad, strict=True):
+            max_step_rad = SPEED_RATIO * joint.speed_limit_rad_s * period_s
+            limited_rad.append(min(max(target_rad, last_rad - max_step_rad), last_rad + max_step_rad))
+        return limited_rad
 
 
-def triangle(turns: float) -> float:
-    """From 0 up to 1, down to -1, and back, in one turn."""
-    return 4 * abs((turns - 0.25) % 1.0 - 0.5) - 1.0
+def triangle_wave(cycles: float) -> float:
+    """Return a triangle wave after a number of cycles: from 0 up to 1, down to -1, and back to 0 in one cycle."""
+    return 4 * abs((cycles - 0.25) % 1.0 - 0.5) - 1.0
 
 
-def tones(joints: int, to_hz: float) -> list[list[tuple[float, float, float]]]:
-    """Frequency, share and phase of each joint's tones: no two joints have one in common, and shares sum to 1."""
-    pick = random.Random(SEED)
-    min_rate_hz = to_hz / 10
-    count = SPREAD * joints
-    grid_hz = [min_rate_hz * (to_hz / min_rate_hz) ** (k / max(count - 1, 1)) for k in range(count)]
-    made: list[list[tuple[float, float, float]]] = []
-    for i in range(joints):
-        own = [grid_hz[i + joints * k] for k in range(SPREAD)]
-        whole = sum(hz**-0.5 for hz in own)
-        made.append([(hz, hz**-0.5 / whole, pick.uniform(0, math.tau)) for hz in own])
-    return made
+def make_tones(joint_count: int, max_hz: float) -> list[list[Tone]]:
+    """Make the tones of each joint.
+
+    The frequencies are in geometric progression from max_hz / BAND_RATIO to max_hz, and no two joints have one in
+    common. Amplitudes are proportional to 1 / sqrt(frequency), and those of a joint sum to 1.
+
+    Args:
+        joint_count: number of joints.
+        max_hz: highest frequency.
+
+    Returns:
+        TONES_PER_JOINT tones of each joint, tail to head.
+    """
+    rng = random.Random(SEED)
+    min_hz = max_hz / BAND_RATIO
+    count = TONES_PER_JOINT * joint_count
+    frequencies_hz = [min_hz * (max_hz / min_hz) ** (k / max(count - 1, 1)) for k in range(count)]
+    tones: list[list[Tone]] = []
+    for i in range(joint_count):
+        joint_hz = [frequencies_hz[i + joint_count * k] for k in range(TONES_PER_JOINT)]
+        total = sum(hz**-0.5 for hz in joint_hz)
+        tones.append([Tone(hz, hz**-0.5 / total, rng.uniform(0, math.tau)) for hz in joint_hz])
+    return tones

@@ -1,7 +1,7 @@
 """Joint check: moves one joint after another a little to one side, back, to the other side and back, from tail to head.
 
-The other joints hold. The load of each gear reverses on the way, so that its backlash shows. What the motors, the
-encoders and the IMUs measure is judged afterwards, from the record: `snakesim joints check`.
+The other joints hold. The load of each gear reverses on the way, so that its backlash shows. `snakesim joints check`
+evaluates afterwards what the motors, the encoders and the IMUs measured.
 """
 
 from enum import Enum, auto
@@ -12,11 +12,11 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about, bounded
 
-MARGIN_RAD = 0.02  # left before a limit
+MARGIN_RAD = 0.02  # between a target and the joint's limit
 
 
 class _Phase(Enum):
-    """What the joint does whose motion it is."""
+    """What the joint that is under test does."""
 
     REST = auto()
     OUT = auto()
@@ -24,7 +24,7 @@ class _Phase(Enum):
 
 
 class JointCheck:
-    """Each joint away from its nearer limit until its encoder says that it moved, and back; then to the other side."""
+    """Moves each joint away from its nearer limit until its encoder shows the motion, and back; then the other way."""
 
     NEEDS = "joints"
 
@@ -32,30 +32,36 @@ class JointCheck:
         """How far, how fast, and when to give up."""
 
         move_rad: Annotated[float, bounded(0.01, 0.2, "rad"), about("how far each joint moves to either side")] = 0.06
-        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("of a target")] = 0.3
+        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("speed of a target")] = 0.3
         give_up_rad: Annotated[
             float,
             bounded(0.02, 0.5, "rad"),
             about("a joint that has not moved when its target is so far away is left, and the next one follows"),
         ] = 0.15
-        rest_s: Annotated[float, bounded(0.02, 5.0, "s"), about("before each of its two motions, and after")] = 0.15
+        rest_s: Annotated[
+            float, bounded(0.02, 5.0, "s"), about("rest before each of its two motions, and after them")
+        ] = 0.15
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
         self._settings = settings
-        self._start_rad: list[float] = []
-        self._joint = 0  # whose motion it is
-        self._sides: list[int] = []  # that it has still to move to: +1, -1
+        self._start_rad: list[float] = []  # empty: there has been no view yet
+
+        # The joint under test.
+        self._joint = 0
+        self._sides: list[int] = []  # the sides to which it still has to move: +1, -1
+        self._before_rad = 0.0  # measured before the motion; a drive without current may have let it sink
+
+        # Its present motion.
         self._phase = _Phase.REST
         self._rested_s = 0.0
-        self._offset_rad = 0.0  # of its target from its start
-        self._before_rad = 0.0  # its angle before the motion: without current, it may not be where it was
+        self._offset_rad = 0.0  # between its target and its start angle
 
     def update(self, view: View) -> Action:
-        """Return the next target of the joint whose motion it is; all others hold."""
+        """Return the next target of the joint under test; all others hold."""
         if not self._start_rad:
             self._start_rad = list(view.joints.angle_rad)
-            self._sides = self._sides_of(self._joint)
+            self._sides = self._plan_sides(self._joint)
         if self._joint == len(self._robot.joints):
             return self._hold("every joint was moved")
         name = self._robot.joints[self._joint].name
@@ -89,12 +95,13 @@ class JointCheck:
         self._phase = _Phase.OUT
 
     def _begin_joint(self, joint: int) -> None:
+        """Test another joint; the number of joints means that all have been tested."""
         self._joint = joint
         if joint < len(self._robot.joints):
-            self._sides = self._sides_of(joint)
+            self._sides = self._plan_sides(joint)
 
     def _move_out(self, view: View) -> None:
-        """Move the target on until the joint has moved as far as it should, or cannot."""
+        """Move the target further until the joint has moved as far as it should, or does not follow."""
         settings = self._settings
         self._offset_rad += settings.speed_rad_s * view.period_s
         moved_rad = abs(view.joints.angle_rad[self._joint] - self._before_rad)
@@ -102,27 +109,32 @@ class JointCheck:
         if moved_rad >= settings.move_rad:
             self._phase = _Phase.BACK
         elif self._offset_rad >= furthest_rad:
-            # A joint that does not follow is not asked a second time.
+            # A joint that does not follow is not moved to the other side.
             del self._sides[1:]
             self._phase = _Phase.BACK
 
     def _move_back(self, view: View) -> None:
+        """Move the target back to the start angle."""
         self._offset_rad -= self._settings.speed_rad_s * view.period_s
         if self._offset_rad <= 0:
             self._offset_rad = 0.0
             del self._sides[0]
             self._phase = _Phase.REST
 
-    def _sides_of(self, joint: int) -> list[int]:
-        """Return the sides to which a joint moves: first away from the nearer limit, then towards it if it has room."""
+    def _plan_sides(self, joint: int) -> list[int]:
+        """Return the sides to which a joint moves: first away from the nearer limit, then back if there is room."""
         limits = self._robot.joints[joint]
-        away = 1 if 2 * self._start_rad[joint] <= limits.angle_min_rad + limits.angle_max_rad else -1
+        is_nearer_to_minimum = 2 * self._start_rad[joint] <= limits.angle_min_rad + limits.angle_max_rad
+        away = 1 if is_nearer_to_minimum else -1
         has_room = self._room_rad(joint, -away) > self._settings.move_rad + MARGIN_RAD
-        return [away, -away] if has_room else [away]
+        if has_room:
+            return [away, -away]
+        return [away]
 
     def _room_rad(self, joint: int, side: int) -> float:
-        """Return how far a joint's target may go from its start to a side."""
+        """Return how far a joint's target may move from its start angle to a side."""
         limits = self._robot.joints[joint]
         start_rad = self._start_rad[joint]
-        distance_rad = limits.angle_max_rad - start_rad if side > 0 else start_rad - limits.angle_min_rad
-        return distance_rad - MARGIN_RAD
+        if side > 0:
+            return limits.angle_max_rad - start_rad - MARGIN_RAD
+        return start_rad - limits.angle_min_rad - MARGIN_RAD

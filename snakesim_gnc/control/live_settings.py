@@ -1,7 +1,8 @@
-"""The controller's settings: from the configuration, and then as operators change them while it runs.
+"""The settings of the controller: first those of the configuration, later as operators change them during the run.
 
 A request is answered between two ticks. It is refused, and nothing changes, unless the controller accepts all values
-and can be made with them. Then the controller is made again: it takes over from the measured state, as after an arming.
+and can be constructed with them. After a change the controller is constructed again: it takes over from the measured
+state, as it does after an arming.
 """
 
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import msgspec
 
 from snakesim_gnc.control.controller import Controller
-from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
@@ -22,24 +23,34 @@ from snakesim_hal.wire.codec import UNDECODABLE, Decoder
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, Description, SettingsRequest
 from snakesim_hal.wire.quantities import MAX_SCHEMA, MAX_SETTINGS
 
-MAX_WAITING = 8  # later requests displace the oldest, which gets no answer
+MAX_WAITING_REQUESTS = 8  # a later request displaces the oldest, which gets no answer
+MAX_REASON = 500  # characters of a refusal, as the wire allows
+MAX_LOGGED = 2000  # characters of settings in the log
+MAX_NAME = 64  # characters of a controller's name on the wire; the end of a path tells more than its beginning
 
 
 class LiveSettings:
-    """The settings in force. Makes controllers with them."""
+    """The settings in force. Constructs controllers with them."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Finds the controller and checks its settings. Raises ConfigError."""
-        self._client, self._config = client, config
+        """Find the controller and check its settings. Raises ConfigError."""
+        self._client = client
+        self._config = config
+
+        # The controller.
         self.plugin: type[Controller] = find_plugin(CONTROLLERS, config.controller)
-        self._name = config.controller[-64:]
-        self._settings = self._checked(config.control_settings, f"scenario {config.name!r}")
-        self._waiting: Mailbox[Question] = Mailbox((MAX_WAITING,))
+        self._name = config.controller[-MAX_NAME:]
+        self._robot: Description | None = None  # None: `configure` has not been called yet
+
+        # The settings in force.
+        self._settings = self._check_settings(config.control_settings, f"scenario {config.name!r}")
+        self._changed_by: str | None = None  # None: they are those of the configuration
+        self._change_count = 0
+        self._published_change = -1  # number of the change that was published last
+
+        # Requests and publications.
+        self._waiting: Mailbox[Question] = Mailbox((MAX_WAITING_REQUESTS,))
         self._decoder = Decoder(SettingsRequest)
-        self._robot: Description | None = None
-        self._by: str | None = None
-        self._changes = 0
-        self._published = -1  # number of the change that was published last
         client.session.on_question(keys.SETTINGS, self._waiting.put)
         self._publisher = client.session.latched_publisher(keys.SETTINGS_IN_FORCE, ControlSettings)
 
@@ -49,55 +60,69 @@ class LiveSettings:
         return getattr(self.plugin, "SENSES", False)
 
     def configure(self, robot: Description) -> None:
-        """For this robot from now on, whose time may have started over."""
-        self._robot, self._published = robot, -1
+        """Use this robot from now on. The settings are published again, because its time may have started over."""
+        self._robot = robot
+        self._published_change = -1
 
-    def controller(self) -> Guarded:
-        """A new controller with the settings in force. Raises ControllerError."""
-        return self._made(self._settings)
+    def construct_controller(self) -> GuardedController:
+        """Construct a controller with the settings in force. Raises ControllerError."""
+        return self._construct(self._settings)
 
-    def turn(self, clock: Clock) -> bool:
-        """Answer all requests that wait, and publish what is new; whether a controller must be made again."""
-        before = self._changes
+    def answer_requests(self, clock: Clock) -> bool:
+        """Answer all waiting requests, and publish the settings if they are new.
+
+        Returns:
+            Whether the settings have changed, so that the controller must be constructed again.
+        """
+        count_before = self._change_count
         while not self._waiting.empty():
             question = self._waiting.get_nowait()
-            question.reply(self._answer(question))
-        if self._published != self._changes:
-            self._published = self._changes
+            answer = self._answer_request(question)
+            question.reply(answer)
+        if self._published_change != self._change_count:
+            self._published_change = self._change_count
             self._publish(clock)
-        return self._changes != before
+        return self._change_count != count_before
 
-    def _answer(self, question: Question) -> Answer:
+    def _answer_request(self, question: Question) -> Answer:
+        """Put the settings of a request in force if the controller accepts them."""
         try:
             request = self._decoder.decode(question.payload, question.encoding)
         except WireError as error:
-            return Answer(ok=False, reason=str(error)[:500], refusal=error.reason)
+            return Answer(ok=False, reason=str(error)[:MAX_REASON], refusal=error.reason)
         if request.controller != self._name:
-            return Answer(
-                ok=False, reason=f"the controller is {self._name}, not {request.controller}", refusal="wrong_controller"
-            )
+            reason = f"the controller is {self._name}, not {request.controller}"
+            return Answer(ok=False, reason=reason, refusal="wrong_controller")
         try:
-            asked = msgspec.json.decode(request.settings, type=dict[str, Any])
-            settings = self._checked(asked, f"request of {request.who!r}")
-            self._made(settings)
+            section = msgspec.json.decode(request.settings, type=dict[str, Any])
+            settings = self._check_settings(section, f"request of {request.who!r}")
+            self._construct(settings)  # a trial: a constructor may refuse more than the schema does
         except (ConfigError, ControllerError, *UNDECODABLE) as error:
-            return Answer(ok=False, reason=str(error)[:500], refusal="bad_settings")
-        self._settings, self._by, self._changes = settings, request.who, self._changes + 1
-        print_stderr(f"settings changed by {request.who!r}: {_in_json(settings)[:2000]}")
+            return Answer(ok=False, reason=str(error)[:MAX_REASON], refusal="bad_settings")
+        self._settings = settings
+        self._changed_by = request.who
+        self._change_count += 1
+        print_stderr(f"settings changed by {request.who!r}: {_to_json(settings)[:MAX_LOGGED]}")
         return Answer(ok=True, reason=f"{self._name} has the settings of {request.who}")
 
-    def _checked(self, section: dict[str, Any], source: str) -> Any:
+    def _check_settings(self, section: dict[str, Any], source: str) -> Any:
+        """Return the controller's settings from a section of TOML or JSON; `source` is named in a ConfigError."""
         return plugin_settings(self.plugin, section, source, self._config.control_section)
 
-    def _made(self, settings: Any) -> Guarded:
+    def _construct(self, settings: Any) -> GuardedController:
         if self._robot is None:
             raise ControllerError("control has not met the robot yet")
-        return Guarded(self._config.controller, self.plugin, self._robot, settings)
+        return GuardedController(self._config.controller, self.plugin, self._robot, settings)
 
     def _publish(self, clock: Clock) -> None:
-        settings, schema = _in_json(self._settings), _schema(type(self._settings))
+        """Publish the settings in force, unless they or their schema are too long for a message.
+
+        Clients cannot change what is not published.
+        """
+        settings = _to_json(self._settings)
+        schema = _make_schema(type(self._settings))
         if len(settings) > MAX_SETTINGS or len(schema) > MAX_SCHEMA:
-            return  # this controller's settings cannot be changed while it runs
+            return
         self._publisher.put(
             ControlSettings(
                 tick=clock.tick,
@@ -105,19 +130,19 @@ class LiveSettings:
                 controller=self._name,
                 settings=settings,
                 schema=schema,
-                who=self._by,
-                changes=self._changes,
+                who=self._changed_by,
+                changes=self._change_count,
             )
         )
 
 
-def _in_json(settings: Any) -> str:
+def _to_json(settings: Any) -> str:
     return msgspec.json.encode(settings).decode()
 
 
-def _schema(settings: type[msgspec.Struct]) -> str:
-    """The JSON Schema; of a type that has none an empty one, which allows anything."""
+def _make_schema(settings_type: type[msgspec.Struct]) -> str:
+    """Return the JSON Schema of settings. For a type that has none it is empty, which allows anything."""
     try:
-        return msgspec.json.encode(msgspec.json.schema(settings)).decode()
+        return msgspec.json.encode(msgspec.json.schema(settings_type)).decode()
     except (TypeError, ValueError):
         return "{}"

@@ -112,9 +112,7 @@ class ObstacleAided:
             from_zero(1000, "N*m"),
             about("bound of a joint's torque for pushing"),
         ] = 5.0
-        max_contact_n: Annotated[float, above(1000, "N"), about("bound of the force that is asked of one contact")] = (
-            60.0
-        )
+        max_contact_n: Annotated[float, above(1000, "N"), about("bound of the desired force on one contact")] = 60.0
         reach_m: Annotated[float, above(1, "m"), about("an obstacle so near to the body is pushed")] = 0.03
         contact_gap_scale_m: Annotated[
             float, above(1, "m"), about("gap to an obstacle at which a contact counts half")
@@ -128,15 +126,17 @@ class ObstacleAided:
         search_after_s: Annotated[
             float,
             from_zero(1000, "s"),
-            about("in which the body comes no 2 cm on, until it moves by a wave in search of contacts; 0: never"),
+            about("after so long with less than 2 cm of advance the body searches for contacts by a wave; 0: never"),
         ] = 1.2
-        search_s: Annotated[float, above(1000, "s"), about("how long it does so, and then tries its path again")] = 30.0
+        search_s: Annotated[
+            float, above(1000, "s"), about("duration of a search, after which the body tries its path again")
+        ] = 30.0
         blend_s: Blend = 0.3
         speed_filter_s: SpeedFilter = 0.05
         no_contact_cost: Annotated[
             float,
             from_zero(1000, "1"),
-            about("how many times dearer the force on an obstacle is that is not felt; 0: as dear as on others"),
+            about("added cost of a force on an obstacle without measured contact; 0: it costs as much as on others"),
         ] = 10.0
         shape_nm_per_rad: Annotated[
             float,

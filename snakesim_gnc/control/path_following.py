@@ -1,7 +1,12 @@
 """Path following: every joint in position mode, towards a body pose slightly further along the path.
 
-The obstacles turn the change of shape into motion. The reference moves with the mission's speed, but never more than
-`look_ahead_m` ahead of the measured body, so a blocked snake does not wind up.
+The obstacles turn the change of shape into motion. With the arc length s of the tail end, the mission's speed v, the
+period T and the look-ahead L, the reference is the pose of the body at the arc length
+
+    s_ref = min(max(s_ref + v T, s), s + L)
+
+so that it moves with the mission's speed, but never further than L ahead of the measured body: a blocked snake does
+not wind up.
 """
 
 from typing import Annotated
@@ -17,7 +22,7 @@ from snakesim_hal.wire.quantities import about, from_zero
 
 
 class PathFollowing:
-    """Shape control along a path; does not use obstacles."""
+    """Controls the shape of the body along a path. It does not use the positions of obstacles."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
@@ -32,22 +37,25 @@ class PathFollowing:
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._set = settings
-        self._body, self._climb = PlanarBody(robot), Climb(robot)
+        self._body = PlanarBody(robot)
+        self._climb = Climb(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
         self._bumpless = BumplessReference(robot, settings.blend_s)
-        self._ahead_s_m = 0.0
+        self._reference_s_m = 0.0  # s_ref
 
     def update(self, view: View) -> Action:
-        """Angles of the body slightly further along the path."""
+        """Return the joint angles of the body slightly further along the path; hold if its position is unknown."""
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._bumpless.hold(view, located)
         tail_s_m = located.tail_s_m
         if located.restarted:
-            self._ahead_s_m = tail_s_m
-        advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
-        self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
-        reference = self._body.all_angles(located.on_path.pose_at(self._ahead_s_m))
-        reference = reference + self._climb.angles_rad(located.trajectory.rises, self._ahead_s_m)
-        setpoints = self._bumpless.follow(view, reference, restarted=located.restarted)
-        return Action(setpoints, Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))
+            self._reference_s_m = tail_s_m
+        advanced_s_m = self._reference_s_m + located.trajectory.speed_m_s * view.period_s
+        self._reference_s_m = min(max(advanced_s_m, tail_s_m), tail_s_m + self._set.look_ahead_m)
+
+        yaw_rad = self._body.all_angles(located.on_path.pose_at(self._reference_s_m))
+        pitch_rad = self._climb.angles_rad(located.trajectory.rises, self._reference_s_m)
+        reference_rad = yaw_rad + pitch_rad
+        setpoints = self._bumpless.follow(view, reference_rad, restarted=located.restarted)
+        return Action(setpoints, Report(path_s_m=tail_s_m, reference_rad=reference_rad.tolist()))

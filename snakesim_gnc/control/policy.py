@@ -1,6 +1,7 @@
-"""A learned policy as a controller: an ONNX model from what the sensors say to a target for every joint.
+"""A learned policy as a controller: an ONNX model that maps an observation to one target for each joint.
 
-The model says in its metadata what it takes and gives; units are in the names. All of that is checked when it is made.
+The metadata of the model name its observation, its action, its number of joints and its frame skip. All of them are
+checked against the robot when the model is loaded.
 """
 
 import contextlib
@@ -13,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_gnc.control.observations import Observer, Part, chosen, parts_of
+from snakesim_gnc.control.observations import ObservationPart, Observer, chosen, make_parts
 from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import SHIPPED, FileStruct, expanded
 from snakesim_hal.model.plugins import pip_install
@@ -23,48 +24,82 @@ from snakesim_hal.wire.quantities import about
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 RUNTIME: Any = None
-with contextlib.suppress(ModuleNotFoundError):  # as this file is loaded: an arming, which makes the policy, cannot wait
+with contextlib.suppress(ModuleNotFoundError):
+    # Imported when this file is loaded: the policy is constructed while the robot arms, and that must not wait.
     import onnxruntime
 
     RUNTIME = onnxruntime
 
-OBSERVATIONS, ACTION = "snakesim.observations", "snakesim.action"
-JOINTS, FRAME_SKIP = "snakesim.joints", "snakesim.frame_skip"
+# Names of the metadata properties.
+OBSERVATIONS = "snakesim.observations"
+ACTION = "snakesim.action"
+JOINTS = "snakesim.joints"
+FRAME_SKIP = "snakesim.frame_skip"
+
 MODES = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
-MAX_FRAME_SKIP = 1000
-POLICIES, SUFFIX = SHIPPED / "policies", ".onnx"
+MAX_FRAME_SKIP = 1000  # ticks; a longer pause between two targets is a mistake
+MAX_DIGITS = 9  # of a number in the metadata; more digits are a mistake
+
+# Shipped policies.
+POLICIES = SHIPPED / "policies"
+SUFFIX = ".onnx"
 
 
 class Model:
-    """A model from a file, and what its metadata say. Callable: an observation in, targets out."""
+    """A model from a file, with what its metadata say. Calling it computes targets from an observation."""
 
     def __init__(self, robot: Description, file: str) -> None:
-        """Raises ConfigError that names the file, the field, its value and what is expected."""
-        self._session, given = opened(file)
-        fields = _Metadata(file, given)
-        self.parts = fields.parts(robot)
-        self.action = fields.one_of(ACTION, MODES)
-        self.frame_skip = fields.whole(FRAME_SKIP, MAX_FRAME_SKIP, "ticks")
-        count = len(robot.joints)
-        joints = fields.whole(JOINTS)
-        if joints != count:
-            raise fields.wrong(JOINTS, joints, f"{count}, the number of joints of robot {robot.robot!r}")
-        for joint in robot.joints:
-            if not joint.has(MODES[self.action]):
-                has = [name for name, mode in MODES.items() if joint.has(mode)]
-                raise fields.wrong(ACTION, self.action, f"what {joint.name} can do: {', '.join(has)}")
-            if "torque_nm" in self.parts and "torque" not in joint.measures:
-                raise fields.wrong(OBSERVATIONS, ",".join(self.parts), f"without torque_nm: {joint.name} measures none")
+        """Load the model and check that it fits the robot.
+
+        Args:
+            robot: the robot that the model is going to move.
+            file: path of an ONNX file, or the name of a shipped policy.
+
+        Raises:
+            ConfigError: the model does not fit; the error names the file, the field, its value and what is expected.
+        """
+        self._session, properties = opened(file)
+        metadata = _Metadata(file, properties)
+
+        # What the model observes and returns.
+        self.parts = metadata.read_parts(robot)
+        self.action = metadata.read_choice(ACTION, MODES)
+        self.frame_skip = metadata.read_integer(FRAME_SKIP, MAX_FRAME_SKIP, "ticks")  # ticks per inference
+        _check_joints(metadata, robot, self.action, self.parts)
+
+        # Names of the model's tensors.
         width = sum(len(part.names) for part in self.parts.values())
-        self._input = _only("input", self._session.get_inputs(), width, ", ".join(self.parts), file)
-        self._output = _only("output", self._session.get_outputs(), count, "a target for each joint", file)
+        joint_count = len(robot.joints)
+        self._input = _check_tensor("input", self._session.get_inputs(), width, ", ".join(self.parts), file)
+        self._output = _check_tensor(
+            "output", self._session.get_outputs(), joint_count, "a target for each joint", file
+        )
 
     def __call__(self, observation: NDArray[np.float32]) -> list[float]:
-        return self._session.run([self._output], {self._input: observation[None]})[0][0].tolist()
+        """Return the targets of all joints, tail to head, for an observation of shape (width,)."""
+        batch = observation[None]
+        (targets,) = self._session.run([self._output], {self._input: batch})
+        return targets[0].tolist()
+
+
+def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts: Mapping[str, ObservationPart]) -> None:
+    """Check that the robot has the joints that the model commands and observes. Raises ConfigError."""
+    joint_count = len(robot.joints)
+    expected_count = metadata.read_integer(JOINTS)
+    if expected_count != joint_count:
+        allowed = f"{joint_count}, the number of joints of robot {robot.robot!r}"
+        raise metadata.make_error(JOINTS, expected_count, allowed)
+    for joint in robot.joints:
+        if not joint.has(MODES[action]):
+            available = [name for name, mode in MODES.items() if joint.has(mode)]
+            raise metadata.make_error(ACTION, action, f"what {joint.name} can do: {', '.join(available)}")
+        if "torque_nm" in parts and "torque" not in joint.measures:
+            allowed = f"without torque_nm: {joint.name} measures none"
+            raise metadata.make_error(OBSERVATIONS, ",".join(parts), allowed)
 
 
 class Policy:
-    """Asks the model every `snakesim.frame_skip` ticks, and holds its targets meanwhile."""
+    """Runs the model every `snakesim.frame_skip` ticks, and repeats its targets in between."""
 
     NEEDS, SENSES = "joints", True
 
@@ -74,117 +109,192 @@ class Policy:
         model: Annotated[str, Meta(min_length=1, max_length=1024), about("shipped name, or path of an ONNX file")]
 
     def __init__(self, robot: Description, settings: Settings) -> None:
-        """Raises ConfigError for a model that does not fit."""
+        """Load the model. Raises ConfigError if it does not fit the robot."""
+        self._robot = robot
+        self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
+
+        # The model.
         self._model = Model(robot, settings.model)
         self._observer = Observer(robot, self._model.parts)
         self._mode = MODES[self._model.action]
-        self._robot = robot
-        self._held: RequestedSetpoints | None = None  # setpoints while a sensor is silent
-        self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
-        self._target: list[float] | None = None
-        self._asked = 0  # the tick of the last question
+
+        # Its last targets.
+        self._target: list[float] | None = None  # None: the next tick runs the model
+        self._target_tick = 0  # tick at which the model ran last
+
+        # Setpoints that hold the pose while a sensor is late; None while all sensors are fresh.
+        self._hold_setpoints: RequestedSetpoints | None = None
 
     @staticmethod
     def check(robot: Description, settings: Settings) -> None:
-        """Before a run begins. Raises ConfigError for a model that does not fit."""
+        """Check before a run that the model fits the robot. Raises ConfigError."""
         Model(robot, settings.model)
 
     def update(self, view: View) -> Action:
-        """The model's targets; the limiter limits them. It holds its pose while a sensor that it needs is silent."""
-        late = {} if view.senses is None else view.senses.late
-        if why := "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys())):
-            self._held = self._held or positions(self._robot, view.joints.angle_rad)
-            self._target = None
-            return Action(self._held, Report(why=why))
-        self._held = None
-        if self._target is None or view.tick - self._asked >= self._model.frame_skip:
-            self._target, self._asked = self._model(self._observer.update(view)), view.tick
-        points = RequestedSetpoints([self._mode] * len(self._target), list(self._target), list(self._torque_limit_nm))
-        reference = self._target if self._mode is Mode.POSITION else ()
-        return Action(points, Report(why="a policy moves the joints", reference_rad=reference))
+        """Return the model's targets, or setpoints that hold the pose while a sensor that the model needs is late.
+
+        The command limiter limits the targets.
+        """
+        why_late = self._describe_late_sensors(view)
+        if why_late:
+            return self._hold(view, why_late)
+        self._hold_setpoints = None
+        if self._target is None or view.tick - self._target_tick >= self._model.frame_skip:
+            self._target = self._model(self._observer.update(view))
+            self._target_tick = view.tick
+        modes = [self._mode] * len(self._target)
+        setpoints = RequestedSetpoints(modes, list(self._target), list(self._torque_limit_nm))
+        reference: Sequence[float] = ()
+        if self._mode is Mode.POSITION:
+            reference = self._target
+        return Action(setpoints, Report(why="a policy moves the joints", reference_rad=reference))
+
+    def _describe_late_sensors(self, view: View) -> str:
+        """Return why samples that the model needs must not be used; empty when all are fresh."""
+        if view.senses is None:
+            return ""
+        late = view.senses.late
+        return "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys()))
+
+    def _hold(self, view: View, why: str) -> Action:
+        """Hold the pose that the robot had when the sensor became late."""
+        if self._hold_setpoints is None:
+            self._hold_setpoints = positions(self._robot, view.joints.angle_rad)
+        self._target = None
+        return Action(self._hold_setpoints, Report(why=why))
 
 
 class _Metadata:
-    """The metadata properties of a model, as texts."""
+    """Reads and checks the metadata properties of a model, which are texts. Its methods raise ConfigError."""
 
-    def __init__(self, file: str, given: Mapping[str, str]) -> None:
-        self._file, self._given = short(file), given
+    def __init__(self, file: str, properties: Mapping[str, str]) -> None:
+        self._file = short(file)
+        self._properties = properties
 
-    def parts(self, robot: Description) -> dict[str, Part]:
-        """The observation's parts, in order."""
-        there = parts_of(robot)
-        wanted = f"names out of {', '.join(there)}, each once, with commas between"
-        text = self._text(OBSERVATIONS, wanted)
-        parts = [part.strip() for part in text.split(",")]
-        if not set(parts) <= set(there) or len(set(parts)) < len(parts):
-            raise self.wrong(OBSERVATIONS, text, wanted)
+    def read_parts(self, robot: Description) -> dict[str, ObservationPart]:
+        """Return the parts of the observation, in the order in which the model expects them."""
+        available = make_parts(robot)
+        allowed = f"names out of {', '.join(available)}, each once, with commas between"
+        text = self._read_text(OBSERVATIONS, allowed)
+        names = [name.strip() for name in text.split(",")]
+        has_unknown_names = not set(names) <= set(available)
+        has_repeated_names = len(set(names)) < len(names)
+        if has_unknown_names or has_repeated_names:
+            raise self.make_error(OBSERVATIONS, text, allowed)
         try:
-            return chosen(robot, parts)
+            return chosen(robot, names)
         except ConfigError as error:
             raise ConfigError(f"{self._file}: metadata `{OBSERVATIONS}` is {short(text)!r}: {error}") from None
 
-    def one_of(self, field: str, allowed: Mapping[str, Any]) -> str:
-        wanted = f"one of {', '.join(allowed)}"
-        text = self._text(field, wanted).strip()
-        if text not in allowed:
-            raise self.wrong(field, text, wanted)
+    def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
+        """Return a text that is one of the choices."""
+        allowed = f"one of {', '.join(choices)}"
+        text = self._read_text(field, allowed).strip()
+        if text not in choices:
+            raise self.make_error(field, text, allowed)
         return text
 
-    def whole(self, field: str, most: int | None = None, unit: str = "") -> int:
-        wanted = f"a whole number{f' of {unit}' if unit else ''} from 1{f' to {most}' if most else ''}"
-        text = self._text(field, wanted).strip()
-        if not (text.isascii() and text.isdigit() and len(text) < 10 and 1 <= int(text) <= (most or int(text))):
-            raise self.wrong(field, text, wanted)
-        return int(text)
+    def read_integer(self, field: str, maximum: int | None = None, unit: str = "") -> int:
+        """Return an integer from 1 to `maximum`; None: without an upper bound."""
+        allowed = "a whole number"
+        if unit:
+            allowed += f" of {unit}"
+        allowed += " from 1"
+        if maximum is not None:
+            allowed += f" to {maximum}"
+        text = self._read_text(field, allowed).strip()
+        is_number = text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS
+        if not is_number:
+            raise self.make_error(field, text, allowed)
+        value = int(text)
+        if value < 1 or (maximum is not None and value > maximum):
+            raise self.make_error(field, text, allowed)
+        return value
 
-    def wrong(self, field: str, value: object, wanted: str) -> ConfigError:
-        return ConfigError(f"{self._file}: metadata `{field}` is {short(str(value))!r}, must be {wanted}")
+    def make_error(self, field: str, value: object, allowed: str) -> ConfigError:
+        """Return an error that names the file, the field, its value and what is allowed."""
+        return ConfigError(f"{self._file}: metadata `{field}` is {short(str(value))!r}, must be {allowed}")
 
-    def _text(self, field: str, wanted: str) -> str:
-        if field not in self._given:
-            there = ", ".join(sorted(self._given)) or "no metadata"
+    def _read_text(self, field: str, allowed: str) -> str:
+        if field not in self._properties:
+            available = ", ".join(sorted(self._properties)) or "no metadata"
             raise ConfigError(
-                f"{self._file}: has no metadata `{field}`, which must be {wanted}; there is {short(there, 200)}"
+                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {short(available, 200)}"
             )
-        return self._given[field]
+        return self._properties[field]
 
 
-def _path_of(name: str) -> Path:
-    """Of a file, or of a shipped policy by its name."""
+def _find_model_file(name: str) -> Path:
+    """Return the path of a model from its path as written, or from the name of a shipped policy.
+
+    Raises:
+        ConfigError: no shipped policy has this name.
+    """
     if "/" in name or name.endswith(SUFFIX):
         return expanded(name)
-    there = sorted(path.stem for path in POLICIES.glob(f"*{SUFFIX}"))
-    if name not in there:
+    shipped = sorted(path.stem for path in POLICIES.glob(f"*{SUFFIX}"))
+    if name not in shipped:
         raise ConfigError(
-            f"no policy called {short(name)!r}; {did_you_mean(name, there)}shipped are {', '.join(there)}. For a file "
-            f"of your own give its path, such as ./{short(name)}{SUFFIX}"
+            f"no policy called {short(name)!r}; {did_you_mean(name, shipped)}shipped are {', '.join(shipped)}. For a "
+            f"file of your own give its path, such as ./{short(name)}{SUFFIX}"
         )
     return POLICIES / f"{name}{SUFFIX}"
 
 
 def opened(file: str) -> tuple[Any, Mapping[str, str]]:
-    """A session with the model of a file, and its metadata."""
-    data = read_bytes(_path_of(file))
+    """Load a model.
+
+    Args:
+        file: path of an ONNX file, or the name of a shipped policy.
+
+    Returns:
+        An inference session of onnxruntime, and the metadata properties of the model.
+
+    Raises:
+        ConfigError: the file cannot be read or is no model, or onnxruntime is not installed.
+    """
+    data = read_bytes(_find_model_file(file))
     if RUNTIME is None:
         raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}")
     options = RUNTIME.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # the same sums in the same order, whatever the CPU
-    options.log_severity_level = 3  # errors are raised, and told once
+    # One thread adds in the same order on every computer, so that results are equal to the bit.
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3  # errors only: they are raised as well, and would be printed twice below
     try:
         session = RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # of many kinds, which have no name in common
+    except Exception as error:  # onnxruntime raises many classes that share no base class
         raise ConfigError(f"{short(file)}: cannot be loaded as an ONNX model: {short(str(error), 300)}") from error
     return session, session.get_modelmeta().custom_metadata_map
 
 
-def _only(what: str, found: Sequence[Any], width: int, of: str, file: str) -> str:
-    """The name of a model's one input or output, if it is float32 of shape (1, width); the 1 may be left open."""
-    names = [f"{one.name} {one.type} {tuple(one.shape)}" for one in found]
-    fits = len(found) == 1 and found[0].type == "tensor(float)" and len(found[0].shape) == 2
-    first, second = found[0].shape if fits else (None, None)
-    if not fits or second != width or (isinstance(first, int) and first != 1):
-        there = short("; ".join(names) or "none", 200)
-        raise ConfigError(
-            f"{short(file)}: {what} is {there}, must be one tensor(float), that is float32, of shape (1, {width}): {of}"
-        )
-    return found[0].name
+def _check_tensor(kind: str, tensors: Sequence[Any], width: int, meaning: str, file: str) -> str:
+    """Return the name of a model's only input or output after a check of its type and shape.
+
+    Args:
+        kind: "input" or "output", for the error.
+        tensors: all inputs or all outputs of the model.
+        width: the tensor must be float32 of shape (1, width); its first dimension may be left open.
+        meaning: what the numbers are, for the error.
+        file: the model's file, for the error.
+
+    Raises:
+        ConfigError: there is not exactly one tensor, or it has another type or shape.
+    """
+    if len(tensors) == 1 and _has_width(tensors[0], width):
+        return tensors[0].name
+    descriptions = [f"{tensor.name} {tensor.type} {tuple(tensor.shape)}" for tensor in tensors]
+    available = short("; ".join(descriptions) or "none", 200)
+    raise ConfigError(
+        f"{short(file)}: {kind} is {available}, must be one tensor(float), that is float32, of shape (1, {width}): "
+        f"{meaning}"
+    )
+
+
+def _has_width(tensor: Any, width: int) -> bool:
+    """Return whether a tensor is float32 of shape (1, width), where the 1 may be left open."""
+    if tensor.type != "tensor(float)" or len(tensor.shape) != 2:
+        return False
+    batch_size, tensor_width = tensor.shape
+    batch_is_open = not isinstance(batch_size, int)  # a symbolic dimension is a text
+    return tensor_width == width and (batch_is_open or batch_size == 1)

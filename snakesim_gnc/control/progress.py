@@ -1,4 +1,8 @@
-"""Present position and speed of the body along its path, from a world model that is some ticks old."""
+"""Estimates the present position and speed of the body along its path.
+
+A world model is some ticks old when it arrives. An alpha-beta filter tracks the arc length of the tail end, s, and its
+speed, v, over the poses; between them s is extrapolated.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -16,82 +20,136 @@ from snakesim_hal.wire.quantities import about, from_zero
 SpeedFilter = Annotated[
     float, from_zero(1, "s"), about("time constant of the filter of the speed along the path; 0: none")
 ]
-AGAIN_STEPS = 8  # to localize a body again that may have slid meanwhile
+RELOCALIZE_STEPS = 8  # iterations for a body that may have slid while its position was unknown
 
 
 @dataclass(frozen=True)
 class Located:
     """The body on its path at one tick."""
 
+    # At this tick.
     on_path: BodyOnPath
     tail_s_m: float  # arc length of the tail end
     speed_m_s: float
-    nodes_w: Floats  # (2, n_nodes), last measurement
-    measured_s_m: float  # arc length of the tail end then
-    fresh: bool  # there is a new world model
+
+    # At the instant of the last pose.
+    nodes_w: Floats  # (2, n_nodes) m, tail to head
+    measured_s_m: float  # arc length of the tail end
+
+    fresh: bool  # the world model is a new one
     restarted: bool  # on a new path, or localized again after it was unknown: the position may have jumped
     world: World
     trajectory: Trajectory
 
 
 class Progress:
-    """Tracks the body along the path with an alpha-beta filter over poses, each with the joints of its instant.
+    """Tracks the body along the path with an alpha-beta filter over poses, each with the joint angles of its instant.
 
-    Only the yaw joints bend; all others count as straight. Between poses the tail is extrapolated at the last
-    speed, so the result is always for the present. A world model that repeats a pose is not a new measurement: used
-    as one, it would look like a body that stands still.
+    Only the yaw joints bend; all others count as straight. Between poses the arc length is extrapolated at the last
+    speed, so that the result is always for the present. A world model that repeats a pose is not a new measurement:
+    if it counted as one, the body would seem to be stationary.
     """
 
     def __init__(self, body: PlanarBody, *, speed_filter_s: float) -> None:
+        """Start without a position.
+
+        Args:
+            body: the robot's body.
+            speed_filter_s: time constant of the filter; 0 takes every measurement as it is.
+        """
         self._planar = body
         self._speed_filter_s = speed_filter_s
         self._angles = RecentAngles()
+
+        # The path.
         self._body: BodyOnPath | None = None
         self._path_id: int | None = None
+
+        # The last world model and the last pose.
         self._world_tick: int | None = None
-        self._measured_ns: int | None = None  # the pose's instant; None: the body's position is unknown
+        self._measured_ns: int | None = None  # instant of the pose; None: the body's position is unknown
         self._nodes = np.empty((2, 0))
-        self._s_m = 0.0  # at that instant
+
+        # The state of the filter at that instant.
+        self._s_m = 0.0
         self._speed_m_s = 0.0
 
     def update(self, view: View) -> Located | str:
-        """Position of the body at this tick, or why it is unknown."""
+        """Return the position of the body at this tick, or why it is unknown. Call it in every tick."""
         self._angles.add(view.joints.timestamp_ns, view.joints.angle_rad)
-        world, trajectory = view.world, view.trajectory
-        if world is None or trajectory is None:
+        world = view.world
+        trajectory = view.trajectory
+        if world is None:
             self._measured_ns = None
-            return "no world model" if world is None else "no trajectory"
-        new_path = self._body is None or trajectory.path_id != self._path_id
-        if new_path:
-            self._body = BodyOnPath(Route(trajectory.path_w), self._planar.segments_m, trajectory.rises)
-            self._path_id = trajectory.path_id
-        body = self._body
-        assert body is not None
-        pose_ns, before_ns = pose_instant_ns(world), self._measured_ns
-        if before_ns is None or pose_ns > before_ns:
-            self._nodes = self._planar.nodes_w(world, self._angles.nearest_to(pose_ns))
-            self._measured_ns = pose_ns
-        if new_path:
-            self._s_m = body.find_tail_s_m(self._nodes)  # the body is as fast as before
-        elif before_ns is None:
-            self._s_m, self._speed_m_s = body.refine_tail_s_m(self._nodes, self._s_m, steps=AGAIN_STEPS), 0.0
-        elif pose_ns > before_ns:
-            self._filter(body, max(_seconds(pose_ns - before_ns, view), view.period_s))
-        assert self._measured_ns is not None
-        s = self._s_m + self._speed_m_s * _seconds(view.joints.timestamp_ns - self._measured_ns, view)
-        restarted = new_path or before_ns is None
-        fresh, self._world_tick = world.tick != self._world_tick, world.tick
-        return Located(body, s, self._speed_m_s, self._nodes, self._s_m, fresh, restarted, world, trajectory)
+            return "no world model"
+        if trajectory is None:
+            self._measured_ns = None
+            return "no trajectory"
 
-    def _filter(self, body: BodyOnPath, passed_s: float) -> None:
-        """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""
-        expected = self._s_m + self._speed_m_s * passed_s
-        off = body.refine_tail_s_m(self._nodes, expected, steps=1) - expected
-        keep = float(np.exp(-passed_s / self._speed_filter_s)) if self._speed_filter_s > 0 else 0.0
-        self._s_m = expected + (1 - keep * keep) * off
-        self._speed_m_s += (1 - keep) ** 2 * off / passed_s
+        body = self._body
+        is_new_path = body is None or trajectory.path_id != self._path_id
+        if body is None or is_new_path:
+            body = BodyOnPath(Route(trajectory.path_w), self._planar.segments_m, trajectory.rises)
+            self._body = body
+            self._path_id = trajectory.path_id
+
+        last_measured_ns = self._measured_ns
+        measured_ns = self._measure(body, world, view, is_new_path=is_new_path)
+        elapsed_s = _seconds(view.joints.timestamp_ns - measured_ns, view)
+        is_new_world = world.tick != self._world_tick
+        self._world_tick = world.tick
+        return Located(
+            on_path=body,
+            tail_s_m=self._s_m + self._speed_m_s * elapsed_s,
+            speed_m_s=self._speed_m_s,
+            nodes_w=self._nodes,
+            measured_s_m=self._s_m,
+            fresh=is_new_world,
+            restarted=is_new_path or last_measured_ns is None,
+            world=world,
+            trajectory=trajectory,
+        )
+
+    def _measure(self, body: BodyOnPath, world: World, view: View, *, is_new_path: bool) -> int:
+        """Localize the body if the path or the pose is new. Return the instant of the newest pose in ns."""
+        last_ns = self._measured_ns
+        pose_ns = pose_instant_ns(world)
+        measured_ns = pose_ns
+        if last_ns is None or pose_ns > last_ns:
+            self._nodes = self._planar.nodes_w(world, self._angles.nearest_to(pose_ns))
+        else:
+            measured_ns = last_ns
+        self._measured_ns = measured_ns
+
+        if is_new_path:
+            # The body is as fast on the new path as it was on the old one.
+            self._s_m = body.find_tail_s_m(self._nodes)
+        elif last_ns is None:
+            self._s_m = body.refine_tail_s_m(self._nodes, self._s_m, steps=RELOCALIZE_STEPS)
+            self._speed_m_s = 0.0
+        elif pose_ns > last_ns:
+            self._filter(body, max(_seconds(pose_ns - last_ns, view), view.period_s))
+        return measured_ns
+
+    def _filter(self, body: BodyOnPath, dt_s: float) -> None:
+        """Update the arc length s and the speed v with a new pose, by a critically damped alpha-beta filter.
+
+        With the time T between two poses, the time constant tau = `speed_filter_s` and k = exp(-T / tau):
+
+            s_predicted = s + v T
+            r = s_measured - s_predicted
+            s = s_predicted + (1 - k^2) r
+            v = v + (1 - k)^2 r / T
+        """
+        predicted_s_m = self._s_m + self._speed_m_s * dt_s
+        residual_m = body.refine_tail_s_m(self._nodes, predicted_s_m, steps=1) - predicted_s_m
+        k = 0.0
+        if self._speed_filter_s > 0:
+            k = float(np.exp(-dt_s / self._speed_filter_s))
+        self._s_m = predicted_s_m + (1 - k * k) * residual_m
+        self._speed_m_s += (1 - k) ** 2 * residual_m / dt_s
 
 
 def _seconds(elapsed_ns: int, view: View) -> float:
-    """In whole periods if possible: these are equal on every machine."""
+    """Convert a time to seconds as a multiple of the period, which gives the same bits on every machine."""
     return elapsed_ns / round(view.period_s * 1e9) * view.period_s

@@ -1,22 +1,23 @@
-"""The control process: runs one controller, holds the lease, sends the commands, and publishes its state.
+"""The control process: runs one controller, holds the command lease, sends setpoints, and publishes its state.
 
-A controller gets only fresh inputs (`freshness`). With stale joints no command is sent: the lease ends, and
-the robot is stopped. Its output is checked (`guarded`): a controller that fails ends this process at once.
+The controller gets only fresh inputs (`freshness`). If the joint state is too old, this process sends no command: the
+lease expires, and the robot is stopped. The controller's output is checked (`guarded`): a controller that fails ends
+this process at once.
 """
 
 import time
 from collections.abc import Sequence
 
 from snakesim_gnc.control.controller import Senses, Task, View
-from snakesim_gnc.control.freshness import Limits
-from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.freshness import AgeLimits
+from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.live_settings import LiveSettings
 from snakesim_gnc.control.state_reports import StateReports
 from snakesim_gnc.control.update_times import UpdateTimes
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.programs.preflight import what_it_lacks
 from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.wire import keys
@@ -33,7 +34,10 @@ from snakesim_hal.wire.messages import (
     World,
 )
 
+# Sensor samples that a controller may ask for.
 SENSED: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS: Contacts}
+
+Outputs = list[tuple[str, Message]]  # messages to publish, with their keys
 
 
 class Control(Service):
@@ -43,87 +47,119 @@ class Control(Service):
     urgent = True
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Finds the controller and checks its settings."""
+        """Find the controller, check its settings, and subscribe to its inputs."""
+        self._client = client
         self._config = config
         self._settings = LiveSettings(client, config)
-        self._client = client
+
+        # Inputs of every controller.
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._world = client.subscribe(keys.WORLD, World)
         self._trajectory = client.subscribe(keys.TRAJECTORY, Trajectory)
-        asked = self._settings.asks_for_senses
-        sensors = config.robot.sensors
-        has = {keys.POSE: sensors.pose is not None, keys.CONTACTS: sensors.contacts is not None}
-        self._feeds = {key: client.subscribe(key, SENSED[key]) for key in SENSED if asked and has[key]}
-        self._sensed: dict[str, Message] = {}
-        self._task = Task.of(config) if asked else None
         self._statuses = client.session.reader(keys.STATUS, Status)
-        self._arm_session = -1
-        self._armed_at_ns = 0
-        self._noted: set[str] = set()  # streams that are too old, as the log has it
         self._last_clock: Clock | None = None
 
+        # Inputs of a controller that asks for sensor samples.
+        self._task: Task | None = None  # None: the controller does not ask for samples
+        self._sensor_feeds: dict[str, Feed[Message]] = {}
+        self._sensor_samples: dict[str, Message] = {}  # the newest of each key
+        if self._settings.asks_for_senses:
+            self._task = Task.of(config)
+            self._subscribe_to_sensors()
+
+        # The arm session of the present controller.
+        self._arm_session = -1
+        self._armed_at_ns = 0
+
+        # Streams that the log already reports as too old.
+        self._logged_late_streams: set[str] = set()
+
+    def _subscribe_to_sensors(self) -> None:
+        """Subscribe to those sensors in SENSED that the robot has."""
+        sensors = self._config.robot.sensors
+        is_mounted = {keys.POSE: sensors.pose is not None, keys.CONTACTS: sensors.contacts is not None}
+        for key, message_type in SENSED.items():
+            if is_mounted[key]:
+                self._sensor_feeds[key] = self._client.subscribe(key, message_type)
+
     def configure(self, robot: Description) -> None:
-        """Get ready to command this robot."""
-        if (lacks := what_it_lacks(robot.joints, self._settings.plugin, self._config.controller)) is not None:
-            raise ControllerError(f"robot {robot.robot!r}: {lacks}")
+        """Prepare to command this robot. Raises ControllerError if the robot lacks what the controller needs."""
+        missing = what_it_lacks(robot.joints, self._settings.plugin, self._config.controller)
+        if missing is not None:
+            raise ControllerError(f"robot {robot.robot!r}: {missing}")
         self._settings.configure(robot)
         self._commander = Commander(self._client, robot)
-        self._limits = Limits.of(self._config, robot)
+        self._age_limits = AgeLimits.from_config(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
         self._times = UpdateTimes(robot)
-        self._controller: Guarded | None = None
-        self._sensed.clear()
+        self._controller: GuardedController | None = None
+        self._sensor_samples.clear()
 
-    def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """Command the robot: while armed by the controller, otherwise to hold its pose."""
+    def outputs(self, clock: Clock) -> Outputs | None:
+        """Command the robot in one tick: by the controller while the robot is armed, otherwise to hold its pose.
+
+        Returns:
+            The state of control if it is due; None if there is no joint state for this tick.
+        """
         self._last_clock = clock
-        self._statuses.drain()  # those found in a silence have come after the last clock
-        if self._settings.turn(clock):
-            self._controller = None
+        self._statuses.drain()  # `silence` considers only a status that is newer than the last clock
+        self._apply_new_settings(clock)
         joints = self._client.read(self._joints)
         if joints is None:
             return None
-        armed = clock.lifecycle == "armed"
-        mine = self._commander.holds(clock)
-        if not (armed and mine):
+        is_armed = clock.lifecycle == "armed"
+        holds_lease = self._commander.holds(clock)
+        if not (is_armed and holds_lease):
             self._controller = None
-        if not mine:
+        if not holds_lease:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
-            return _state_messages(self._reports.state(clock, armed=armed, missing=why))
-        late = self._limits.against_joints(joints, clock.timestamp_ns)
-        if late:
-            self._note(clock, [late], "no commands")
-            return _state_messages(self._reports.state(clock, armed=armed, missing=late))
-        if not armed:
-            self._note(clock)
+            return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why))
+        why_late = self._age_limits.check_joints(joints, clock.timestamp_ns)
+        if why_late:
+            self._log_late_streams(clock, [why_late], "no commands")
+            return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why_late))
+        if not is_armed:
+            self._log_late_streams(clock)
             self._commander.send(clock, joints, self._commander.stay(joints))
-            return _state_messages(self._reports.state(clock))
-        return self._act(clock, joints)
+            return _state_messages(self._reports.make_state(clock))
+        return self._run_controller(clock, joints)
 
     def pause(self, clock: Clock) -> None:
-        """Settings may be changed; they are in force from the next tick on."""
-        if self._settings.turn(clock):
-            self._controller = None
+        """Answer requests for other settings while time is paused; they take effect in the next tick."""
+        self._apply_new_settings(clock)
 
-    def silence(self) -> list[tuple[str, Message]]:
-        """Time stands, or the HAL is silent altogether: PowerOff. The next tick decides about the controller."""
+    def silence(self) -> Outputs:
+        """Report why no clock arrives: time is paused, or the HAL is silent altogether, which is PowerOff.
+
+        The controller is kept. The next tick decides whether it goes on.
+        """
         clock = self._last_clock
         if clock is None:
             return []
         statuses = self._statuses.drain()
         if not statuses:
             silent = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
-            return _state_messages(self._reports.state(clock, silent=silent))
-        stands = statuses[-1].held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
-        armed = statuses[-1].lifecycle == "armed"
-        return _state_messages(self._reports.state(clock, armed=armed, stands=f"time stands: {stands}"))
+            return _state_messages(self._reports.make_state(clock, silent=silent))
+        status = statuses[-1]
+        why_paused = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
+        is_armed = status.lifecycle == "armed"
+        return _state_messages(self._reports.make_state(clock, armed=is_armed, paused=f"time stands: {why_paused}"))
 
-    def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
-        """Call the controller, with world and trajectory as far as they are fresh."""
-        world, trajectory, missing = self._outlook(clock)
-        senses = self._senses(clock)
+    def _apply_new_settings(self, clock: Clock) -> None:
+        """Answer requests for other settings. If the settings have changed, the controller is constructed again."""
+        if self._settings.answer_requests(clock):
+            self._controller = None
+
+    def _run_controller(self, clock: Clock, joints: JointState) -> Outputs:
+        """Call the controller with its fresh inputs, send its setpoints, and return its state if it is due.
+
+        Raises:
+            ControllerError: the controller has failed; its last state has been published.
+        """
+        world, trajectory, missing = self._read_fresh_plan(clock)
+        senses = self._read_senses(clock)
         try:
-            controller = self._made_for(clock)
+            controller = self._prepare_controller(clock)
             view = View(
                 tick=clock.tick,
                 time_s=(clock.timestamp_ns - self._armed_at_ns) * 1e-9,
@@ -133,73 +169,93 @@ class Control(Service):
                 trajectory=trajectory,
                 senses=senses,
             )
-            began_s = time.perf_counter()
+            started_s = time.perf_counter()
             action = controller.update(view)
-            self._note_time(clock, time.perf_counter() - began_s)
+            duration_s = time.perf_counter() - started_s
+            self._count_update(clock, duration_s)
             self._commander.send(clock, joints, action.setpoints)
-            rests = _why_it_rests(trajectory)
+            rests = _explain_rest(trajectory)
             try:
-                state = self._reports.state(clock, action.report, armed=True, missing=missing, rests=rests)
+                state = self._reports.make_state(clock, action.report, armed=True, missing=missing, rests=rests)
             except ValueError as error:
-                raise controller.wrong(str(error)) from None
+                raise controller.make_error(str(error)) from None
         except ControllerError as error:
-            self._client.put(keys.CONTROL_STATE, self._reports.failure(clock, str(error)))
+            self._client.put(keys.CONTROL_STATE, self._reports.make_failure(clock, str(error)))
             raise
         return _state_messages(state)
 
-    def _outlook(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
-        """World and trajectory as far as they are available and fresh, and why they are not."""
-        world, trajectory = self._client.read(self._world), self._client.read(self._trajectory)
+    def _read_fresh_plan(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
+        """Return the newest world model and trajectory, None for what is missing or too old, and why it is too old."""
+        world = self._client.read(self._world)
+        trajectory = self._client.read(self._trajectory)
         late: list[str] = []
-        if world is not None and (why := self._limits.against_world(world, clock.timestamp_ns)):
-            world, late = None, [why]
-        if trajectory is not None and (why := self._limits.against_trajectory(trajectory, clock.timestamp_ns)):
-            trajectory, late = None, [*late, why]
-        self._note(clock, late, "the controller holds")
         if world is not None:
-            self._reports.follow(world)
+            why_late = self._age_limits.check_world(world, clock.timestamp_ns)
+            if why_late:
+                late.append(why_late)
+                world = None
+        if trajectory is not None:
+            why_late = self._age_limits.check_trajectory(trajectory, clock.timestamp_ns)
+            if why_late:
+                late.append(why_late)
+                trajectory = None
+        self._log_late_streams(clock, late, "the controller holds")
+        if world is not None:
+            self._reports.add_world(world)
         return world, trajectory, "; ".join(late)
 
-    def _senses(self, clock: Clock) -> Senses | None:
-        """The newest samples, and which of them are too old; None for a controller that does not ask."""
+    def _read_senses(self, clock: Clock) -> Senses | None:
+        """Return the newest sensor samples, and which are too old; None for a controller that does not ask for them."""
         if self._task is None:
             return None
-        for key, feed in self._feeds.items():
-            if (sample := self._client.read(feed)) is not None:
-                self._sensed[key] = sample
-        stamps = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensed.items()}
-        return Senses(dict(self._sensed), self._limits.of_sensors(stamps, clock.timestamp_ns), self._task)
+        for key, feed in self._sensor_feeds.items():
+            sample = self._client.read(feed)
+            if sample is not None:
+                self._sensor_samples[key] = sample
+        timestamps_ns = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensor_samples.items()}
+        late = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
+        return Senses(dict(self._sensor_samples), late, self._task)
 
-    def _made_for(self, clock: Clock) -> Guarded:
-        """The controller of this arming, and of the settings in force."""
-        if self._controller is None or clock.arm_session != self._arm_session:
-            self._controller = self._settings.controller()
-            if clock.arm_session != self._arm_session:
-                self._arm_session, self._armed_at_ns = clock.arm_session, clock.timestamp_ns
+    def _prepare_controller(self, clock: Clock) -> GuardedController:
+        """Return the controller of this arm session, which is new after an arming and after a change of settings."""
+        is_new_session = clock.arm_session != self._arm_session
+        if self._controller is None or is_new_session:
+            self._controller = self._settings.construct_controller()
+            if is_new_session:
+                self._arm_session = clock.arm_session
+                self._armed_at_ns = clock.timestamp_ns
         return self._controller
 
-    def _note_time(self, clock: Clock, took_s: float) -> None:
-        """Count an update, and write into the log when the controller has become too slow for real time."""
-        before = self.too_slow
-        self._times.add(took_s)
+    def _count_update(self, clock: Clock, duration_s: float) -> None:
+        """Count an update, and log once when the controller has become too slow for real time."""
+        was_too_slow = bool(self.too_slow)
+        self._times.add(duration_s)
         self.too_slow = self._times.too_slow
-        if (
-            clock.clock_mode == "realtime"
-        ):  # elsewhere there are no deadlines, and no message may depend on the wall clock
+        # Other clock modes have no deadlines, and there no message may depend on the wall clock.
+        if clock.clock_mode == "realtime":
             self._reports.too_slow = self.too_slow
-        if self.too_slow and not before:
+        if self.too_slow and not was_too_slow:
             print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {self.too_slow}")
 
-    def _note(self, clock: Clock, late: Sequence[str] = (), so: str = "") -> None:
-        """Write into the log when other streams are too old than before, and when all is fresh again."""
+    def _log_late_streams(self, clock: Clock, late: Sequence[str] = (), consequence: str = "") -> None:
+        """Log when other streams are too old than in the tick before, and when all inputs are fresh again.
+
+        Args:
+            clock: the present tick.
+            late: why inputs are too old; each text begins with the key of its stream.
+            consequence: what control does without them.
+        """
         streams = {why.partition(" ")[0] for why in late}
-        if streams != self._noted:
-            text = f"{'; '.join(late)}: {so}" if late else "all inputs of control are fresh again"
+        if streams != self._logged_late_streams:
+            text = "all inputs of control are fresh again"
+            if late:
+                text = f"{'; '.join(late)}: {consequence}"
             print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {text}")
-        self._noted = streams
+        self._logged_late_streams = streams
 
 
-def _why_it_rests(trajectory: Trajectory | None) -> str:
+def _explain_rest(trajectory: Trajectory | None) -> str:
+    """Return why no motion is intended; empty when motion is intended."""
     if trajectory is None:
         return "there is no trajectory yet"
     if trajectory.speed_m_s != 0.0:
@@ -207,5 +263,8 @@ def _why_it_rests(trajectory: Trajectory | None) -> str:
     return trajectory.reason or "the speed is zero"
 
 
-def _state_messages(state: ControlState | None) -> list[tuple[str, Message]]:
-    return [] if state is None else [(keys.CONTROL_STATE, state)]
+def _state_messages(state: ControlState | None) -> Outputs:
+    """Return what `outputs` has to publish."""
+    if state is None:
+        return []
+    return [(keys.CONTROL_STATE, state)]

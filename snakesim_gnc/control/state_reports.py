@@ -1,66 +1,92 @@
-"""Control's state: `control/state` a few times a second, and at once when it changes."""
+"""Makes the messages of `control/state`: 20 times a second, and at once when the state changes."""
 
 import msgspec
 
-from snakesim_gnc.control.advance import Advance
+from snakesim_gnc.control.advance import RecentAdvance
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.controller import Report
 from snakesim_gnc.control.states import locomotion_state
 from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
 from snakesim_hal.wire.outgoing import what_is_wrong
 
-TELEMETRY_S = 0.05
-LONGEST = 500  # characters of a reason
+TELEMETRY_S = 0.05  # period of the messages while the state does not change
+MAX_REASON = 500  # characters, as the wire allows
+MAX_NAME = 64  # characters of a controller's name on the wire; the end of a path tells more than its beginning
 
 
 class StateReports:
-    """Makes the state's message when it is due."""
+    """Makes a message of control's state when one is due."""
 
     def __init__(self, controller: str, robot: Description) -> None:
-        self.too_slow = ""  # what shows that the controller misses its deadlines, in every message from then on
-        self._controller = controller[-64:]
+        """Start without a message.
+
+        Args:
+            controller: the controller as configured.
+            robot: description of the robot.
+        """
+        self.too_slow = ""  # why the controller misses its deadlines; it is in every message from then on
+        self._controller = controller[-MAX_NAME:]
         self._joints = [joint.name for joint in robot.joints]
-        self._advance = Advance()
-        self._felt = MeasuredContacts()
+
+        # What world models measured.
+        self._advance = RecentAdvance()
+        self._measured_contacts = MeasuredContacts()
+
+        # The last message.
+        self._last_summary: tuple[object, ...] = ()
+        self._next_ns = 0  # robot time at which the next message is due
+
         self._decoder = msgspec.msgpack.Decoder(ControlState)
-        self._last: tuple[object, ...] = ()
-        self._next_ns = 0
 
-    def follow(self, world: World) -> None:
-        """Take where the body is, and what it feels, from a world model that is fresh."""
-        self._felt.add_world(world)
+    def add_world(self, world: World) -> None:
+        """Add the position of the body and its contact forces from a world model that is fresh."""
+        self._measured_contacts.add_world(world)
         if world.center_w is not None:
-            self._advance.put(world.timestamp_ns * 1e-9, world.center_w)
+            self._advance.add(world.timestamp_ns * 1e-9, world.center_w)
 
-    def state(
+    def make_state(
         self,
         clock: Clock,
         report: Report | None = None,
         *,
         silent: str = "",
-        stands: str = "",
+        paused: str = "",
         armed: bool = False,
         missing: str = "",
         rests: str = "",
     ) -> ControlState | None:
-        """The message, or None when nothing has changed and the last one is recent. See `locomotion_state`.
+        """Return the message of this tick if one is due.
 
-        silent, stands: why no clock comes; then the message is always due, for its stamp does not age.
+        Args:
+            clock: the last clock.
+            report: the controller's report; None if the controller was not called.
+            silent: why neither clock nor status arrives; see `locomotion_state`.
+            paused: why no clock arrives. If `silent` or `paused` is given, the message is always due, because robot
+                time does not advance.
+            armed: see `locomotion_state`.
+            missing: see `locomotion_state`.
+            rests: see `locomotion_state`.
 
-        Raises ValueError when the report contains an invalid value.
+        Returns:
+            None if nothing has changed and the last message is recent.
+
+        Raises:
+            ValueError: the report contains an invalid value.
         """
-        report = report or Report()
+        if report is None:
+            report = Report()
         state, reason = locomotion_state(
             silent=silent,
             armed=armed,
-            missing=missing or stands,
+            missing=missing or paused,
             rests=rests,
             usable_push_points=report.usable_push_points,
             obstacle=report.why,
             still=report.why_if_still,
-            advanced_m=self._advance.metres,
+            advanced_m=self._advance.distance_m,
         )
-        mark = (
+        # A change of any of these is published at once.
+        summary = (
             state,
             bool(missing),
             rests,
@@ -70,29 +96,36 @@ class StateReports:
             clock.arm_session,
             bool(self.too_slow),
         )
-        if not (silent or stands) and mark == self._last and clock.timestamp_ns < self._next_ns:
+        time_advances = not (silent or paused)
+        if time_advances and summary == self._last_summary and clock.timestamp_ns < self._next_ns:
             return None
-        self._last, self._next_ns = mark, clock.timestamp_ns + round(TELEMETRY_S * 1e9)
-        return self._message(clock, state, reason, report)
+        self._last_summary = summary
+        self._next_ns = clock.timestamp_ns + round(TELEMETRY_S * 1e9)
+        return self._make_message(clock, state, reason, report)
 
-    def failure(self, clock: Clock, why: str) -> ControlState:
-        """The last message of a controller that cannot go on."""
-        return msgspec.structs.replace(self._message(clock, "NotLocomoting", why, Report()), failed=True)
+    def make_failure(self, clock: Clock, why: str) -> ControlState:
+        """Return the last message of a controller that has failed."""
+        message = self._make_message(clock, "NotLocomoting", why, Report())
+        return msgspec.structs.replace(message, failed=True)
 
-    def _message(self, clock: Clock, state: LocomotionState, reason: str, report: Report) -> ControlState:
-        joint = report.propulsion_joint
+    def _make_message(self, clock: Clock, state: LocomotionState, reason: str, report: Report) -> ControlState:
+        """Return a message that a receiver accepts. Raises ValueError for an invalid value in the report."""
+        joint_name = None
+        if report.propulsion_joint is not None:
+            joint_name = self._joints[report.propulsion_joint]
+        obstacles = [point.obstacle for point in report.push_points]
         message = ControlState(
             tick=clock.tick,
             timestamp_ns=clock.timestamp_ns,
             controller=self._controller,
             state=state,
-            reason=reason[:LONGEST],
+            reason=reason[:MAX_REASON],
             path_s_m=report.path_s_m,
-            propulsion_joint=None if joint is None else self._joints[joint],
+            propulsion_joint=joint_name,
             propulsion_n=report.propulsion_n,
             push_points=report.push_points,  # pyright: ignore[reportArgumentType] - any sequence can be sent
             desired_force_n=report.desired_force_n,  # pyright: ignore[reportArgumentType]
-            measured_force_n=self._felt.mean_sizes_n([point.obstacle for point in report.push_points]),
+            measured_force_n=self._measured_contacts.mean_sizes_n(obstacles),
             propulsion_torque_nm=report.propulsion_torque_nm,
             bending_torque_nm=report.bending_torque_nm,  # pyright: ignore[reportArgumentType]
             reference_rad=report.reference_rad,  # pyright: ignore[reportArgumentType]
@@ -103,6 +136,7 @@ class StateReports:
             too_slow=self.too_slow,
         )
         try:
+            # Encoded and decoded, because a Struct checks its fields only when it is decoded.
             return self._decoder.decode(msgspec.msgpack.encode(message))
         except (TypeError, msgspec.ValidationError) as error:
             raise ValueError(what_is_wrong(message, "Report") or str(error)) from None

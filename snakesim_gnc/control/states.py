@@ -1,9 +1,9 @@
-"""The four states of the paper's Figure 6, as one pure function."""
+"""Decides which of the four states of the paper's Figure 6 the robot is in."""
 
 from snakesim_hal.model.locomotion import MOVING_M, STANDING_STILL
 from snakesim_hal.wire.messages import LocomotionState
 
-PUSH_POINTS_NEEDED = 3
+MIN_PUSH_POINTS = 3  # three contacts make a triplet
 
 
 def locomotion_state(
@@ -17,30 +17,42 @@ def locomotion_state(
     still: str = "",
     advanced_m: float | None,
 ) -> tuple[LocomotionState, str]:
-    """The state, and its reason as text. Locomoting means intended and measured motion.
+    """Return the state, and its reason as text. Locomoting means that motion is intended and measured.
 
-    silent: how the HAL says nothing at all any more. missing: inputs that control lacks, such as a fresh pose.
-    rests: why no motion is intended.
-    usable_push_points: None for a controller that does not push off obstacles.
-    obstacle: what prevents motion according to the controller (no feasible triplet, a jam), else empty.
-    still: why it stands, if it should turn out to stand, though nothing prevents motion for certain; else empty.
-    advanced_m: displacement of the body within the last second; None when it is not measured.
+    Args:
+        silent: how the HAL has stopped sending anything; else empty.
+        armed: whether the robot is armed.
+        missing: inputs that control lacks, such as a fresh pose; else empty.
+        rests: why no motion is intended; empty if motion is intended.
+        usable_push_points: their number; None for a controller that does not push off obstacles.
+        obstacle: what prevents motion according to the controller, such as a jam; else empty.
+        still: what the controller assumes as the cause if the body is stationary without an obstacle; else empty.
+        advanced_m: displacement of the body within the last second; None if it is not measured.
     """
     if silent:
         return "PowerOff", silent
     if not armed:
-        return "Idle", f"the robot is not armed; {missing}" if missing else "the robot is not armed"
+        return "Idle", _join_reasons("the robot is not armed", missing)
     if missing:
         return "NotLocomoting", missing
     if rests:
         return "Idle", f"no motion intended: {rests}"
-    if usable_push_points is not None and usable_push_points < PUSH_POINTS_NEEDED:
-        why = f"{usable_push_points} usable push-points, {PUSH_POINTS_NEEDED} are needed"
-        return "NotLocomoting", f"{why}; {obstacle}" if obstacle else why
+    if usable_push_points is not None and usable_push_points < MIN_PUSH_POINTS:
+        too_few = f"{usable_push_points} usable push-points, {MIN_PUSH_POINTS} are needed"
+        return "NotLocomoting", _join_reasons(too_few, obstacle)
     if obstacle:
         return "NotLocomoting", obstacle
     if advanced_m is None:
         return "NotLocomoting", "the motion of the body is not measured"
     if advanced_m < MOVING_M:
         return "NotLocomoting", still or STANDING_STILL
-    return "Locomoting", "pushing" if usable_push_points is not None else "moving"
+    if usable_push_points is None:
+        return "Locomoting", "moving"
+    return "Locomoting", "pushing"
+
+
+def _join_reasons(reason: str, detail: str) -> str:
+    """Return a reason with a detail, which may be empty."""
+    if not detail:
+        return reason
+    return f"{reason}; {detail}"

@@ -26,7 +26,7 @@ JAMMED_M = 0.02  # a body that moves less than this within `jam_after_s` is jamm
 Steering = Annotated[
     float,
     from_zero(2, "1"),
-    about("bend of all joints for each radian that the path leads aside; 0: it goes where it goes"),
+    about("bend of all joints for each radian that the path leads aside; 0: no steering"),
 ]
 
 
@@ -54,7 +54,7 @@ class LateralUndulation:
         """Parameters of the wave, and how much it bends towards the path."""
 
         amplitude_rad: Annotated[float, from_zero(2, "rad"), about("swing of every joint to each side")] = 0.5
-        period_s: Annotated[float, above(100, "s"), about("of the wave")] = 2.0
+        period_s: Annotated[float, above(100, "s"), about("period of the wave")] = 2.0
         lag_rad: Annotated[
             float,
             bounded(-3.2, 3.2, "rad"),
@@ -149,13 +149,13 @@ class CompliantUndulation(HeadSteeredUndulation):
             from_zero(10, "rad/(N*m)"),
             about("how far the amplitude yields to the torque that obstacles put on the wave"),
         ] = 0.05
-        yield_s: Annotated[float, above(10, "s"), about("time constant with which it yields")] = 0.2
+        yield_s: Annotated[float, above(10, "s"), about("time constant with which the amplitude yields")] = 0.2
         jam_after_s: Annotated[
             float,
             from_zero(1000, "s"),
-            about("in which a jammed body comes no 2 cm on, until its wave travels the other way; 0: never"),
+            about("after so long with less than 2 cm of advance the wave travels the other way; 0: never"),
         ] = 0.0
-        back_s: Annotated[float, above(1000, "s"), about("how long it then does so")] = 1.0
+        back_s: Annotated[float, above(1000, "s"), about("how long the wave then travels the other way")] = 1.0
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         super().__init__(robot, settings)

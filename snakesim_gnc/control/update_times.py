@@ -1,8 +1,13 @@
-"""How long a controller computes, against the time that the robot leaves it: a run without deadlines hides that."""
+"""Compares how long a controller computes with the time that it has on a real robot.
+
+A run that is not in real time has no deadlines, and would not show that the controller misses them.
+"""
 
 from snakesim_hal.wire.messages import Description
 
-LATE_FRACTION, FEW = 0.1, 2  # of the updates, and in number: a busy computer delays some
+# A busy computer delays some updates: so many late ones are accepted.
+MAX_LATE_FRACTION = 0.1
+MAX_LATE_UPDATES = 2
 
 
 class UpdateTimes:
@@ -12,30 +17,36 @@ class UpdateTimes:
         """Start without any update."""
         self._period_s = robot.period_ns * 1e-9
         self._lease_s = robot.lease_ns * 1e-9
-        self._updates = 0
-        self._late = 0  # updates that took longer than a period
+        self._update_count = 0
+        self._late_count = 0  # updates that took longer than a period
         self._longest_s = 0.0
 
-    def add(self, took_s: float) -> None:
-        """Count an update."""
-        self._updates += 1
-        self._late += took_s > self._period_s
-        self._longest_s = max(self._longest_s, took_s)
+    def add(self, duration_s: float) -> None:
+        """Count an update that took this long."""
+        self._update_count += 1
+        if duration_s > self._period_s:
+            self._late_count += 1
+        self._longest_s = max(self._longest_s, duration_s)
 
     @property
     def too_slow(self) -> str:
-        """What shows that the controller is too slow for real time; empty when nothing does.
+        """Why the controller is too slow for real time, with the measured times; empty if it is fast enough.
 
-        One update that takes longer than a lease stops a robot, and so does a queue of late ones.
+        An update that takes longer than one lease stops the robot. So does a queue of late updates.
         """
-        often = self._late > max(FEW, LATE_FRACTION * self._updates)
-        if not often and self._longest_s <= self._lease_s:
+        max_late = max(MAX_LATE_UPDATES, MAX_LATE_FRACTION * self._update_count)
+        outlasts_lease = self._longest_s > self._lease_s
+        if not outlasts_lease and self._late_count <= max_late:
             return ""
-        longest = f"update() took {_milliseconds(self._longest_s)} of {_milliseconds(self._period_s)}"
-        if self._updates == 1:
+        longest = f"update() took {_format_ms(self._longest_s)} of {_format_ms(self._period_s)}"
+        if self._update_count == 1:
             return longest
-        return f"{longest}; {self._late} of {self._updates} updates took longer than a period"
+        return f"{longest}; {self._late_count} of {self._update_count} updates took longer than a period"
 
 
-def _milliseconds(time_s: float) -> str:
-    return f"{1e3 * time_s:.0f} ms" if time_s >= 0.01 else f"{1e3 * time_s:.2g} ms"
+def _format_ms(time_s: float) -> str:
+    """Return a time in ms: whole from 10 ms on, with two digits below."""
+    time_ms = 1e3 * time_s
+    if time_s >= 0.01:
+        return f"{time_ms:.0f} ms"
+    return f"{time_ms:.2g} ms"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.obstacle_triplet import TripletSolution, bending_torque_nm, solve_triplet
-from snakesim_gnc.control.obstacle_triplet.statics import loads
+from snakesim_gnc.control.obstacle_triplet.statics import add_tether
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Limits, Motor
@@ -82,7 +82,7 @@ def make_bench(seed: int) -> Bench | None:
         Cylinder(position_m=(float(x), float(y)), radius_m=PEG_RADIUS_M, friction=0.0)
         for x, y in np.array(touched) - (robot.module.radius_m + PEG_RADIUS_M) * np.array(normals)
     ]
-    pushes = loads(solved.forces_n, normals, -PROPULSION_N * tangents[0])
+    pushes = add_tether(solved.forces_n, normals, -PROPULSION_N * tangents[0])
     return Bench(
         config=make_config(points, pegs, tail_s),
         tether=Tether(

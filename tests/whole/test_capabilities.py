@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.model.robot import describe
@@ -36,4 +36,4 @@ def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_comm
     with pytest.raises(
         ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"
     ):
-        Guarded("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]
+        GuardedController("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]

@@ -1,12 +1,14 @@
 """The obstacle-triplet controller: statics of three contacts, the choice of contacts and joint, and the control law.
 
 `statics`     three contacts and one joint: forces and torques (the paper's equations, and a correction to them)
-`contacts`    where the path passes obstacles, and at which of these places the body is
+`contacts`    where the path passes obstacles, and which of these places the body covers
 `selection`   the choice of three contacts and a joint
-`stall`       detects standing still, and its cause
-`controller`  combines these; the entry point `obstacle_triplet`. `settings` and `telemetry` belong to it
+`stall`       detects that the body stands still, and explains why
+`settings`    the controller's parameters
+`telemetry`   what it reports
+`controller`  combines these; the entry point `obstacle_triplet`
 
-Localisation on the path, and bumpless mode changes, are shared with other controllers: see the package above.
+It shares localization on the path and bumpless mode changes with other controllers: see the package above.
 """
 
 from snakesim_gnc.control.obstacle_triplet.controller import ObstacleTriplet

@@ -1,8 +1,8 @@
-"""Push-points: where the path passes an obstacle, and at which of these places the body is. Pure.
+"""Push-points: where the path passes an obstacle, and which of these places the body covers.
 
-The geometry is the planned one: the path's point nearest to the obstacle, and the path's normal there. A measured
-contact point moves along a link as joints move; the planned one does not. Measurements decide only whether the body is
-near enough to push.
+The geometry is the planned one: the point of the path that is nearest to the obstacle, and the normal of the path
+there. A measured contact point moves along a link while joints move; the planned one does not. Measurements decide only
+whether the body is near enough to push.
 """
 
 import math
@@ -20,8 +20,9 @@ from snakesim_hal.wire.messages import Obstacle
 
 Planar = tuple[float, float]
 
-COARSE_M = 0.005
-FINE_M = 0.0002
+# Spacing of the places that are tried in the search for the place nearest to a box: first all, then around the best.
+COARSE_STEP_M = 0.005
+FINE_STEP_M = 0.0002
 
 
 @dataclass(frozen=True)
@@ -49,18 +50,27 @@ class PushPoint:
 def plan_contact(
     route: Route, obstacle: Obstacle, body_radius_m: float, *, near_s_m: float, window_m: float
 ) -> PlannedContact:
-    """The place on the route nearest to an obstacle of any shape, within `window_m` of `near_s_m`."""
+    """Find the place on the route that is nearest to an obstacle of any shape.
+
+    Args:
+        route: the path.
+        obstacle: the obstacle.
+        body_radius_m: radius of the robot's body.
+        near_s_m: arc length around which the search begins.
+        window_m: how far from there it searches.
+    """
     if obstacle.shape == "box":
-        s, push, distance = _past_box(route, obstacle, near_s_m, window_m)
+        s, push, distance_m = _find_place_at_box(route, obstacle, near_s_m, window_m)
     else:
-        center = np.array(obstacle.position_w[:2])
-        s = route.project(center, near_s_m, window_m)
+        center_w = np.array(obstacle.position_w[:2])
+        s = route.project(center_w, near_s_m, window_m)
         x, y = route.at(s)
-        push = (x - float(center[0]), y - float(center[1]))
-        distance = math.hypot(*push) - obstacle.radius_m
-    heading = route.heading_rad(s)
-    tangent = (math.cos(heading), math.sin(heading))
-    side = 1 if tangent[0] * push[1] - tangent[1] * push[0] >= 0 else -1
+        push = (x - float(center_w[0]), y - float(center_w[1]))
+        distance_m = math.hypot(*push) - obstacle.radius_m
+    heading_rad = route.heading_rad(s)
+    tangent = (math.cos(heading_rad), math.sin(heading_rad))
+    is_pushed_left = tangent[0] * push[1] - tangent[1] * push[0] >= 0
+    side = 1 if is_pushed_left else -1
     return PlannedContact(
         obstacle=obstacle.name,
         path_s_m=s,
@@ -68,24 +78,32 @@ def plan_contact(
         normal_w=(-side * tangent[1], side * tangent[0]),
         tangent_w=tangent,
         side=side,
-        clearance_m=distance - body_radius_m,
+        clearance_m=distance_m - body_radius_m,
     )
 
 
-def _past_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
-    """Arc length nearest to a box, the direction from the box to there, and the distance."""
-    outline, step, low, high = Outlines.of([box]), COARSE_M, near_s_m - window_m, near_s_m + window_m
-    s, away, distance = near_s_m, np.zeros(2), 0.0
-    for finer in (FINE_M, 0.0):
-        places = np.arange(low, high, step)
-        distances, normals = outline.towards(route.position_w(places), np.zeros(len(places), dtype=np.intp))
-        best = int(np.argmin(distances))
-        s, away, distance = float(places[best]), normals[best], float(distances[best])
-        low, high, step = s - step, s + step, finer
-    return s, (float(away[0]), float(away[1])), distance
+def _find_place_at_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
+    """Return the arc length nearest to a box, the direction from the box to there, and the distance in m."""
+    outline = Outlines.of([box])
+    low = near_s_m - window_m
+    high = near_s_m + window_m
+    s = near_s_m
+    away_w = np.zeros(2)
+    distance_m = 0.0
+    for step in (COARSE_STEP_M, FINE_STEP_M):
+        places_m = np.arange(low, high, step)
+        box_indices = np.zeros(len(places_m), dtype=np.intp)
+        distances_m, normals_w = outline.towards(route.position_w(places_m), box_indices)
+        best = int(np.argmin(distances_m))
+        s = float(places_m[best])
+        away_w = normals_w[best]
+        distance_m = float(distances_m[best])
+        low = s - step
+        high = s + step
+    return s, (float(away_w[0]), float(away_w[1])), distance_m
 
 
-def push_points(
+def find_push_points(
     planned: Sequence[PlannedContact],
     kept: Collection[str],
     body_pose: BodyPose,
@@ -96,28 +114,44 @@ def push_points(
     give_up_gap_m: float,
     end_m: float,
 ) -> list[PushPoint]:
-    """The planned contacts that the body can push at now, tail to head.
+    """Find the planned contacts that the body can push at now.
 
-    One counts when the body covers it, `end_m` from either tip or more, and the measured body is at most `gap_m` from
-    it, or `give_up_gap_m` if it is among `kept`: in contact, or already used for pushing. measured_w: (2, n_nodes).
-    node_body_s_m: (n_nodes,), arc lengths along the body.
+    One counts if the body covers it, and the measured body is near enough to it.
+
+    Args:
+        planned: planned contacts.
+        kept: names of the obstacles in contact, and of those that the body already pushes at.
+        body_pose: the body as it lies on the path.
+        measured_w: (2, n_nodes) m, the measured body.
+        node_body_s_m: (n_nodes,) arc lengths of the nodes from the tail end along the body.
+        gap_m: maximum distance of the measured body from an obstacle.
+        give_up_gap_m: the same for the obstacles in `kept`.
+        end_m: minimum distance along the body from either tip.
+
+    Returns:
+        The push-points, tail to head.
     """
-    places: list[float] = body_pose.node_s_m.tolist()
-    xs, ys = measured_w.tolist()
-    length = node_body_s_m[-1]
-    found: list[PushPoint] = []
+    # Plain lists: this runs in every tick, and for single numbers they are faster than arrays.
+    node_s_m: list[float] = body_pose.node_s_m.tolist()
+    x_m, y_m = measured_w.tolist()
+    length_m = node_body_s_m[-1]
+    points: list[PushPoint] = []
     for contact in planned:
-        i = bisect_right(places, contact.path_s_m) - 1
-        if not 0 <= i < len(places) - 1:
+        # The contact is on the segment from node i to node i + 1, at this fraction of it.
+        i = bisect_right(node_s_m, contact.path_s_m) - 1
+        if not 0 <= i < len(node_s_m) - 1:
             continue
-        share = (contact.path_s_m - places[i]) / (places[i + 1] - places[i])
-        body_s = node_body_s_m[i] + share * (node_body_s_m[i + 1] - node_body_s_m[i])
-        if not end_m < body_s < length - end_m:
+        fraction = (contact.path_s_m - node_s_m[i]) / (node_s_m[i + 1] - node_s_m[i])
+        body_s_m = node_body_s_m[i] + fraction * (node_body_s_m[i + 1] - node_body_s_m[i])
+        if not end_m < body_s_m < length_m - end_m:
             continue
-        off_x = xs[i] + share * (xs[i + 1] - xs[i]) - contact.point_w[0]
-        off_y = ys[i] + share * (ys[i + 1] - ys[i]) - contact.point_w[1]
-        gap = contact.clearance_m + off_x * contact.normal_w[0] + off_y * contact.normal_w[1]
-        if abs(gap) <= (give_up_gap_m if contact.obstacle in kept else gap_m):  # deep inside: it is on the other side
-            found.append(PushPoint(contact, body_s, gap))
-    found.sort(key=lambda p: p.body_s_m)
-    return found
+        # Offset of the measured body from the planned contact, and its gap to the obstacle along the normal.
+        offset_x_m = x_m[i] + fraction * (x_m[i + 1] - x_m[i]) - contact.point_w[0]
+        offset_y_m = y_m[i] + fraction * (y_m[i + 1] - y_m[i]) - contact.point_w[1]
+        measured_gap_m = contact.clearance_m + offset_x_m * contact.normal_w[0] + offset_y_m * contact.normal_w[1]
+        max_gap_m = give_up_gap_m if contact.obstacle in kept else gap_m
+        # A large negative gap does not count either: the body is on the other side of the obstacle.
+        if abs(measured_gap_m) <= max_gap_m:
+            points.append(PushPoint(contact, body_s_m, measured_gap_m))
+    points.sort(key=lambda point: point.body_s_m)
+    return points

@@ -27,11 +27,11 @@ from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
-from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
+from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, find_push_points, plan_contact
+from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose_triplet
 from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
-from snakesim_gnc.control.obstacle_triplet.telemetry import bending_nm, planned_contacts
+from snakesim_gnc.control.obstacle_triplet.telemetry import compute_bending_nm, make_contact_messages
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
@@ -191,7 +191,7 @@ class ObstacleTriplet:
             return np.zeros(len(self._load_nm))
         load_nm = np.zeros(len(self._load_nm))
         if self._choice is not None and self._force_n > 0.0:
-            load_nm = load_ratio * bending_nm(self._body, body_pose, self._choice, self._force_n)
+            load_nm = load_ratio * compute_bending_nm(self._body, body_pose, self._choice, self._force_n)
         keep = np.exp(-view.period_s / self._set.load_filter_s)
         self._load_nm = keep * self._load_nm + (1.0 - keep) * load_nm
         return self._load_nm / self._stiffness
@@ -243,7 +243,7 @@ class ObstacleTriplet:
         kept = [contact.obstacle for contact in located.world.contacts if contact.obstacle is not None]
         if self._choice is not None:
             kept += self._choice.triplet.names
-        self._points = push_points(
+        self._points = find_push_points(
             [contact for _, contact in self._planned.values()],
             kept,
             body_pose,
@@ -281,7 +281,7 @@ class ObstacleTriplet:
         barred_joint = None
         if self._barred is not None:
             barred_joint, _ = self._barred
-        choices, self._refused = self._triplets.choices(
+        choices, self._refused = self._triplets.find_choices(
             self._points, body_pose.nodes_w, self._body.node_s_m, self._choice, barred_joint
         )
         if located.trajectory.speed_m_s <= 0 or view.time_s < self._position_until_s:
@@ -291,9 +291,9 @@ class ObstacleTriplet:
         if self._choice is not None:
             present = self._choice.triplet
         switch_fraction = self._set.switch_fraction
-        choice = choose(choices, present, switch_fraction=switch_fraction, banned=self._banned)
+        choice = choose_triplet(choices, present, switch_fraction=switch_fraction, banned=self._banned)
         if choice is None:  # a banned triplet is better than none
-            choice = choose(choices, present, switch_fraction=switch_fraction)
+            choice = choose_triplet(choices, present, switch_fraction=switch_fraction)
         self._choice = choice
 
     def _expire_restrictions(self, time_s: float, tail_s_m: float) -> None:
@@ -399,10 +399,10 @@ class ObstacleTriplet:
             path_s_m=located.tail_s_m,
             propulsion_joint=demand.joint,
             propulsion_n=demand.force_n,
-            push_points=planned_contacts(self._body, located.world, choice, forces_n),
+            push_points=make_contact_messages(self._body, located.world, choice, forces_n),
             desired_force_n=forces_n,
             propulsion_torque_nm=demand.torque_nm,
-            bending_torque_nm=bending_nm(self._body, body_pose, choice, demand.force_n).tolist(),
+            bending_torque_nm=compute_bending_nm(self._body, body_pose, choice, demand.force_n).tolist(),
             reference_rad=self._reference.tolist(),
             condition=choice.triplet.unit.condition,
             torque_headroom_nm=self._body.torque_limit_nm[demand.joint] - full_torque_nm,

@@ -1,4 +1,4 @@
-"""The obstacle triplet model: contact forces and joint torques for a propulsion force. Pure and planar.
+"""The obstacle triplet model: contact forces and joint torques for a propulsion force, in the plane.
 
 The equations are those of the paper's section IV-A, solved at once. The obstacles push along their normals only (no
 friction), `f_i = lambda_i n_i`, and an imagined tether at o_1 pulls back with `f_s = -propulsion t_1`. Balance of
@@ -23,16 +23,16 @@ from snakesim_hal.base.arrays import Floats
 
 Planar = tuple[float, float] | Floats
 
-CONDITION_MAX = 100.0
-AUTHORITY_MIN = 0.02
-UNIT_TOLERANCE = 1e-6
+CONDITION_MAX = 100.0  # default; above it, errors of the contact points are amplified too much
+AUTHORITY_MIN = 0.02  # default; sine of the angle between the lever and the normal at o_3
+UNIT_TOLERANCE = 1e-6  # of the length of a unit vector
 
 
 @dataclass(frozen=True)
 class UnitForces:
     """Forces of three contacts for each newton of propulsion."""
 
-    forces: Floats  # (3,) N/N, tail to head; NaN where the contacts decide nothing
+    forces: Floats  # (3,) N/N, tail to head; NaN where the balance has no unique solution
     condition: float  # of the balance, with lengths in units of the triplet's span; infinite when singular
     reason: str  # why these contacts cannot propel; empty when they can
 
@@ -41,7 +41,7 @@ class UnitForces:
 class TripletSolution:
     """Forces of three contacts and torque of one joint for a propulsion force."""
 
-    forces_n: Floats  # (3,) tail to head, along the normals; NaN when the contacts decide nothing
+    forces_n: Floats  # (3,) tail to head, along the normals; NaN where the balance has no unique solution
     torque_nm: float  # internal torque on the part of the body ahead of the joint, left turn positive; NaN like forces
     condition: float
     feasible: bool
@@ -58,77 +58,129 @@ def solve_triplet(
     condition_max: float = CONDITION_MAX,
     authority_min: float = AUTHORITY_MIN,
 ) -> TripletSolution:
-    """Contact forces, and the torque of one joint between o_2 and o_3, that hold a propulsion force in balance.
+    """Compute the contact forces, and the torque of one joint between o_2 and o_3, that balance a propulsion force.
 
-    points_w: (3, 2) m, o_1, o_2, o_3 from tail to head. normals_w: (3, 2) unit, from the obstacle into the body.
-    tangent_1_w: (2,) unit, along the body at o_1 towards the head; the tether pulls along its negative.
-    propulsion_n: size of the tether's force. joint_w: (2,) m, where the torque acts.
+    Args:
+        points_w: (3, 2) m, o_1, o_2, o_3 from tail to head.
+        normals_w: (3, 2) unit vectors, from the obstacle into the body.
+        tangent_1_w: (2,) unit vector along the body at o_1 towards the head; the tether pulls along its negative.
+        propulsion_n: size of the tether's force.
+        joint_w: (2,) m, where the torque acts.
+        condition_max: maximum condition number of the balance, with lengths in units of |o_3 - o_1|.
+        authority_min: minimum of |r x n_3| / |r|, where r reaches from the joint to o_3.
 
-    Not feasible, with the reason, when the balance is ill-conditioned (its condition number, with lengths in units of
-    |o_3 - o_1|, exceeds `condition_max`), when a contact would have to pull (lambda_i <= 0), or when the joint has no
-    authority: r, from the joint to o_3, is parallel to n_3 (|r x n_3| / |r| below `authority_min`).
-    Raises ValueError for invalid arguments: wrong shapes, NaN, directions that are not unit
-    vectors, a propulsion force that is not positive.
+    Returns:
+        The solution. It is not feasible, with the reason, if the balance is ill-conditioned, if a contact would have to
+        pull (lambda_i <= 0), or if the joint has no authority, because r is parallel to n_3.
+
+    Raises:
+        ValueError: wrong shapes, NaN, directions that are not unit vectors, or a propulsion force that is not positive.
     """
-    points = _planar("points_w", points_w, (3, 2))
-    normals = _planar("normals_w", normals_w, (3, 2))
-    tangent = _planar("tangent_1_w", tangent_1_w, (2,))
-    joint = _planar("joint_w", joint_w, (2,))
-    for name, vectors in (("normals_w", normals), ("tangent_1_w", tangent[None])):
-        sizes = np.hypot(vectors[:, 0], vectors[:, 1])
-        if np.abs(sizes - 1.0).max() > UNIT_TOLERANCE:
-            raise ValueError(f"{name} must be unit vectors; their lengths are {sizes.tolist()}")
+    points = _check_array("points_w", points_w, (3, 2))
+    normals = _check_array("normals_w", normals_w, (3, 2))
+    tangent = _check_array("tangent_1_w", tangent_1_w, (2,))
+    joint = _check_array("joint_w", joint_w, (2,))
+    _check_unit_vectors("normals_w", normals)
+    _check_unit_vectors("tangent_1_w", tangent[None])
     if not (math.isfinite(propulsion_n) and propulsion_n > 0):
         raise ValueError(f"propulsion_n = {propulsion_n} N must be a finite force above 0")
-    (unit,) = unit_forces(points[None], normals[None], tangent[None], condition_max=condition_max)
-    forces = propulsion_n * unit.forces
-    torque = propulsion_n * torque_per_newton(unit.forces[2], points[2], normals[2], joint)
-    reason = unit.reason or no_authority(points[2], normals[2], joint, authority_min)
-    return TripletSolution(forces, torque, unit.condition, not reason, reason)
+    (unit,) = solve_unit_forces(points[None], normals[None], tangent[None], condition_max=condition_max)
+    forces_n = propulsion_n * unit.forces
+    torque_nm = propulsion_n * compute_torque_per_newton(unit.forces[2], points[2], normals[2], joint)
+    reason = unit.reason or explain_missing_authority(points[2], normals[2], joint, authority_min)
+    return TripletSolution(
+        forces_n=forces_n,
+        torque_nm=torque_nm,
+        condition=unit.condition,
+        feasible=not reason,
+        reason=reason,
+    )
 
 
-def unit_forces(
+def solve_unit_forces(
     points_w: Floats, normals_w: Floats, tangents_1_w: Floats, *, condition_max: float = CONDITION_MAX
 ) -> list[UnitForces]:
-    """The contact forces for 1 N of propulsion of m triplets at once.
+    """Compute the contact forces for 1 N of propulsion of m triplets at once. Arguments are not checked.
 
-    points_w, normals_w: (m, 3, 2). tangents_1_w: (m, 2). Otherwise as in `solve_triplet`, and not checked.
+    For each triplet it solves A lambda = b, equations (10) and (11) for 1 N, with lever arms a_i = (o_i - o_mean) / L
+    about the mean of the three points and in units of their span L = |o_3 - o_1|:
+
+        A = [  n_1x       n_2x       n_3x     ]      b = [  t_1x      ]
+            [  n_1y       n_2y       n_3y     ]          [  t_1y      ]
+            [ a_1 x n_1  a_2 x n_2  a_3 x n_3 ]          [ a_1 x t_1  ]
+
+    Args:
+        points_w: (m, 3, 2) m, o_1, o_2, o_3 from tail to head.
+        normals_w: (m, 3, 2) unit vectors, from the obstacle into the body.
+        tangents_1_w: (m, 2) unit vectors along the body at o_1 towards the head.
+        condition_max: A is not solved above this condition number.
     """
-    spans = np.hypot(*(points_w[:, 2] - points_w[:, 0]).T)
-    arms = (points_w - points_w.mean(axis=1, keepdims=True)) / np.where(spans > 0.0, spans, 1.0)[:, None, None]
-    balance = np.concatenate([normals_w.swapaxes(1, 2), cross(arms, normals_w)[:, None]], axis=1)
-    conditions = np.where(spans > 0.0, np.linalg.cond(balance), np.inf)
-    pull = np.concatenate([tangents_1_w, cross(arms[:, 0], tangents_1_w)[:, None]], axis=1)
-    forces, solvable = np.full((len(spans), 3), np.nan), conditions <= condition_max
-    forces[solvable] = np.linalg.solve(balance[solvable], pull[solvable, :, None])[..., 0]
-    return [
-        UnitForces(unit, condition, _why_not(span, condition, condition_max, unit.tolist()))
-        for unit, condition, span in zip(forces, conditions.tolist(), spans.tolist(), strict=True)
-    ]
+    span_w = points_w[:, 2] - points_w[:, 0]
+    span_m = np.hypot(span_w[:, 0], span_w[:, 1])
+    has_span = span_m > 0.0
+    unit_m = np.where(has_span, span_m, 1.0)
+    arms = (points_w - points_w.mean(axis=1, keepdims=True)) / unit_m[:, None, None]
+
+    moments = cross(arms, normals_w)
+    a = np.concatenate([normals_w.swapaxes(1, 2), moments[:, None]], axis=1)  # (m, 3, 3)
+    tether_moments = cross(arms[:, 0], tangents_1_w)
+    b = np.concatenate([tangents_1_w, tether_moments[:, None]], axis=1)  # (m, 3)
+
+    conditions = np.where(has_span, np.linalg.cond(a), np.inf)
+    is_solvable = conditions <= condition_max
+    forces = np.full((len(span_m), 3), np.nan)  # lambda
+    forces[is_solvable] = np.linalg.solve(a[is_solvable], b[is_solvable, :, None])[..., 0]
+
+    results: list[UnitForces] = []
+    for unit, condition, length_m in zip(forces, conditions.tolist(), span_m.tolist(), strict=True):
+        reason = _explain_unit_forces(length_m, condition, condition_max, unit.tolist())
+        results.append(UnitForces(unit, condition, reason))
+    return results
 
 
-def _why_not(span_m: float, condition: float, condition_max: float, forces: list[float]) -> str:
-    """Why three contacts cannot propel; empty when they can."""
+def _explain_unit_forces(span_m: float, condition: float, condition_max: float, forces: list[float]) -> str:
+    """Return why three contacts cannot propel; empty when they can."""
     if span_m <= 0.0:
         return "o_1 and o_3 are the same point"
-    if not condition <= condition_max:
+    if not condition <= condition_max:  # also true for NaN
         why = f"the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
         return f"ill-conditioned: {why}"
     pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces) if force <= 0.0]
-    return f"a contact would have to pull: {', '.join(pulling)}" if pulling else ""
+    if pulling:
+        return f"a contact would have to pull: {', '.join(pulling)}"
+    return ""
 
 
-def torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w: Planar, joint_w: Planar) -> float:
-    """Torque on the part ahead of a joint between o_2 and o_3, per newton of propulsion: -lambda_3 (r x n_3)."""
-    (x, y), (nx, ny), (px, py) = point_3_w, normal_3_w, joint_w
-    return float(-unit_force_3 * ((x - px) * ny - (y - py) * nx))
+def compute_torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w: Planar, joint_w: Planar) -> float:
+    """Return the torque on the part ahead of a joint between o_2 and o_3, in N·m per newton of propulsion.
+
+    It is -lambda_3 (r x n_3), where r reaches from the joint to o_3.
+
+    Args:
+        unit_force_3: lambda_3 for 1 N of propulsion.
+        point_3_w: (2,) m, o_3.
+        normal_3_w: (2,) unit vector, n_3.
+        joint_w: (2,) m, where the torque acts.
+    """
+    # Single numbers instead of arrays: this runs for each triplet in every tick.
+    x, y = point_3_w
+    nx, ny = normal_3_w
+    joint_x, joint_y = joint_w
+    r_cross_n = (x - joint_x) * ny - (y - joint_y) * nx
+    return float(-unit_force_3 * r_cross_n)
 
 
-def no_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, least: float) -> str:
-    """Why a torque of the joint does not reach the contact at o_3; empty when it does."""
-    (x, y), (nx, ny), (px, py) = point_3_w, normal_3_w, joint_w
-    lever = math.hypot(x - px, y - py)
-    if lever > 0 and abs((x - px) * ny - (y - py) * nx) >= least * lever:
+def explain_missing_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, authority_min: float) -> str:
+    """Return why a torque of the joint does not press on the contact at o_3; empty when it does.
+
+    With r from the joint to o_3, the joint has authority if |r x n_3| >= authority_min |r|.
+    """
+    x, y = point_3_w
+    nx, ny = normal_3_w
+    joint_x, joint_y = joint_w
+    lever_m = math.hypot(x - joint_x, y - joint_y)
+    r_cross_n = (x - joint_x) * ny - (y - joint_y) * nx
+    if lever_m > 0 and abs(r_cross_n) >= authority_min * lever_m:
         return ""
     return "no authority: the line from the joint to o_3 is parallel to the normal there"
 
@@ -136,35 +188,69 @@ def no_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, least: 
 def bending_torque_nm(
     joints_w: ArrayLike, joints_s_m: ArrayLike, points_w: ArrayLike, points_s_m: ArrayLike, forces_w: ArrayLike
 ) -> Floats:
-    """Internal torque at every joint that holds the forces ahead of it in balance; equation (12), (n_joints,) N·m.
+    """Compute the internal torque at every joint that balances the forces ahead of it; equation (12).
 
-    joints_w: (n, 2) m. joints_s_m: (n,) m from the tail end along the body. points_w, points_s_m, forces_w: (k, 2),
-    (k,) and (k, 2), where and with what the body is pushed, the tether's force included. Torque on the part ahead,
-    left turn positive: the negative sum of the moments about the joint of all forces ahead of it. With forces in
-    balance that is the sum of the moments of all forces behind it.
+    The torque acts on the part ahead of the joint, left turn positive. It is the negative sum of the moments about the
+    joint of all forces ahead of it. If all forces are in balance, that is the sum of the moments of all forces behind.
+
+    Args:
+        joints_w: (n, 2) m, the joints.
+        joints_s_m: (n,) m, the joints from the tail end along the body.
+        points_w: (k, 2) m, where the body is pushed.
+        points_s_m: (k,) m, these points from the tail end along the body.
+        forces_w: (k, 2) N, with what it is pushed, the tether's force included.
+
+    Returns:
+        (n,) N·m.
     """
     pushes = wrenches(np.asarray(points_w), np.asarray(forces_w))
-    return torque_under(np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), pushes)
+    return compute_joint_torques(np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), pushes)
 
 
-def torque_under(joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats) -> Floats:
-    """`bending_torque_nm` for pushes whose wrenches (k, 3) are known already."""
-    ahead = (points_s_m > joints_s_m[:, None]).astype(np.float64)
-    x_force, y_force, moment = (ahead @ wrenches).T
+def compute_joint_torques(joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats) -> Floats:
+    """Compute `bending_torque_nm` from the wrenches of the pushes.
+
+    With the sums F and M over all wrenches ahead of a joint at p, M about the origin: torque = p x F - M.
+
+    Args:
+        joints_w: (n, 2) m, the joints.
+        joints_s_m: (n,) m, the joints from the tail end along the body.
+        points_s_m: (k,) m, where the body is pushed, from the tail end along the body.
+        wrenches: (k, 3) force x and y in N, and moment about the origin in N·m.
+    """
+    is_ahead = (points_s_m > joints_s_m[:, None]).astype(np.float64)
+    x_force, y_force, moment = (is_ahead @ wrenches).T
     return joints_w[:, 0] * y_force - joints_w[:, 1] * x_force - moment
 
 
-def loads(forces_n: ArrayLike, normals_w: ArrayLike, tether_w: ArrayLike) -> Floats:
-    """The forces at the three points, (3, 2) N: the contacts', and at o_1 the tether's as well."""
-    forces = np.asarray(forces_n)[:, None] * np.asarray(normals_w)
-    forces[0] += tether_w
-    return forces
+def add_tether(forces_n: ArrayLike, normals_w: ArrayLike, tether_w: ArrayLike) -> Floats:
+    """Return the forces at the three contacts, with the tether's force added at o_1.
+
+    Args:
+        forces_n: (3,) N, along the normals.
+        normals_w: (3, 2) unit vectors.
+        tether_w: (2,) N.
+
+    Returns:
+        (3, 2) N.
+    """
+    forces_w = np.asarray(forces_n)[:, None] * np.asarray(normals_w)
+    forces_w[0] += tether_w
+    return forces_w
 
 
-def _planar(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
+def _check_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Return a value as an array after a check of its shape. Raises ValueError."""
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite: {array.tolist()}")
     return array
+
+
+def _check_unit_vectors(name: str, vectors_w: Floats) -> None:
+    """Check that all vectors (n, 2) have length 1. Raises ValueError."""
+    lengths = np.hypot(vectors_w[:, 0], vectors_w[:, 1])
+    if np.abs(lengths - 1.0).max() > UNIT_TOLERANCE:
+        raise ValueError(f"{name} must be unit vectors; their lengths are {lengths.tolist()}")

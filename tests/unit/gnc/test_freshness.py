@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_gnc.control.freshness import Limits
+from snakesim_gnc.control.freshness import AgeLimits
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Description, SensorDescription, Trajectory, World
 from tests.unit.gnc.stage import make_world
@@ -26,8 +26,8 @@ def robot(**rates: float) -> Description:
     return msgspec.structs.replace(description(), sensors=sensors)
 
 
-def limits(config: RunConfig | None = None, **rates: float) -> Limits:
-    return Limits.of(config or run_config(services=SCHEDULE), robot(**rates))
+def limits(config: RunConfig | None = None, **rates: float) -> AgeLimits:
+    return AgeLimits.from_config(config or run_config(services=SCHEDULE), robot(**rates))
 
 
 def world(**changes: Any) -> World:
@@ -95,31 +95,31 @@ def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
     ],
 )
 def test_a_world_model_is_as_old_as_what_it_was_made_of(made: dict[str, Any], words: str) -> None:
-    assert limits(pose=100.0, contacts=100.0).against_world(world(**made), NOW) == words
+    assert limits(pose=100.0, contacts=100.0).check_world(world(**made), NOW) == words
 
 
 def test_a_perceived_map_is_as_old_as_its_newest_image() -> None:
     config = run_config(services=SCHEDULE, mission={"map": "perceived"})
     sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=20.0, delay_s=0.03) for name in ("depth/a", "range/b")]
     seeing = msgspec.structs.replace(description(), sensors=sensors)
-    found, known = Limits.of(config, seeing), Limits.of(run_config(services=SCHEDULE), seeing)
-    assert found.against_world(world(depth_timestamp_ns=NOW - 270_000_000), NOW) == ""
-    old = found.against_world(world(depth_timestamp_ns=NOW - 400_000_000), NOW)
+    found, known = AgeLimits.from_config(config, seeing), AgeLimits.from_config(run_config(services=SCHEDULE), seeing)
+    assert found.check_world(world(depth_timestamp_ns=NOW - 270_000_000), NOW) == ""
+    old = found.check_world(world(depth_timestamp_ns=NOW - 400_000_000), NOW)
     assert old == "sensor/depth or sensor/range is 0.4 s old, at most 0.27 s"
-    assert "was made without sensor/depth" in found.against_world(world(), NOW)
-    assert known.against_world(world(), NOW) == ""  # of the scene's file, which does not age
+    assert "was made without sensor/depth" in found.check_world(world(), NOW)
+    assert known.check_world(world(), NOW) == ""  # of the scene's file, which does not age
 
 
 def test_a_sensor_that_the_robot_lacks_cannot_be_stale() -> None:
     bare = world(pose_timestamp_ns=None, contacts_timestamp_ns=None)
-    assert limits().against_world(bare, NOW) == ""
+    assert limits().check_world(bare, NOW) == ""
 
 
 def test_joints_and_trajectory_have_their_own_limits() -> None:
     found, joints = limits(), state(robot(), timestamp_ns=NOW)
-    assert found.against_joints(joints, NOW + 30_000_000) == ""
-    assert found.against_joints(joints, NOW + 31_000_000) == "sensor/joints is 0.031 s old, at most 0.03 s"
-    assert found.against_joints(joints, NOW - 10_000_000) == ""  # it came before its tick's clock
-    assert found.against_trajectory(trajectory(NOW - 800_000_000), NOW) == ""
-    assert "navigation/trajectory is 0.9 s old" in found.against_trajectory(trajectory(NOW - 900_000_000), NOW)
-    assert found.against_trajectory(trajectory(None), NOW) == "navigation/trajectory was planned without a world model"
+    assert found.check_joints(joints, NOW + 30_000_000) == ""
+    assert found.check_joints(joints, NOW + 31_000_000) == "sensor/joints is 0.031 s old, at most 0.03 s"
+    assert found.check_joints(joints, NOW - 10_000_000) == ""  # it came before its tick's clock
+    assert found.check_trajectory(trajectory(NOW - 800_000_000), NOW) == ""
+    assert "navigation/trajectory is 0.9 s old" in found.check_trajectory(trajectory(NOW - 900_000_000), NOW)
+    assert found.check_trajectory(trajectory(None), NOW) == "navigation/trajectory was planned without a world model"

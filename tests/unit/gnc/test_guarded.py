@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.gnc.stage import make_stage
@@ -39,7 +39,7 @@ class Wave:
 
 def update(answer: Any) -> Action:
     plugin: Any = Wave
-    return Guarded("./wave.py:Wave", plugin, STAGE.robot, answer).update(VIEW)
+    return GuardedController("./wave.py:Wave", plugin, STAGE.robot, answer).update(VIEW)
 
 
 def points(**changes: Any) -> Action:

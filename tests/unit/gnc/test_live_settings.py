@@ -32,9 +32,9 @@ class Bench:
         self.settings = LiveSettings(Client(network.session(), "control"), config)
         self.settings.configure(description())
         self.anew: list[bool] = []
-        network.answer = lambda: self.anew.append(self.settings.turn(CLOCK))
+        network.answer = lambda: self.anew.append(self.settings.answer_requests(CLOCK))
         self.operator: LocalSession = network.session()
-        self.settings.turn(CLOCK)
+        self.settings.answer_requests(CLOCK)
 
     def ask(self, settings: str, controller: str = "obstacle_triplet") -> Answer:
         return self.operator.ask(keys.SETTINGS, SettingsRequest(who="ada", controller=controller, settings=settings))

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, plan_contact, push_points
+from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, find_push_points, plan_contact
 from snakesim_gnc.control.obstacle_triplet.selection import (
     Choice,
     Triplets,
-    alternating,
-    choose,
-    propulsion_joint,
-    solve,
+    choose_triplet,
+    find_alternating_triples,
+    find_propulsion_joint,
+    solve_triplets,
 )
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_hal.model.route import Route
@@ -38,7 +38,7 @@ def points_at(tail_s_m, *, kept=(), off_w=(0.0, 0.0)):
     stage = make_stage()
     lie = BodyOnPath(stage.route, SEGMENTS).pose_at(tail_s_m)
     measured = nodes_of(stage, tail_s_m) + np.array(off_w)[:, None]
-    return push_points(planned_row(), kept, lie, measured, NODE_S, **LIMITS), lie
+    return find_push_points(planned_row(), kept, lie, measured, NODE_S, **LIMITS), lie
 
 
 def test_a_peg_is_met_at_its_inflection():
@@ -106,14 +106,14 @@ def test_contacts_at_the_tips_do_not_count():
 
 @given(st.lists(st.sampled_from([-1, 1]), max_size=10))
 def test_every_three_on_alternating_sides_are_a_triple(sides):
-    found = alternating(sides)
+    found = find_alternating_triples(sides)
     threes = combinations(range(len(sides)), 3)
     assert sorted(found) == [(i, j, k) for i, j, k in threes if sides[i] == -sides[j] == sides[k]]
 
 
 @given(st.floats(0.0, 1.2), st.floats(0.05, 0.5), st.one_of(st.none(), st.integers(0, 12)))
 def test_the_propulsion_joint_is_the_first_ahead_of_the_middle_contact(behind, distance, present):
-    joint = propulsion_joint(NODE_S, behind, behind + distance, present, 0.003)
+    joint = find_propulsion_joint(NODE_S, behind, behind + distance, present, 0.003)
     between = [i for i in range(13) if behind < NODE_S[i + 1] < behind + distance]
     if joint is None:
         assert not between
@@ -124,43 +124,43 @@ def test_the_propulsion_joint_is_the_first_ahead_of_the_middle_contact(behind, d
 
 def test_noise_does_not_pass_the_turn_to_and_fro():
     place = NODE_S[6]
-    assert propulsion_joint(NODE_S, place - 0.001, 1.2, 6, 0.003) == 6
-    assert propulsion_joint(NODE_S, place - 0.004, 1.2, 6, 0.003) == 5
-    assert propulsion_joint(NODE_S, place - 0.001, 1.2, 5, 0.003) == 5
-    assert propulsion_joint(NODE_S, place - 0.001, 1.2, None, 0.003) == 5
+    assert find_propulsion_joint(NODE_S, place - 0.001, 1.2, 6, 0.003) == 6
+    assert find_propulsion_joint(NODE_S, place - 0.004, 1.2, 6, 0.003) == 5
+    assert find_propulsion_joint(NODE_S, place - 0.001, 1.2, 5, 0.003) == 5
+    assert find_propulsion_joint(NODE_S, place - 0.001, 1.2, None, 0.003) == 5
 
 
 def choices_in_row(count=7):
     row = planned_row()
-    triplets = solve([(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0)
+    triplets = solve_triplets([(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0)
     return [Choice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
 
 
 def test_the_present_triplet_stays_and_its_successor_shares_most_push_points():
     row = choices_in_row()
-    assert choose(row, row[3].triplet, switch_fraction=0.5) is row[3]
+    assert choose_triplet(row, row[3].triplet, switch_fraction=0.5) is row[3]
     rest = [row[0], row[1], row[4], row[6]]
-    assert choose(rest, row[3].triplet, switch_fraction=0.5) is row[4]
+    assert choose_triplet(rest, row[3].triplet, switch_fraction=0.5) is row[4]
 
 
 def test_of_equals_the_one_nearest_to_the_tail_is_chosen():
     row = choices_in_row()
-    assert choose(row, None, switch_fraction=0.5) is row[0]
-    assert choose(row, None, switch_fraction=0.5, banned=[row[0].triplet.names]) is row[1]
-    assert choose(row, None, switch_fraction=0.5, banned=[c.triplet.names for c in row]) is None
+    assert choose_triplet(row, None, switch_fraction=0.5) is row[0]
+    assert choose_triplet(row, None, switch_fraction=0.5, banned=[row[0].triplet.names]) is row[1]
+    assert choose_triplet(row, None, switch_fraction=0.5, banned=[c.triplet.names for c in row]) is None
 
 
 def test_points_become_choices_with_a_joint_each():
     points, lie = points_at(0.2)
     triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.choices(points, lie.nodes_w, NODE_S, None, None)
+    found, refused = triplets.find_choices(points, lie.nodes_w, NODE_S, None, None)
     threes = [[int(name[-1]) for name in c.triplet.names] for c in found]
     assert threes == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
     assert len(refused) == 1 and "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refused[0]
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
-    barred, why = triplets.choices(points, lie.nodes_w, NODE_S, None, found[0].joint)
+    barred, why = triplets.find_choices(points, lie.nodes_w, NODE_S, None, found[0].joint)
     assert [c.joint for c in barred] == [c.joint for c in found if c.joint != found[0].joint]
     assert len(barred) + len(why) == len(found) + len(refused)
 
@@ -174,6 +174,6 @@ def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list
     planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:5]]
     points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
     triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.choices(points, BodyOnPath(route, SEGMENTS).pose_at(0.2).nodes_w, NODE_S, None, None)
+    found, refused = triplets.find_choices(points, BodyOnPath(route, SEGMENTS).pose_at(0.2).nodes_w, NODE_S, None, None)
     assert ["".join(name[-1] for name in c.triplet.names) for c in found] == pushes
     assert all("lambda_1" in why for why in refused)

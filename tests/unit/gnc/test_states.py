@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.advance import Advance
+from snakesim_gnc.control.advance import RecentAdvance
 from snakesim_gnc.control.states import locomotion_state
 
 READY = {"usable_push_points": 3, "advanced_m": 0.1}
@@ -36,11 +36,11 @@ def test_state_and_reason(change, state, word):
 
 
 def advanced(speed_m_s, seconds, noise_m=0.0, every_s=0.02):
-    rng, advance, far = np.random.default_rng(1), Advance(), []
+    rng, advance, far = np.random.default_rng(1), RecentAdvance(), []
     for tick in range(round(seconds / every_s)):
         x, y, z = (rng.standard_normal(3) * noise_m).tolist()
-        advance.put(tick * every_s, (x + speed_m_s * tick * every_s, y, z))
-        far.append(advance.metres)
+        advance.add(tick * every_s, (x + speed_m_s * tick * every_s, y, z))
+        far.append(advance.distance_m)
     return far
 
 
@@ -56,18 +56,18 @@ def test_noise_is_no_advance():
 
 
 def test_a_body_that_stops_stands_still_a_second_later():
-    advance = Advance()
+    advance = RecentAdvance()
     for tick in range(300):
-        advance.put(tick * 0.02, (0.1 * min(tick * 0.02, 2.0), 0.0, 0.0))
+        advance.add(tick * 0.02, (0.1 * min(tick * 0.02, 2.0), 0.0, 0.0))
         if tick * 0.02 > 3.4:
-            assert advance.metres is not None and advance.metres < 0.005
+            assert advance.distance_m is not None and advance.distance_m < 0.005
 
 
 def test_nothing_is_known_before_the_first_measurement_and_after_a_time_without_any_it_begins_anew():
-    advance = Advance()
-    assert advance.metres is None
-    advance.put(0.0, (0.0, 0.0, 0.0))
-    advance.put(5.0, (1.0, 0.0, 0.0))
-    assert advance.metres == 0.0
-    advance.put(4.0, (9.0, 0.0, 0.0))  # comes too late to say anything
-    assert advance.metres == 0.0
+    advance = RecentAdvance()
+    assert advance.distance_m is None
+    advance.add(0.0, (0.0, 0.0, 0.0))
+    advance.add(5.0, (1.0, 0.0, 0.0))
+    assert advance.distance_m == 0.0
+    advance.add(4.0, (9.0, 0.0, 0.0))  # comes too late to say anything
+    assert advance.distance_m == 0.0

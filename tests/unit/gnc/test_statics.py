@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.obstacle_triplet import bending_torque_nm, solve_triplet
-from snakesim_gnc.control.obstacle_triplet.statics import loads
+from snakesim_gnc.control.obstacle_triplet.statics import add_tether
 
 PROPULSION_N = 35.0
 
@@ -73,7 +73,7 @@ def test_beyond_30_degrees_the_tail_contact_would_have_to_pull(slope_deg, feasib
 @given(cases())
 def test_forces_and_moments_balance(case):
     forces = case.solve().forces_n
-    pushed = loads(forces, case.normals, -PROPULSION_N * case.tangent)
+    pushed = add_tether(forces, case.normals, -PROPULSION_N * case.tangent)
     size = np.abs(forces).max() + PROPULSION_N
     assert np.abs(pushed.sum(axis=0)).max() < 1e-9 * size
     assert abs(cross(case.points, pushed).sum()) < 1e-9 * size
@@ -147,7 +147,7 @@ def test_the_papers_equations_1_to_11_with_the_corrected_one_give_the_same(case)
 def test_bending_torque_is_the_same_from_ahead_and_from_behind_and_at_the_propulsion_joint_its_torque(case, joints):
     places = np.array([0.0, 0.3, 0.6])
     solved = case.solve()
-    pushed = loads(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
+    pushed = add_tether(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
     joints_w = np.array(joints)
     joints_s = joints_w[:, 0]
     ahead = bending_torque_nm(joints_w, joints_s, case.points, places, pushed)

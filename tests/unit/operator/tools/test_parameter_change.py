@@ -35,7 +35,7 @@ class Control:
         session = self._network.session()
         self._settings = LiveSettings(Client(session, "control"), load("triplet", []).config)
         self._settings.configure(description())
-        self._settings.turn(CLOCK)
+        self._settings.answer_requests(CLOCK)
         self._states = session.publisher(keys.CONTROL_STATE, ControlState)
         self._reported = reported
         self._gone = gone
@@ -43,7 +43,7 @@ class Control:
         self.operator: LocalSession = self._network.session()
 
     def _answer(self) -> None:
-        self._settings.turn(CLOCK)
+        self._settings.answer_requests(CLOCK)
         if self._reported is not None:
             self._states.put(self._reported)
         if self._gone:
