@@ -1,4 +1,4 @@
-"""One controller, unchanged, on the simulator and on emulated drives of every type, side by side: see docs/odrive.md."""
+"""Run one controller, unchanged, on the simulator and on emulated drives of every type. See docs/odrive.md."""
 
 import statistics
 import sys
