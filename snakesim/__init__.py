@@ -1,12 +1,13 @@
-"""SnakeSIM for programs and notebooks: run scenarios, look at what came of them, and steer robots that run.
+"""SnakeSIM for Python programs and notebooks: run scenarios, read their results, and command running robots.
 
     import snakesim
 
     result = snakesim.run("triplet", duration=8, set={"control.propulsion_n": 35})
     result["angle_rad"], result.metrics["path_distance_m"], result.plot("torque_nm")
 
-`run` and `Result` are for whole runs, `Robot` for one that is there already. `View`, `Action`, `Report`, `positions`
-and `Settings` are for controllers. `docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
+`run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running. `View`, `Action`,
+`Report`, `positions` and `Settings` are for controllers. `docs/python.md` is the reference. Nothing of SnakeSIM imports
+this package.
 
 Names are loaded when they are first used. A program that imports this package before NumPy computes as `snakesim run`
 does, so that one seed gives one digest; one that has imported NumPy already gets its runs from a child process.

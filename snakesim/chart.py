@@ -1,4 +1,4 @@
-"""Figures on a page of their own, for a notebook or a file."""
+"""Charts of signals: figures on one page, for a notebook or a file."""
 
 import os
 from collections.abc import Sequence
@@ -11,19 +11,30 @@ from snakesim_operator.results.page.charts import Figure
 from snakesim_operator.results.page.html import render
 
 PAGE = Path(__file__).with_name("plot.html")
-MARGIN_PX, PADDING_PX = 30, 160  # of each figure, of the page
+MARGIN_PX = 30  # below each figure
+PADDING_PX = 160  # of the page
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Figures over time, which a notebook shows."""
+    """Figures of signals over time. A notebook shows them."""
 
     title: str
     figures: Sequence[Figure]
     joints: int
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write one page of HTML, which needs no network and no other file."""
+        """Write one page of HTML that needs no network and no other file.
+
+        Args:
+            path: The file to write.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            ConfigError: The file cannot be written.
+        """
         write_text(Path(path), self._page())
         return Path(path)
 
@@ -36,6 +47,6 @@ class Chart:
 
 
 def framed(page: str, height_px: int) -> str:
-    """A page within another one."""
+    """Return HTML that shows a page within another one, isolated from it."""
     style = f"width:100%;height:{height_px}px;border:0"
     return f'<iframe style="{style}" sandbox="allow-scripts allow-downloads" srcdoc="{escape(page)}"></iframe>'

@@ -1,4 +1,4 @@
-"""A scenario with what a caller sets, checked: `snakesim.run` and the environments take the same, and answer alike."""
+"""Loads a scenario with values that a Python program sets. `snakesim.run` and the environments share it."""
 
 import os
 from collections.abc import Mapping
@@ -10,27 +10,52 @@ from snakesim_hal.programs.preflight import check_plugins
 
 
 def overrides_of(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
-    """What a caller sets. given: by dotted key; arguments: of the call, by the key that they stand for."""
-    if given is not None and not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
+    """Return the values that a caller sets, as overrides of the scenario.
+
+    Args:
+        given: The argument `set` of the caller: values by their dotted keys.
+        **arguments: Other arguments of the caller, by the key that they stand for. None is left out.
+
+    Raises:
+        ConfigError: `given` is no mapping of keys.
+    """
+    if given is None:
+        given = {}
+    if not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
         raise ConfigError(f"set={given!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}")
-    values = {key: value for key, value in arguments.items() if value is not None}
-    found = [Override(key, _plain(value), f"{key.removesuffix('_s')}={value!r:.60}") for key, value in values.items()]
-    return found + [
-        Override(key, _plain(value), f"set={{{key!r}: {value!r:.60}}}") for key, value in (given or {}).items()
-    ]
+    overrides: list[Override] = []
+    for key, value in arguments.items():
+        if value is not None:
+            flag = f"{key.removesuffix('_s')}={value!r:.60}"
+            overrides.append(Override(key, _to_plain(value), flag))
+    for key, value in given.items():
+        flag = f"set={{{key!r}: {value!r:.60}}}"
+        overrides.append(Override(key, _to_plain(value), flag))
+    return overrides
 
 
-def _plain(value: Any) -> Any:
-    """Of a NumPy number or array the Python one; of a path its text."""
+def _to_plain(value: Any) -> Any:
+    """Return a NumPy number or array as a Python one, and a path as text."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    return value.tolist() if hasattr(value, "tolist") else value
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return value
 
 
 def checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
-    """The configuration of a run, for which everything is there. Raises ConfigError."""
+    """Return the configuration of a run, for which all plugins are there.
+
+    Args:
+        scenario: Name of a shipped scenario, or path of a file.
+        overrides: Values that replace those of the scenario.
+        processes: Whether the run has processes of its own. In one process the clock mode is lockstep.
+
+    Raises:
+        ConfigError: A value is wrong, a plugin is missing, or the clock mode is not possible.
+    """
     clock_mode = next((override for override in overrides if override.key == "clock_mode"), None)
-    if clock_mode is None and not processes:  # the only one there is in one process
+    if clock_mode is None and not processes:
         overrides = [*overrides, Override("clock_mode", "lockstep", "one process")]
     loaded = load(scenario, overrides)
     if clock_mode is not None and not processes and loaded.config.clock_mode != "lockstep":

@@ -1,4 +1,4 @@
-"""What a program may give as a controller: a shipped name, `./file.py:Class`, a class, or a function."""
+"""Converts what a program gives as a controller: a shipped name, `./file.py:Class`, a class, or a function."""
 
 import inspect
 import os
@@ -14,15 +14,22 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description, JointState
 
 JointFunction = Callable[[float, JointState], Sequence[float]]
-"""From the time since arming in s, and the joints' state, to an angle in rad for each joint, tail to head."""
+"""Maps the time since arming in s and the state of the joints to an angle in rad for each joint, tail to head."""
 Given = str | os.PathLike[str] | type[Any] | JointFunction
 TAKES = "a shipped name, a path './file.py:Class', a class, or a function f(time_s, joints) -> angles_rad"
 
 
 def named(controller: Given) -> tuple[str, Any | None]:
-    """Its name in a configuration, and the class that the name stands for; None where the name says it all.
+    """Return the name of a controller in a configuration, and its class.
 
-    Raises ConfigError for anything else.
+    Args:
+        controller: A shipped name, a path "./file.py:Class", a class with a method `update`, or a function.
+
+    Returns:
+        The name, and the class that must be offered under this name; None if the name alone is enough.
+
+    Raises:
+        ConfigError: It is none of these.
     """
     if isinstance(controller, str | os.PathLike):
         return os.fspath(controller), None
@@ -39,11 +46,13 @@ def named(controller: Given) -> tuple[str, Any | None]:
         inspect.signature(controller).bind(0.0, None)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"controller={name}: is called as f(time_s, joints), which does not fit: {error}") from None
-    return f"program:{name}", _class_of(controller, name)
+    return f"program:{name}", _wrap_function(controller, name)
 
 
-def _class_of(function: JointFunction, name: str) -> Any:
-    class OfFunction:
+def _wrap_function(function: JointFunction, name: str) -> Any:
+    """Return a controller class that calls a function in every tick."""
+
+    class FunctionController:
         NEEDS = "joints"
 
         class Settings(FileStruct, frozen=True):
@@ -53,25 +62,25 @@ def _class_of(function: JointFunction, name: str) -> Any:
             self._robot = robot
 
         def update(self, view: View) -> Action:
-            answer = function(view.time_s, view.joints)
-            angles_rad = _as_angles(answer, len(self._robot.joints), name)
+            returned = function(view.time_s, view.joints)
+            angles_rad = _check_angles(returned, len(self._robot.joints), name)
             report = Report(why=f"{name} moves the joints", reference_rad=angles_rad)
             return Action(positions(self._robot, angles_rad), report)
 
-    OfFunction.__name__ = name
-    OfFunction.__module__ = getattr(function, "__module__", None) or OfFunction.__module__
-    return OfFunction
+    FunctionController.__name__ = name
+    FunctionController.__module__ = getattr(function, "__module__", None) or FunctionController.__module__
+    return FunctionController
 
 
-def _as_angles(answer: Any, count: int, name: str) -> list[float]:
-    """Return a function's answer as `count` angles in rad. Raises ControllerError."""
-    shown = " ".join(repr(answer).split())  # NumPy prints several lines
-    wanted = f"{name}() returned {shown:.60}, must return {count} angles in rad, tail to head"
+def _check_angles(returned: Any, count: int, name: str) -> list[float]:
+    """Return what a function returned as `count` angles in rad. Raises ControllerError."""
+    shown = " ".join(repr(returned).split())  # NumPy prints several lines
+    message = f"{name}() returned {shown:.60}, must return {count} angles in rad, tail to head"
     try:
-        angles_rad = np.asarray(answer, dtype=float)
+        angles_rad = np.asarray(returned, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ControllerError(f"{wanted}: {error}") from error
+        raise ControllerError(f"{message}: {error}") from error
     if angles_rad.shape == (count,):
         return angles_rad.tolist()
-    got = f"{len(angles_rad)}" if angles_rad.ndim == 1 else f"an array of shape {angles_rad.shape}"
-    raise ControllerError(f"{wanted}; got {got}")
+    actual = f"{len(angles_rad)}" if angles_rad.ndim == 1 else f"an array of shape {angles_rad.shape}"
+    raise ControllerError(f"{message}; got {actual}")

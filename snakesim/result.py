@@ -1,4 +1,4 @@
-"""What came of a run: signals by name with their units, metrics, and pages, plots and films of them."""
+"""The result of a run: signals by name with their units, metrics, and pages, plots and films of them."""
 
 import dataclasses
 import importlib
@@ -29,9 +29,10 @@ SPAN_S = (0.0, math.inf)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Result:
-    """A run that is over. Every signal has a row for each tick since the first arming; NaN is unknown.
+    """The signals and the summary of a run that is over.
 
-    result["angle_rad"] is (ticks, joints), result["angle_rad.joint_3"] is (ticks,); `names` lists all.
+    Every signal has a row for each tick since the first arming; NaN is unknown. `result["angle_rad"]` is
+    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `names` lists all signals.
     """
 
     record: RunRecord
@@ -39,57 +40,67 @@ class Result:
 
     @cached_property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Every signal, (ticks,) or (ticks, width)."""
+        """All signals by name, each (ticks,) or (ticks, width)."""
         return arrays(self.record)
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Every signal one number wide, (ticks,), as in the tables of `snakesim export`."""
+        """All signals split into columns by name, each (ticks,), as in the tables of `snakesim export`."""
         return table(self.record)
 
     @property
     def names(self) -> list[str]:
-        """Of all signals."""
+        """The names of all signals and columns."""
         return list(self.arrays | self.columns)
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """Of each signal, SI; "1" for plain numbers."""
+        """The SI unit of each signal by its name; "1" for plain numbers."""
         return {name: unit_of(name, self.record) for name in self.names}
 
     @property
     def joints(self) -> list[str]:
-        """Names of the joints, tail to head: the second axis of `angle_rad` and the like."""
+        """The names of the joints, tail to head, which are the second axis of signals such as `angle_rad`."""
         return [joint.name for joint in self.record.description.joints]
 
     @property
     def time_s(self) -> NDArray[np.float64]:
-        """Robot time of each row."""
+        """The robot time of each row in s, (ticks,)."""
         return self.record.time_s
 
     @cached_property
     def metrics(self) -> dict[str, float | bool | None]:
-        """The numbers of the summary; units are in the names; None is unknown."""
-        of = msgspec.structs.asdict(self.summary)
-        return {name: value for name, value in of.items() if value is None or isinstance(value, bool | int | float)}
+        """The numbers of the summary by name. Units are in the names; None is unknown."""
+        metrics: dict[str, float | bool | None] = {}
+        for name, value in msgspec.structs.asdict(self.summary).items():
+            if value is None or isinstance(value, bool | int | float):
+                metrics[name] = value
+        return metrics
 
     @property
     def digest(self) -> str:
-        """Hash of every setpoint as applied: the same for the same run, to the bit."""
+        """A hash of all applied setpoints. Two runs have the same hash if their setpoints are equal to the bit."""
         return self.summary.command_digest
 
     @property
     def ended(self) -> str:
-        """How the run ended: "complete", or what failed."""
+        """How the run ended: "complete", or the failure."""
         return self.summary.ended
 
     @property
     def complete(self) -> bool:
-        """Whether the robot was armed for all of the time asked for."""
+        """Whether the robot was armed for the whole duration."""
         return self.ended == COMPLETE
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """A signal. Raises ConfigError, for a name that there is not."""
+        """Return a signal.
+
+        Args:
+            name: A name in `names`, such as "angle_rad" or "angle_rad.joint_3".
+
+        Raises:
+            ConfigError: There is no such signal.
+        """
         if name not in self.names:
             raise ConfigError(
                 f"no signal {short(str(name))!r}; {did_you_mean(str(name), self.names)}there are "
@@ -98,9 +109,13 @@ class Result:
         return self.arrays[name] if name in self.arrays else self.columns[name]
 
     def to_pandas(self) -> Any:
-        """A DataFrame of all columns, with the time as its index; `attrs["units"]` has the units.
+        """Return a pandas DataFrame of all columns, with the time in s as its index.
 
-        Raises ConfigError without pandas.
+        Returns:
+            The DataFrame; its `attrs["units"]` has the unit of each column.
+
+        Raises:
+            ConfigError: pandas is not installed.
         """
         try:
             pandas = importlib.import_module("pandas")
@@ -113,15 +128,32 @@ class Result:
         return frame
 
     def plot(self, *signals: str) -> Chart:
-        """A chart for each signal over time; without names, of angles and torques. Raises ConfigError."""
+        """Return a chart of signals over time, which a notebook shows.
+
+        Args:
+            *signals: Names of signals, one figure each; without names, angles and torques.
+
+        Raises:
+            ConfigError: There is no such signal.
+        """
         figures = [self._figure(name) for name in signals or ("angle_rad", "torque_nm")]
         return Chart(self.summary.scenario, figures, len(self.joints))
 
     def report(self, path: str | os.PathLike[str]) -> Path:
-        """Write the run's report: one page of HTML, which needs no network and no other file."""
+        """Write the report of the run: one page of HTML that needs no network and no other file.
+
+        Args:
+            path: The file to write.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            ConfigError: The file cannot be written.
+        """
         from snakesim_operator.results.report import page
 
-        write_text(Path(path), page(self._unkept, self.summary))
+        write_text(Path(path), page(self._linkless_record, self.summary))
         return Path(path)
 
     def video(
@@ -134,25 +166,42 @@ class Result:
         speed: float = 1.0,
         span_s: tuple[float, float] = SPAN_S,
     ) -> Path:
-        """Film the run into FILE.mp4 or FILE.gif. Raises ConfigError without a pose, or the extra `video`."""
+        """Film the run.
+
+        Args:
+            path: The file to write, with the suffix .mp4 or .gif.
+            width: Width of a picture in pixels.
+            height: Height of a picture in pixels.
+            fps: Pictures in a second of the film.
+            speed: Seconds of robot time in a second of the film.
+            span_s: Begin and end of the part of the run to film, in s.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            ConfigError: The run has no pose, or the extra `video` is not installed.
+        """
         from snakesim_operator.playback.video import film
 
         film(self.record, Path(path), size=(width, height), fps=fps, speed=speed, span_s=span_s, say=lambda _line: None)
         return Path(path)
 
     def compare(self, other: "Result") -> str:
-        """What differs between this run and another one, as `snakesim compare` prints it."""
+        """Return the differences between this run and another one, as `snakesim compare` prints them."""
         from snakesim_operator.results.compare.difference import differ
-        from snakesim_operator.results.compare.table import table as in_words
+        from snakesim_operator.results.compare.table import table as format_table
 
-        return "\n".join(in_words(differ(self.record, other.record)))
+        return "\n".join(format_table(differ(self.record, other.record)))
 
     def __repr__(self) -> str:
-        of, moved_m = self.summary, distance_m(self.summary)
+        summary = self.summary
+        moved_m = distance_m(summary)
         moved = "" if moved_m is None else f", moved {moved_m:.3f} m"
-        what = f"{of.scenario}, {of.controller}, {of.backend}"
-        slow = "".join(f", {words}" for words in of.too_slow)
-        return f"<Result {what}: {of.duration_s:g} s{moved}, {of.ended}{slow}, digest {self.digest[:16]}>"
+        configuration = f"{summary.scenario}, {summary.controller}, {summary.backend}"
+        slow = "".join(f", {part}" for part in summary.too_slow)
+        digest = self.digest[:16]
+        return f"<Result {configuration}: {summary.duration_s:g} s{moved}, {summary.ended}{slow}, digest {digest}>"
 
     def _repr_html_(self) -> str:
         from snakesim_operator.results.report import playback_page
@@ -160,18 +209,29 @@ class Result:
         return framed(playback_page(self.record, self.summary), PLAYBACK_PX)
 
     @property
-    def _unkept(self) -> RunRecord:
-        """The record, whose folder may be gone: its pages then name no files in it."""
-        return self.record if self.record.folder.exists() else dataclasses.replace(self.record, alone=True)
+    def _linkless_record(self) -> RunRecord:
+        """The record; if its folder is gone, one whose pages link to no files in the folder."""
+        if self.record.folder.exists():
+            return self.record
+        return dataclasses.replace(self.record, alone=True)
 
     def _figure(self, name: str) -> dict[str, Any]:
-        values, unit = self[name].astype(float), self.units[name]
-        drawn = self._drawn(name, values)
-        until_s = float(self.time_s[-1]) if len(self.time_s) else 0.0
-        return lines(f"{name} over time", name if unit == "1" else f"{name}, {unit}", drawn, until_s)
+        """Return the figure of a signal over time."""
+        values = self[name].astype(float)
+        unit = self.units[name]
+        title = name if unit == "1" else f"{name}, {unit}"
+        end_s = float(self.time_s[-1]) if len(self.time_s) else 0.0
+        return lines(f"{name} over time", title, self._lines(name, values), end_s)
 
-    def _drawn(self, name: str, values: NDArray[np.float64]) -> Sequence[Line]:
+    def _lines(self, name: str, values: NDArray[np.float64]) -> Sequence[Line]:
+        """Return a line for each column of a signal."""
         if values.ndim == 1:
             return [Line(name, self.time_s, values, "--measured")]
-        parts = self.joints if name in OF_JOINTS else "xyz" if name == "position_w" else "wxyz"
-        return [Line(part, self.time_s, values[:, i], f"--joint-{i}") for i, part in enumerate(parts)]
+        labels: Sequence[str]
+        if name in OF_JOINTS:
+            labels = self.joints
+        elif name == "position_w":
+            labels = "xyz"
+        else:
+            labels = "wxyz"
+        return [Line(label, self.time_s, values[:, i], f"--joint-{i}") for i, label in enumerate(labels)]

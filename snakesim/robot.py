@@ -1,4 +1,8 @@
-"""A robot that runs, for scripts and notebooks: read the newest, wait for a tick, command, arm, stop, tune, record."""
+"""A connection to a robot that is already running, for scripts and notebooks.
+
+It reads the newest messages, waits for ticks, sends commands, arms and stops the robot, changes parameters, and
+records what the robot publishes.
+"""
 
 import math
 import os
@@ -41,8 +45,12 @@ from snakesim_operator.robot_commands.command import ask_meanwhile
 from snakesim_operator.robot_commands.parameters import Parameter, change, in_force, parameters_of
 from snakesim_operator.robot_commands.stop import estop
 
-CONNECT_S, FIRST_S, SILENCE_S, READY_S, RECORDING_S = 5.0, 1.0, 2.0, 10.0, 10.0
-LOOK_S = 0.0005
+CONNECT_TIMEOUT_S = 5.0  # a robot may be starting
+FIRST_MESSAGE_TIMEOUT_S = 1.0  # from the first read of a key until its first message
+TICK_TIMEOUT_S = 2.0
+ARM_TIMEOUT_S = 10.0
+RECORDING_START_TIMEOUT_S = 10.0
+POLL_INTERVAL_S = 0.0005
 
 
 class Robot:
@@ -50,25 +58,40 @@ class Robot:
 
         with snakesim.Robot.connect() as robot:
             robot.arm()
-            began = robot.wait()
-            while (passed_s := robot.wait() - began) < 3:
-                robot.command([0.2 * math.sin(passed_s)] * len(robot.names))
+            start_s = robot.wait()
+            while (elapsed_s := robot.wait() - start_s) < 3:
+                robot.command([0.2 * math.sin(elapsed_s)] * len(robot.names))
 
-    There is no thread: an armed robot needs a command in every tick, or its lease ends, and it stops in a fault.
+    There is no thread: an armed robot needs a command in every tick. Without one its lease ends, and the robot stops
+    with a fault.
     """
 
     def __init__(self, link: Link) -> None:
-        """As `connect`."""
-        self._link, self._opened = link, ExitStack()
-        self._session: Session = self._opened.enter_context(open_session(link, CONNECT_S))
+        """Open a session to a robot whose link is known; `connect` finds the link.
+
+        Args:
+            link: Endpoint, namespace and session file of the robot.
+
+        Raises:
+            NotConnectedError: The endpoint does not answer, or the robot publishes no description or status.
+        """
+        self._link = link
+        self._opened = ExitStack()
+        self._session: Session = self._opened.enter_context(open_session(link, CONNECT_TIMEOUT_S))
+
+        # Messages, by key.
         self._readers: dict[str, Reader[Any]] = {}
         self._newest: dict[str, Any] = {}
+
+        # The right to command.
         self._control: Commanding | None = None
-        self._armed = False  # by this
+        self._armed = False  # by this connection
+
         try:
-            self.description: Description = self._present(keys.DESCRIPTION, Description)
-            self._present(keys.STATUS, Status)
-            self._taken(keys.CLOCK, Clock, 0.0)  # in lockstep none comes while somebody thinks
+            self.description: Description = self._require_newest(keys.DESCRIPTION, Description)
+            self._require_newest(keys.STATUS, Status)
+            # In lockstep the clock publishes nothing while a controller computes, so its first message is not required.
+            self._read_newest(keys.CLOCK, Clock, 0.0)
         except NotConnectedError:
             self._opened.close()
             raise
@@ -77,31 +100,35 @@ class Robot:
     def connect(
         endpoint: str | None = None, *, name: str | None = None, session: str | os.PathLike[str] | None = None
     ) -> "Robot":
-        """Meet a robot. name: its namespace, needed where there are several; session: Zenoh session file of a lab.
+        """Find a running robot, and connect to it.
 
-        endpoint: None is the only robot that runs on this computer. Raises NotConnectedError, RefusedError when there
-        are several, ConfigError.
+        Args:
+            endpoint: Zenoh endpoint of the robot's HAL host, such as "tcp/127.0.0.1:7447". None finds the only robot
+                that runs on this computer.
+            name: Namespace of the robot; needed where there are several robots.
+            session: Path of the Zenoh session file of a lab. The file names the endpoint.
+
+        Returns:
+            The open connection. Use it in a `with` statement, or call `close`.
+
+        Raises:
+            ConfigError: An argument is malformed, or both `endpoint` and `session` are given.
+            NotConnectedError: No robot answers within CONNECT_TIMEOUT_S.
+            RefusedError: Several robots answer.
         """
-        if endpoint is not None:
-            check_endpoint(endpoint, "endpoint")
-        if name is not None:
-            check_namespace(name, "name")
-        where = RobotSelection(endpoint, name)
-        if session is not None:
-            if endpoint is not None:
-                raise ConfigError("endpoint and session: the session file names the endpoint; leave one out")
-            file = read_session(Path(session))
-            where = RobotSelection(file.endpoints[0], file.namespace_for(name), file)
-        deadline = time.monotonic() + CONNECT_S  # a robot may be starting
-        while not (found := find_robots(where)) and time.monotonic() < deadline:
-            time.sleep(LOOK_S)
-        if not found:
-            named = "" if where.namespace is None else f" named {where.namespace}"
-            raise NotConnectedError(f"no robot{named} on {', '.join(where.endpoints())}; is its HAL host running?")
-        if len(found) > 1:
-            choices = [f"  endpoint={link.endpoint!r}, name={link.namespace!r}" for link in found]
+        selection = _select_robot(endpoint, name, session)
+        deadline = time.monotonic() + CONNECT_TIMEOUT_S
+        links = find_robots(selection)
+        while not links and time.monotonic() < deadline:
+            time.sleep(POLL_INTERVAL_S)
+            links = find_robots(selection)
+        if not links:
+            named = "" if selection.namespace is None else f" named {selection.namespace}"
+            raise NotConnectedError(f"no robot{named} on {', '.join(selection.endpoints())}; is its HAL host running?")
+        if len(links) > 1:
+            choices = [f"  endpoint={link.endpoint!r}, name={link.namespace!r}" for link in links]
             raise RefusedError("several robots found; choose one:", *choices)
-        return Robot(found[0])
+        return Robot(links[0])
 
     def __enter__(self) -> Self:
         return self
@@ -110,7 +137,7 @@ class Robot:
         self.close()
 
     def close(self) -> None:
-        """Disarm what this has armed, and leave."""
+        """Disarm the robot if this connection armed it, and close the session."""
         try:
             if self._armed:
                 self.disarm()
@@ -119,42 +146,59 @@ class Robot:
 
     @property
     def names(self) -> list[str]:
-        """Of the joints, tail to head."""
+        """The names of the joints, tail to head."""
         return [joint.name for joint in self.description.joints]
 
     @property
     def status(self) -> Status:
-        """The newest one: lifecycle, why, faults, counters."""
-        return self._present(keys.STATUS, Status)
+        """The newest status: lifecycle state, its reason, faults and counters.
+
+        Raises:
+            NotConnectedError: The robot publishes no status.
+        """
+        return self._require_newest(keys.STATUS, Status)
 
     @property
     def joints(self) -> JointState | None:
-        """The newest state of all joints; None when there is none yet, as for all readings."""
+        """The newest state of all joints, or None before the first one."""
         return self.read(keys.JOINTS)
 
     @property
     def pose(self) -> Pose | None:
-        """The newest pose of the base, of a robot that has a sensor for it."""
+        """The newest pose of the base, or None if the robot has no sensor for it."""
         return self.read(keys.POSE)
 
     @property
     def contacts(self) -> Contacts | None:
-        """The newest contacts."""
+        """The newest contacts, or None if the robot has no sensor for them."""
         return self.read(keys.CONTACTS)
 
     @property
     def time_s(self) -> float:
-        """Robot time of the tick at hand, or of the newest one."""
+        """Robot time of the current tick in s; before the first command, of the newest tick."""
         return self._clock.timestamp_ns * 1e-9
 
     def age_s(self, message: Any) -> float:
-        """How old a reading is, in robot time."""
+        """Return the age of a message in s of robot time.
+
+        Args:
+            message: Any message with a timestamp, as `read` returns it.
+        """
         return self.time_s - message.timestamp_ns * 1e-9
 
     def read(self, key: str) -> Any:
-        """The newest message at a key, such as "sensor/imu"; None when there is none.
+        """Return the newest message at a key.
 
-        From the first command on, joints, pose and contacts are those of the tick at hand.
+        From the first command on, joints, pose and contacts are those of the current tick.
+
+        Args:
+            key: Key of the key space without the namespace, such as "sensor/imu".
+
+        Returns:
+            The message, or None if there is none. The first read of a key waits up to FIRST_MESSAGE_TIMEOUT_S.
+
+        Raises:
+            ConfigError: There is no such key.
         """
         if self._control is not None and key in READ:
             return self._control.read(key)
@@ -163,11 +207,19 @@ class Robot:
             known = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
             raise ConfigError(f"no key {key!r} in the key space; {did_you_mean(key, known)}see schemas/keys.md")
         message = message_of(key, self.description) or message
-        first = key not in self._readers and self._control is None
-        return self._taken(key, message, FIRST_S if first else 0.0)
+        may_wait = key not in self._readers and self._control is None
+        return self._read_newest(key, message, FIRST_MESSAGE_TIMEOUT_S if may_wait else 0.0)
 
     def wait(self) -> float:
-        """The next tick; its robot time in s. Raises StalledError; RefusedError when what was armed is not any more."""
+        """Wait for the next tick.
+
+        Returns:
+            Robot time of the tick in s.
+
+        Raises:
+            StalledError: No tick came within TICK_TIMEOUT_S.
+            RefusedError: This connection armed the robot, and the robot is not armed any more.
+        """
         if self._control is None:
             return self._wait_for_clock()
         clock = self._control.wait()
@@ -177,56 +229,85 @@ class Robot:
         return clock.timestamp_ns * 1e-9
 
     def command(self, angles_rad: Sequence[float] | RequestedSetpoints) -> None:
-        """Command every joint, tail to head, in this tick: by angles, or by `RequestedSetpoints` with modes and limits.
+        """Send a setpoint for every joint in this tick. The first command takes the lease.
 
-        Raises ConfigError for what is no such command, RefusedError without the right to command.
+        Args:
+            angles_rad: (joints,) angles in rad, tail to head; or `RequestedSetpoints`, which also choose the mode and
+                the torque limit of each joint.
+
+        Raises:
+            ConfigError: The values are not one finite number for each joint.
+            RefusedError: Another controller commands the robot, or the lease was lost.
         """
-        points = (
-            angles_rad if isinstance(angles_rad, RequestedSetpoints) else positions(self.description, list(angles_rad))
-        )
-        count = len(self.names)
-        for what, values in (("target", points.target), ("torque_limit_nm", points.torque_limit_nm)):
-            wanted = f"{what} is {values!r:.80}, must be {count} finite numbers, tail to head"
-            if len(values) != count:
-                raise ConfigError(f"{wanted}; got {len(values)}")
-            if not all(math.isfinite(value) for value in values):
-                raise ConfigError(wanted)
-        self._commanding().send(points)
+        if isinstance(angles_rad, RequestedSetpoints):
+            setpoints = angles_rad
+        else:
+            setpoints = positions(self.description, list(angles_rad))
+        self._check_values("target", setpoints.target)
+        self._check_values("torque_limit_nm", setpoints.torque_limit_nm)
+        self._start_commanding().send(setpoints)
 
     def arm(self, *, unchecked: bool = False) -> None:
-        """Take the lease, and have the robot hold its pose until the first command. Raises RefusedError.
+        """Take the lease and arm the robot. It holds its pose until the first command.
 
-        unchecked: also a robot whose joints nobody has checked as they are now; see docs/commissioning.md.
+        Args:
+            unchecked: Also arm a robot whose joints were not checked as they are now; see docs/commissioning.md.
+
+        Raises:
+            RefusedError: The robot is not ready within ARM_TIMEOUT_S, or refuses, or disarms at once.
         """
-        control = self._commanding()
-        control.turn_until(lambda: self.status.ready_to_arm, READY_S, lambda: f"not armed: {self.status.why}")
-        before = self._clock.arm_session
-        self._ask(request_to_arm(self.description, user_name(), unchecked=unchecked), "armed")
-        control.turn_until(lambda: self._clock.arm_session > before, READY_S, lambda: f"not armed: {self.status.why}")
+        control = self._start_commanding()
+
+        def explain_not_armed() -> str:
+            return f"not armed: {self.status.why}"
+
+        control.turn_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
+        previous_session = self._clock.arm_session
+        self._send_request(request_to_arm(self.description, user_name(), unchecked=unchecked), "armed")
+        control.turn_until(lambda: self._clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed)
         if self._clock.lifecycle != "armed":
             raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")
         self._armed = True
 
     def disarm(self) -> None:
-        """Make the joints passive."""
-        self._ask(LifecycleRequest(action="disarm", who=user_name()), "disarmed")
+        """Disarm the robot; its joints become passive.
+
+        Raises:
+            RefusedError: The robot refuses, or does not confirm.
+        """
+        self._send_request(LifecycleRequest(action="disarm", who=user_name()), "disarmed")
         self._armed = False
 
     def clear(self) -> None:
-        """Clear a fault or an emergency stop; the robot is disarmed then."""
-        self._ask(LifecycleRequest(action="clear", who=user_name()), "cleared")
+        """Reset a fault or an emergency stop. The robot is disarmed afterwards.
+
+        Raises:
+            RefusedError: The cause is still present, or the robot does not confirm.
+        """
+        self._send_request(LifecycleRequest(action="clear", who=user_name()), "cleared")
 
     def estop(self) -> None:
-        """Emergency stop, over the stop port and over the network. Raises RefusedError unless it is confirmed."""
-        said: list[str] = []
+        """Trigger the emergency stop, over the stop port and over the network.
+
+        Raises:
+            RefusedError: The robot does not confirm the stop.
+        """
+        output: list[str] = []
         self._armed = False
-        if estop(RobotSelection(self._link.endpoint, self._link.namespace, self._link.session), said.append):
-            raise RefusedError(*said)
+        selection = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
+        exit_code = estop(selection, output.append)
+        if exit_code:
+            raise RefusedError(*output)
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Parameters of the running controller by name: value, unit, range, meaning."""
-        return {f"control.{one.name}": one for one in parameters_of(in_force(self._session))}
+        """Parameters of the running controller by name, such as "control.amplitude_rad": value, unit, range, meaning.
+
+        Raises:
+            NotConnectedError: No controller is running.
+        """
+        parameters = parameters_of(in_force(self._session))
+        return {f"control.{parameter.name}": parameter for parameter in parameters}
 
     def set(self, changes: Mapping[str, Any]) -> None:
         """Change parameters of the running controller, all or none.
@@ -240,34 +321,56 @@ class Robot:
 
     @contextmanager
     def record(self, path: str | os.PathLike[str]) -> Iterator[Path]:
-        """Record everything that the robot publishes into an MCAP file. Raises ConfigError for one that exists."""
-        ended, heard = threading.Event(), threading.Event()
+        """Record everything that the robot publishes, during a `with` block.
+
+        Args:
+            path: The MCAP file to create.
+
+        Yields:
+            The path of the file.
+
+        Raises:
+            ConfigError: The file exists already, or cannot be written.
+        """
+        ended = threading.Event()
+        started = threading.Event()
         link = replace(self._link, max_bytes=MAX_IMAGE_BYTES)
-        with ThreadPoolExecutor(1) as beside:
-            recording = beside.submit(record, link, Path(path), lambda: not ended.is_set(), lambda *_: heard.set())
+        with ThreadPoolExecutor(1) as executor:
+            recording = executor.submit(record, link, Path(path), lambda: not ended.is_set(), lambda *_: started.set())
             try:
-                deadline = time.monotonic() + RECORDING_S
-                while not heard.is_set() and not recording.done() and time.monotonic() < deadline:
-                    self._pass()
+                deadline = time.monotonic() + RECORDING_START_TIMEOUT_S
+                while not started.is_set() and not recording.done() and time.monotonic() < deadline:
+                    self._let_time_pass()
                 yield Path(path)
             finally:
                 ended.set()
                 while not recording.done():
-                    self._pass()
+                    self._let_time_pass()
                 recording.result()
 
-    def _commanding(self) -> Commanding:
+    def _start_commanding(self) -> Commanding:
+        """Return what sends commands; the first call takes the lease."""
         if self._control is None:
             self._control = Commanding(self._session, self.description, self.status.clock_mode)
         return self._control
 
-    def _ask(self, request: LifecycleRequest, done: str) -> None:
-        ask_meanwhile(self._session, request, done, self._link, self._pass)
+    def _check_values(self, name: str, values: Sequence[float]) -> None:
+        """Raise ConfigError unless there is one finite number for each joint."""
+        count = len(self.names)
+        expected = f"{name} is {values!r:.80}, must be {count} finite numbers, tail to head"
+        if len(values) != count:
+            raise ConfigError(f"{expected}; got {len(values)}")
+        if not all(math.isfinite(value) for value in values):
+            raise ConfigError(expected)
 
-    def _pass(self) -> None:
-        """Let some time pass."""
+    def _send_request(self, request: LifecycleRequest, done: str) -> None:
+        """Send a lifecycle request and wait for its effect, while the lease is renewed."""
+        ask_meanwhile(self._session, request, done, self._link, self._let_time_pass)
+
+    def _let_time_pass(self) -> None:
+        """Run one tick if this connection commands the robot, so that its lease stays valid; otherwise sleep."""
         if self._control is None:
-            time.sleep(LOOK_S)
+            time.sleep(POLL_INTERVAL_S)
         else:
             self._control.turn()
 
@@ -275,39 +378,67 @@ class Robot:
     def _clock(self) -> Clock:
         if self._control is not None and self._control.clock is not None:
             return self._control.clock
-        return self._present(keys.CLOCK, Clock)
+        return self._require_newest(keys.CLOCK, Clock)
 
     def _wait_for_clock(self) -> float:
-        before, deadline = self._clock.tick, time.monotonic() + SILENCE_S
-        while (clock := self._clock).tick == before:
+        """Wait for the next tick without the right to command; return its robot time in s."""
+        previous_tick = self._clock.tick
+        deadline = time.monotonic() + TICK_TIMEOUT_S
+        clock = self._clock
+        while clock.tick == previous_tick:
             if time.monotonic() > deadline:
-                raise StalledError(f"no tick of {self._link.namespace} for {SILENCE_S:g} s")
-            time.sleep(LOOK_S)
+                raise StalledError(f"no tick of {self._link.namespace} for {TICK_TIMEOUT_S:g} s")
+            time.sleep(POLL_INTERVAL_S)
+            clock = self._clock
         return clock.timestamp_ns * 1e-9
 
-    def _present(self, key: str, message: type[Message]) -> Any:
-        """The newest message of a key that every robot writes. Raises NotConnectedError."""
-        found = self._taken(key, message, CONNECT_S)
-        if found is None:
+    def _require_newest(self, key: str, message: type[Message]) -> Any:
+        """Return the newest message of a key that every robot publishes. Raises NotConnectedError."""
+        newest = self._read_newest(key, message, CONNECT_TIMEOUT_S)
+        if newest is None:
             raise NotConnectedError(f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?")
-        return found
+        return newest
 
-    def _taken(self, key: str, message: type[Message], first_s: float) -> Any:
-        """The newest message; the first one is waited for, at most so long."""
-        row = keys.row_at(key)
-        reader = self._readers.get(key)
-        if reader is None:
-            latched = row is not None and row.kind == "latched"
-            reader = (self._session.latched_reader if latched else self._session.reader)(key, message)
-            self._readers[key] = reader
-        deadline = time.monotonic() + (0.0 if key in self._newest else first_s)
-        while (found := reader.newest(self._fits)) is None and time.monotonic() < deadline:
-            time.sleep(LOOK_S)
-        if found is not None:
-            self._newest[key] = found
+    def _read_newest(self, key: str, message: type[Message], first_timeout_s: float) -> Any:
+        """Return the newest message of a key, or None. Only the first one is waited for."""
+        reader = self._reader(key, message)
+        timeout_s = 0.0 if key in self._newest else first_timeout_s
+        deadline = time.monotonic() + timeout_s
+        newest = reader.newest(self._is_of_this_robot)
+        while newest is None and time.monotonic() < deadline:
+            time.sleep(POLL_INTERVAL_S)
+            newest = reader.newest(self._is_of_this_robot)
+        if newest is not None:
+            self._newest[key] = newest
         return self._newest.get(key)
 
-    def _fits(self, message: Message) -> bool:
-        """Whether it is of this robot, as far as that is known."""
+    def _reader(self, key: str, message: type[Message]) -> Reader[Any]:
+        """Return the reader of a key; the first call subscribes to it."""
+        reader = self._readers.get(key)
+        if reader is None:
+            row = keys.row_at(key)
+            if row is not None and row.kind == "latched":
+                reader = self._session.latched_reader(key, message)
+            else:
+                reader = self._session.reader(key, message)
+            self._readers[key] = reader
+        return reader
+
+    def _is_of_this_robot(self, message: Message) -> bool:
+        """Whether a message fits the robot's description, as far as the description is known."""
         robot = self._newest.get(keys.DESCRIPTION)
         return robot is None or mismatch(message, robot) is None
+
+
+def _select_robot(endpoint: str | None, name: str | None, session: str | os.PathLike[str] | None) -> RobotSelection:
+    """Return which robots the arguments of `Robot.connect` allow. Raises ConfigError."""
+    if endpoint is not None:
+        check_endpoint(endpoint, "endpoint")
+    if name is not None:
+        check_namespace(name, "name")
+    if session is None:
+        return RobotSelection(endpoint, name)
+    if endpoint is not None:
+        raise ConfigError("endpoint and session: the session file names the endpoint; leave one out")
+    file = read_session(Path(session))
+    return RobotSelection(file.endpoints[0], file.namespace_for(name), file)

@@ -1,4 +1,4 @@
-"""Runs of scenarios: in this process, or in processes of their own, as `snakesim run` has them."""
+"""Runs scenarios in this process, or in several processes as `snakesim run` does."""
 
 import contextlib
 import os
@@ -34,15 +34,27 @@ def run(
     out: str | os.PathLike[str] | None = None,
     processes: bool = False,
 ) -> Result:
-    """Run a scenario and return what came of it, also if that is a fault: `Result.ended` says how it ended.
+    """Run a scenario, and return its result.
 
-    scenario: shipped name, or path of a scenario or of a run's config.json. duration: s of robot time. set: any other
-    value by its dotted key, as `--set` takes them. out: folder for what `snakesim run` leaves; None keeps nothing.
-    processes: host and services in processes of their own, at any clock mode; a backend that moves a real robot needs
-    it.
+    Args:
+        scenario: Name of a shipped scenario, or path of a scenario file or of a run's config.json.
+        controller: A shipped name, a path "./file.py:Class", a controller class, or a function
+            f(time_s, joints) -> angles_rad; None takes the scenario's controller.
+        duration: Robot time in s; None takes the scenario's duration.
+        seed: Seed of all random numbers; None takes the scenario's seed.
+        backend: Name of a backend; None takes the scenario's backend.
+        set: Other values of the scenario by their dotted keys, as in `snakesim run --set`.
+        out: Folder for the files that `snakesim run` writes; None keeps none.
+        processes: Whether HAL host and services run in processes of their own, in any clock mode. A backend that
+            moves a real robot needs this.
 
-    Raises ConfigError for wrong input, before anything runs; ControllerError when the controller raises, or answers
-    what is not allowed; SnakesimError when a run cannot begin.
+    Returns:
+        The result, also of a run that ended with a fault: `Result.ended` says how it ended.
+
+    Raises:
+        ConfigError: An argument is wrong; nothing was run.
+        ControllerError: The controller raised an exception, or returned something that is not allowed.
+        SnakesimError: The run could not begin.
     """
     if not isinstance(scenario, str | os.PathLike):
         raise ConfigError(f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file")
@@ -60,24 +72,28 @@ def run(
                 opened.enter_context(offered(CONTROLLERS, name, plugin))
         config = checked(os.fspath(scenario), overrides, processes=processes)
         folder = None if out is None else Path(out)
-        return _in_processes(config, folder) if processes else _in_this_process(config, folder)
+        if processes:
+            return _run_in_processes(config, folder)
+        return _run_here(config, folder)
 
 
-def _in_this_process(config: RunConfig, out: Path | None) -> Result:
-    found = simulate(config, out)
-    failure = found.control_failure
+def _run_here(config: RunConfig, out: Path | None) -> Result:
+    """Run in this process. Raises ControllerError, with the exception of the controller as its cause."""
+    simulated = simulate(config, out)
+    failure = simulated.control_failure
     if failure is None:
-        return Result(found.record, found.summary)
+        return Result(simulated.record, simulated.summary)
     try:
         raise ControllerError(failure.message) from failure.cause
     finally:
         # The traceback of the cause holds this function's frame, so nothing in the frame may hold the cause.
-        del found, failure
+        del simulated, failure
 
 
-def _in_processes(config: RunConfig, out: Path | None) -> Result:
-    with TemporaryDirectory(prefix="snakesim-") as kept:
-        folder = out or Path(kept) / "run"
+def _run_in_processes(config: RunConfig, out: Path | None) -> Result:
+    """Run in several processes. Raises SnakesimError when the run leaves no record."""
+    with TemporaryDirectory(prefix="snakesim-") as scratch:
+        folder = out or Path(scratch) / "run"
         if run_processes(RunRequest(config, out=folder)) == INTERRUPTED:
             raise KeyboardInterrupt
         if not (folder / SUMMARY).is_file():

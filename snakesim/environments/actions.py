@@ -1,4 +1,4 @@
-"""What an environment lets its agent command: a target for every joint, with unit and bounds."""
+"""The actions of an environment: a target for every joint, with unit and bounds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,37 +16,57 @@ KINDS = {"position": (Mode.POSITION, "rad"), "velocity": (Mode.VELOCITY, "rad/s"
 
 @dataclass(frozen=True)
 class Commands:
-    """The actions of an environment, joint by joint, tail to head."""
+    """What an action of an environment commands, joint by joint, tail to head."""
 
     kind: str
     mode: Mode
     unit: str
-    names: Sequence[str]
+    names: Sequence[str]  # of the joints
     low: Sequence[float]
     high: Sequence[float]
 
     @staticmethod
     def of(robot: Description, kind: str, residual_rad: float) -> "Commands":
-        """kind: as `controller_of` accepts it."""
-        joints, names = robot.joints, [joint.name for joint in robot.joints]
+        """Return the actions of a robot.
+
+        Args:
+            robot: Description with the joints and their limits.
+            kind: "position", "velocity", "torque", or "residual:CONTROLLER".
+            residual_rad: Largest correction of a joint, for "residual:CONTROLLER".
+        """
+        joints = robot.joints
+        names = [joint.name for joint in joints]
         if kind.startswith(RESIDUAL):
-            count = len(joints)
-            return Commands(kind, Mode.POSITION, "rad", names, [-residual_rad] * count, [residual_rad] * count)
+            high = [residual_rad] * len(joints)
+            return Commands(kind, Mode.POSITION, "rad", names, [-value for value in high], high)
         mode, unit = KINDS[kind]
-        if mode is Mode.POSITION:
-            low, high = [joint.angle_min_rad for joint in joints], [joint.angle_max_rad for joint in joints]
-            return Commands(kind, mode, unit, names, low, high)
-        most = [joint.speed_limit_rad_s if mode is Mode.VELOCITY else joint.torque_limit_nm for joint in joints]
-        return Commands(kind, mode, unit, names, [-value for value in most], most)
+        match mode:
+            case Mode.POSITION:
+                low = [joint.angle_min_rad for joint in joints]
+                high = [joint.angle_max_rad for joint in joints]
+            case Mode.VELOCITY:
+                high = [joint.speed_limit_rad_s for joint in joints]
+                low = [-value for value in high]
+            case _:
+                high = [joint.torque_limit_nm for joint in joints]
+                low = [-value for value in high]
+        return Commands(kind, mode, unit, names, low, high)
 
     def target(self, action: Any) -> list[float]:
-        """An action as targets. Raises ValueError for another shape, and for what is no finite number."""
+        """Return the targets of an action.
+
+        Args:
+            action: (joints,) numbers, tail to head; an array or a sequence.
+
+        Raises:
+            ValueError: The action has another shape, or holds a number that is not finite.
+        """
         try:
             values: NDArray[np.float64] = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ValueError(f"action is {action!r:.60}, must be {self._wanted()}") from None
+            raise ValueError(f"action is {action!r:.60}, must be {self._describe_expected()}") from None
         if values.shape != (len(self.names),):
-            raise ValueError(f"action has shape {values.shape}, must be {self._wanted()}")
+            raise ValueError(f"action has shape {values.shape}, must be {self._describe_expected()}")
         if not np.isfinite(values).all():
             bad = int(np.argmin(np.isfinite(values)))
             raise ValueError(
@@ -54,14 +74,18 @@ class Commands:
             )
         return values.tolist()
 
-    def _wanted(self) -> str:
+    def _describe_expected(self) -> str:
         count = len(self.names)
         what = "a correction" if self.kind.startswith(RESIDUAL) else f"a {self.kind}"
         return f"({count},): {what} in {self.unit} for each joint, {self.names[0]} to {self.names[-1]}"
 
 
 def controller_of(kind: str) -> str | None:
-    """The controller whose targets an action corrects; None: it is a target itself. Raises ConfigError."""
+    """Return the controller whose targets an action corrects, or None if an action is itself a target.
+
+    Raises:
+        ConfigError: There is no such kind of action.
+    """
     if isinstance(kind, str) and kind.startswith(RESIDUAL) and kind != RESIDUAL:
         return kind.removeprefix(RESIDUAL)
     if kind not in KINDS:

@@ -1,4 +1,4 @@
-"""A robot whose controller drives it, and an environment corrects: a whole run in this process, turn by turn."""
+"""A robot whose controller drives it while an environment corrects the targets: a whole run in this process."""
 
 import contextlib
 import io
@@ -24,7 +24,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
-SPARE_S = 1.0  # the run must not be over before the episode is
+SPARE_S = 1.0  # the run lasts longer than the episode, which must not end with it
 OVER = object()
 
 
@@ -32,97 +32,132 @@ class AssistedRobot:
     """A simulated robot, armed, with guidance, navigation and control of its scenario."""
 
     def __init__(self, config: RunConfig) -> None:
-        """Raises SnakesimError when the run cannot begin."""
+        """Start the run and wait until the robot is armed.
+
+        Args:
+            config: Configuration of the run; its controller is the one that is corrected.
+
+        Raises:
+            SnakesimError: The run cannot begin.
+        """
+        # The corrected controller has the configuration section of the original one.
         self._residual: list[float] = [0.0] * config.robot.chain.modules
-        name = f"residual:{config.controller.rpartition(':')[2]}"  # which has the same section of settings
-        plugin = _corrected(find_plugin(CONTROLLERS, config.controller), self._residual)
+        name = f"residual:{config.controller.rpartition(':')[2]}"
+        plugin = _make_corrected(find_plugin(CONTROLLERS, config.controller), self._residual)
         longer = msgspec.structs.replace(config, controller=name, duration_s=config.duration_s + SPARE_S)
-        self._said = io.StringIO()  # by the services; the reason of a failure is in `failed`
+
+        self._service_output = io.StringIO()  # not shown: the reason of a failure is in `failed` of the run
         with offered(CONTROLLERS, name, plugin), contextlib.ExitStack() as opening:
             self._run = opening.enter_context(InProcessRun(longer))
-            session = self._run.network.session()
-            opening.callback(session.close)
-            self._joints = session.reader(keys.JOINTS, JointState)
-            self._applied = session.reader(keys.APPLIED, AppliedCommand)
-            self._sensors = {key: session.reader(key, message) for key, message in SENSED.items()}
-            self._turns = self._run.iterate_ticks(before_services=True)
-            opening.callback(self._turns.close)
+            self._subscribe(opening)
+            self._ticks = self._run.iterate_ticks(before_services=True)
+            opening.callback(self._ticks.close)
             self.description: Description = self._run.host.description
             self._index = {joint.name: i for i, joint in enumerate(self.description.joints)}
-            self.newest: dict[str, Message] = {}
-            self.limited: dict[int, str] = {}
-            self._turn()
+            self.newest: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
+            self.limited: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
+            self._run_tick()
             while not self._run.host.authority.arm_session:
-                self._turn()
+                self._run_tick()
             self._opened = opening.pop_all()
+
+    def _subscribe(self, opening: contextlib.ExitStack) -> None:
+        """Open the readers of what the environment observes."""
+        session = self._run.network.session()
+        opening.callback(session.close)
+        self._joints = session.reader(keys.JOINTS, JointState)
+        self._applied = session.reader(keys.APPLIED, AppliedCommand)
+        self._sensors = {key: session.reader(key, message) for key, message in SENSED.items()}
 
     @property
     def lifecycle(self) -> LifecycleState:
-        """As the host publishes it."""
+        """The lifecycle state, as the host publishes it."""
         return self._run.host.authority.state
 
     @property
     def why(self) -> str:
-        """Why it is in this state."""
+        """Why the robot is in this state."""
         return self._run.host.authority.why
 
     @property
     def digest(self) -> str:
-        """`command_digest` of the run."""
+        """The digest of all setpoints, as the `command_digest` of a run."""
         return self._run.host.black_box.command_digest
 
     def step(self, mode: Mode, target: list[float]) -> None:
-        """One tick; the targets are added to the controller's own, of the joints that it commands in this mode."""
+        """Run one tick. Joints that the controller commands in position mode get its target plus a correction.
+
+        Args:
+            mode: Not used: corrections are positions.
+            target: (joints,) corrections in rad, tail to head.
+
+        Raises:
+            BackendError: The run has ended.
+            ControllerError: The controller has failed.
+        """
         self._residual[:] = target
-        self._turn()
+        self._run_tick()
         applied = self._applied.newest(lambda _: True)
-        self.limited = {} if applied is None else {self._index[name]: why for name, why in applied.limited.items()}
+        if applied is None:
+            self.limited = {}
+        else:
+            self.limited = {self._index[name]: reason for name, reason in applied.limited.items()}
 
     def close(self) -> None:
         """End the run."""
         self._opened.close()
 
-    def _turn(self) -> None:
-        with contextlib.redirect_stderr(self._said):
-            over = next(self._turns, OVER) is OVER
+    def _run_tick(self) -> None:
+        """Run one tick and read its samples. Raises ControllerError, BackendError."""
+        with contextlib.redirect_stderr(self._service_output):
+            over = next(self._ticks, OVER) is OVER
         if self._run.failed:
             errors = self._run.take_errors()
             try:
-                raise ControllerError("; ".join(self._run.failed)) from _cause_of(errors)
+                raise ControllerError("; ".join(self._run.failed)) from _find_cause(errors)
             finally:
                 del errors  # the traceback in it holds this frame
         if over and self.lifecycle == "armed":
             raise BackendError(f"the run ended early: {self._run.host.ended_why or self._run.host.ended}")
-        if (joints := self._joints.newest(lambda _: True)) is not None:
+        joints = self._joints.newest(lambda _: True)
+        if joints is not None:
             self.joints = joints
         for key, reader in self._sensors.items():
-            if (message := reader.newest(lambda _: True)) is not None:
+            message = reader.newest(lambda _: True)
+            if message is not None:
                 self.newest[key] = message
 
 
-def _cause_of(errors: Mapping[str, SnakesimError]) -> BaseException | None:
+def _find_cause(errors: Mapping[str, SnakesimError]) -> BaseException | None:
     """Return what the controller has raised, if that is what ended control."""
     error = errors.get(CONTROL)
     return None if error is None else error.__cause__
 
 
-def _corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:
-    """The controller with a residual on its position targets. residual_rad: read at every tick."""
+def _make_corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:
+    """Return a controller class that adds corrections to the position targets of another one.
+
+    Args:
+        plugin: The class of the other controller.
+        residual_rad: (joints,) corrections in rad. The list is read in every tick.
+    """
 
     class Corrected:
         Settings = plugin.Settings
-        NEEDS, SENSES = getattr(plugin, "NEEDS", "world"), getattr(plugin, "SENSES", False)
+        NEEDS = getattr(plugin, "NEEDS", "world")
+        SENSES = getattr(plugin, "SENSES", False)
 
         def __init__(self, robot: Description, settings: Any) -> None:
-            self._inner = plugin(robot, settings)
+            self._controller = plugin(robot, settings)
 
         def update(self, view: View) -> Action:
-            action = self._inner.update(view)
-            points = action.setpoints
-            target = [
-                asked + by if by and mode is Mode.POSITION else asked  # by nothing: to the bit what was asked
-                for asked, by, mode in zip(points.target, residual_rad, points.mode, strict=True)
-            ]
-            return Action(RequestedSetpoints(points.mode, target, points.torque_limit_nm), action.report)
+            action = self._controller.update(view)
+            setpoints = action.setpoints
+            target = list(setpoints.target)
+            for i, residual in enumerate(residual_rad):
+                # A residual of 0 is not added, so that the target stays the same to the bit.
+                if residual and setpoints.mode[i] is Mode.POSITION:
+                    target[i] = setpoints.target[i] + residual
+            return Action(RequestedSetpoints(setpoints.mode, target, setpoints.torque_limit_nm), action.report)
 
     return Corrected

@@ -1,4 +1,4 @@
-"""What an environment pays for, term by term."""
+"""The terms of an environment's reward."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from snakesim_hal.base.errors import ConfigError, did_you_mean, short
 
 @dataclass(frozen=True)
 class Term:
-    """One term: its weight unless another is given, the unit of what it weighs, and what that is."""
+    """One term of the reward: its default weight, and the quantity that it weighs, with unit and meaning."""
 
     weight: float
     unit: str
@@ -18,18 +18,29 @@ class Term:
 TERMS = {
     "advance": Term(1.0, "m", "of the center of mass towards the goal; without a goal along the first heading"),
     "energy": Term(-0.005, "J", "sum over joints of |torque x velocity| over time"),
-    "limited": Term(-0.001, "1", "share of joints whose targets the limiter changed, mean over the ticks of the step"),
+    "limited": Term(
+        -0.001, "1", "fraction of joints whose targets the limiter changed, mean over the ticks of the step"
+    ),
     "goal": Term(1.0, "1", "1 in the step that reaches the goal"),
     "stopped": Term(-1.0, "1", "1 in the step in which the robot is stopped by a fault"),
 }
 
 
 def weights_of(given: Mapping[str, float] | None) -> dict[str, float]:
-    """The weight of every term. given: those that differ. Raises ConfigError for what is no term, or no number."""
+    """Return the weight of every term.
+
+    Args:
+        given: Weights that differ from the defaults, by the name of their term.
+
+    Raises:
+        ConfigError: There is no such term, or its weight is no number.
+    """
+    weights = {name: float(term.weight) for name, term in TERMS.items()}
     for name, weight in (given or {}).items():
         if name not in TERMS:
             hint = did_you_mean(str(name), TERMS)
             raise ConfigError(f"reward={short(str(given))}: no term {name!r}; {hint}there are {', '.join(TERMS)}")
         if not isinstance(weight, int | float):
             raise ConfigError(f"reward[{name!r}]={weight!r:.60}: give a number, the reward per {TERMS[name].unit}")
-    return {name: float((given or {}).get(name, term.weight)) for name, term in TERMS.items()}
+        weights[name] = float(weight)
+    return weights

@@ -1,4 +1,4 @@
-"""Many environments at once: one process for each processor, and each process steps its share of the environments.
+"""Steps many environments at once: one process for each processor, and each steps its share of the environments.
 
 With one process for each environment, a step waits for the slowest process, and every environment pays for its own
 messages.
@@ -28,9 +28,9 @@ Outcome = tuple[Any, float, bool, bool, dict[str, Any]]
 
 
 class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
-    """Environments of one scenario. After the end of an episode the next step resets it, as Gymnasium's own do.
+    """Many environments of one scenario. The step after the end of an episode resets it, as Gymnasium's own do.
 
-    A pickled one starts new processes when it is loaded, and needs a `reset`.
+    An unpickled one starts new processes, and needs a `reset`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -49,15 +49,17 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         if num_envs < 1 or (processes is not None and processes < 1):
             raise ConfigError(f"num_envs={num_envs!r}, processes={processes!r}: give whole numbers, 1 or more")
         self._arguments = {"num_envs": num_envs, "processes": processes, **arguments}
-        one = self._example = SnakeEnv(**arguments)
+        example = SnakeEnv(**arguments)
+        self._example = example
         self.num_envs = num_envs
-        self.render_mode = one.render_mode
-        self.metadata = {**self.metadata, "render_fps": one.metadata["render_fps"]}
-        self.single_observation_space = one.observation_space
-        self.single_action_space = one.action_space
-        self.observation_space = batch_space(one.observation_space, num_envs)
-        self.action_space = batch_space(one.action_space, num_envs)
-        count = min(processes or len(os.sched_getaffinity(0)), num_envs)
+        self.render_mode = example.render_mode
+        self.metadata = {**self.metadata, "render_fps": example.metadata["render_fps"]}
+        self.single_observation_space = example.observation_space
+        self.single_action_space = example.action_space
+        self.observation_space = batch_space(example.observation_space, num_envs)
+        self.action_space = batch_space(example.action_space, num_envs)
+        available = len(os.sched_getaffinity(0))
+        count = min(processes or available, num_envs)
         self._shares = [part.tolist() for part in np.array_split(np.arange(num_envs), count)]
         self._workers = _Workers([len(share) for share in self._shares], arguments)
         self._unequal = False  # a request has not reached all environments, or not all have answered it
@@ -74,20 +76,31 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             seed: Seed of the first environment, the next ones count up; or one seed for each environment.
             options: `reset_mask` is not supported; nothing else is read.
 
+        Returns:
+            Observations of all environments, stacked, and their merged info dicts.
+
         Raises:
             gymnasium.error.Error: A seed is not a Python integer of 0 or more, as in Gymnasium.
             ValueError: The number of seeds is wrong, or `options` has a `reset_mask`.
         """
         if options and "reset_mask" in options:
             raise ValueError("options['reset_mask'] is not supported: every environment is reset; leave it out")
-        seeds = _seeds_of(seed, self.num_envs)
+        seeds = _spread_seeds(seed, self.num_envs)
         self._unequal = True
-        found = self._request("reset", seeds)
+        results = self._request("reset", seeds)
         self._unequal = False
-        return self._joined([observation for observation, _ in found]), self._merged([info for _, info in found])
+        observations = [observation for observation, _ in results]
+        infos = [info for _, info in results]
+        return self._stack(observations), self._merge(infos)
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Step every environment by its row of actions, (num_envs, joints).
+        """Step every environment.
+
+        Args:
+            actions: (num_envs, joints) actions, a row for each environment.
+
+        Returns:
+            Stacked observations; rewards, terminated and truncated, each (num_envs,); and merged info dicts.
 
         Raises:
             gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example.
@@ -105,13 +118,13 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         self._unequal = True
         outcomes = self._request("step", actions)
         self._unequal = False
-        seen, rewards, terminated, truncated, infos = zip(*outcomes, strict=True)
+        observations, rewards, terminated, truncated, infos = zip(*outcomes, strict=True)
         return (
-            self._joined(seen),
+            self._stack(observations),
             np.array(rewards, dtype=np.float64),
             np.array(terminated, dtype=np.bool_),
             np.array(truncated, dtype=np.bool_),
-            self._merged(infos),
+            self._merge(infos),
         )
 
     def render(self) -> tuple[Any, ...] | None:
@@ -124,29 +137,31 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         """End the processes."""
         self._workers.close()
 
-    def _request(self, what: str, each: Sequence[Any]) -> list[Any]:
-        """Return the answers of all environments, in their order."""
-        return self._workers.request(what, [[each[i] for i in share] for share in self._shares])
+    def _request(self, method: str, arguments: Sequence[Any]) -> list[Any]:
+        """Call a method of all environments with one argument each; return the results in their order."""
+        shares = [[arguments[i] for i in share] for share in self._shares]
+        return self._workers.request(method, shares)
 
-    def _joined(self, observations: Sequence[Any]) -> Any:
+    def _stack(self, observations: Sequence[Any]) -> Any:
+        """Return the observations of all environments as one batch."""
         space = self.single_observation_space
         return concatenate(space, observations, create_empty_array(space, self.num_envs))
 
-    def _merged(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def _merge(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
         merged: dict[str, Any] = {}
         for number, info in enumerate(infos):
             merged = self._add_info(merged, info, number)
         return merged
 
 
-def _rebuild_vector(kind: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any) -> SnakeVectorEnv:
+def _rebuild_vector(env_class: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any) -> SnakeVectorEnv:
     """Return a new vector environment like the one that was pickled."""
-    made = kind(**arguments)
-    made.spec = spec
-    return made
+    env = env_class(**arguments)
+    env.spec = spec
+    return env
 
 
-def _seeds_of(seed: Any, count: int) -> list[int | None]:
+def _spread_seeds(seed: Any, count: int) -> list[int | None]:
     """Return a seed for each environment, by the rules of Gymnasium.
 
     Raises:
@@ -165,12 +180,13 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
         raise
     if len(seeds) != count:
         raise ValueError(f"seed has {len(seeds)} entries, must be one number, or {count}")
-    for number, one in enumerate(seeds):
-        _check_seed(f"seed[{number}]", one)
+    for number, seed_of_env in enumerate(seeds):
+        _check_seed(f"seed[{number}]", seed_of_env)
     return seeds
 
 
 def _check_seed(name: str, seed: Any) -> None:
+    """Raise gymnasium.error.Error, with the name of the argument, for what is no seed."""
     try:
         np_random(seed)
     except error.Error as refusal:
@@ -201,8 +217,15 @@ class _Workers:
                 self._ends.append(ours)
                 self._processes.append(process)
 
-    def request(self, what: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
-        """Have every process do it for its share, at the same time; return all answers in order.
+    def request(self, method: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
+        """Call a method of all environments, in all processes at the same time.
+
+        Args:
+            method: Name of a method of `_Seat`, or CLOSE.
+            shares: For each process, one argument for each of its environments.
+
+        Returns:
+            The results of all environments, in their order.
 
         Raises:
             BackendError: A process has ended, or a message was cut off.
@@ -217,7 +240,7 @@ class _Workers:
         errors: list[Exception] = []
         try:
             for end, share in zip(self._ends, shares, strict=True):
-                self._send(end, (self._number, what, share))
+                self._send(end, (self._number, method, share))
             for end in self._ends:
                 answer = self._receive(end)
                 if isinstance(answer, Exception):
@@ -259,7 +282,7 @@ class _Workers:
 
 
 class _Seat:
-    """One environment, which resets itself in the step after its end."""
+    """One environment, which resets itself in the step after the end of an episode."""
 
     def __init__(self, arguments: dict[str, Any]) -> None:
         self._env = SnakeEnv(**arguments)
@@ -273,9 +296,9 @@ class _Seat:
         if self._over:
             observation, info = self.reset(None)
             return observation, 0.0, False, False, info
-        outcome = self._env.step(action)
-        self._over = outcome[2] or outcome[3]
-        return outcome
+        observation, reward, terminated, truncated, info = self._env.step(action)
+        self._over = terminated or truncated
+        return observation, reward, terminated, truncated, info
 
     def render(self, _nothing: None) -> Any:
         return self._env.render()
@@ -298,11 +321,11 @@ def _work(end: Connection, ends_of_parent: Sequence[Connection], count: int, arg
     seats = [_Seat(arguments) for _ in range(count)]
     while True:
         try:
-            number, what, each = end.recv()
-            if what == CLOSE:
+            number, method, share = end.recv()
+            if method == CLOSE:
                 return
             try:
-                answer: Any = [getattr(seat, what)(one) for seat, one in zip(seats, each, strict=True)]
+                answer: Any = [getattr(seat, method)(argument) for seat, argument in zip(seats, share, strict=True)]
             except Exception as raised:  # noqa: BLE001 - the parent raises it, whatever it is
                 answer = raised
             end.send((number, answer))

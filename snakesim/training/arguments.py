@@ -1,4 +1,4 @@
-"""Arguments of `snakesim train`. Importable without the extra that it needs."""
+"""Arguments of `snakesim train`. This module can be imported without the extra that the command needs."""
 
 import argparse
 import dataclasses
@@ -11,7 +11,7 @@ TASK = "run"  # under which `snakesim --help` lists it
 
 
 def add_commands(commands: Any) -> None:
-    """Add it to the parser of `snakesim`."""
+    """Add `train` to the parser of `snakesim`."""
     train = commands.add_parser(
         "train",
         help="search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE",
@@ -52,37 +52,52 @@ def add_commands(commands: Any) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
     from snakesim_operator.base import extras
 
-    for extra in ("train", "gym", "plot", "policy", *(["evaluate"] if arguments.cluster else [])):
+    for extra in ("train", "gym", "plot", "policy"):
         extras.check(extra, "`snakesim train`")
+    if arguments.cluster:
+        extras.check("evaluate", "`snakesim train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import train
     from snakesim_hal.model.drawn import parse_draw
     from snakesim_hal.model.scenario import parse_set
 
-    chosen = ["--form", arguments.form, *(["--duration", f"{arguments.duration:g}"] if arguments.duration else [])]
-    for flag in ("generations", "population", "fields", "check_fields", "seed"):
-        chosen += [f"--{flag.replace('_', '-')}", str(getattr(arguments, flag))]
-    chosen += ["--from", arguments.begin] if arguments.begin else []
-    chosen += ["--spread", f"{arguments.spread:g}"] if arguments.spread != 1.0 else []
-    for flag in ("reward", "set", "draw"):
-        chosen += [word for value in getattr(arguments, flag) for word in (f"--{flag}", value)]
     environment = {
         "scenario": arguments.scenario,
         "duration": arguments.duration,
-        "reward": {one.key: one.value for one in map(parse_set, arguments.reward)},
-        "set": {one.key: one.value for one in map(parse_set, arguments.set)},
+        "reward": {override.key: override.value for override in map(parse_set, arguments.reward)},
+        "set": {override.key: override.value for override in map(parse_set, arguments.set)},
         "draw": dict(map(parse_draw, arguments.draw)),
     }
+    effort = Effort(**{field.name: getattr(arguments, field.name) for field in dataclasses.fields(Effort)})
     return train(
         environment,
         arguments.form,
         arguments.begin,
-        Effort(**{one.name: getattr(arguments, one.name) for one in dataclasses.fields(Effort)}),
+        effort,
         arguments.out,
         workers=arguments.workers,
         cluster=arguments.cluster,
-        again=["snakesim", "train", arguments.scenario, *chosen],
+        again=["snakesim", "train", arguments.scenario, *_repeat_options(arguments)],
         resume=arguments.resume,
     )
+
+
+def _repeat_options(arguments: argparse.Namespace) -> list[str]:
+    """Return the options that give the same search again; --out, --workers and --cluster change no number."""
+    options = ["--form", arguments.form]
+    if arguments.duration:
+        options += ["--duration", f"{arguments.duration:g}"]
+    for name in ("generations", "population", "fields", "check_fields", "seed"):
+        flag = f"--{name.replace('_', '-')}"
+        options += [flag, str(getattr(arguments, name))]
+    if arguments.begin:
+        options += ["--from", arguments.begin]
+    if arguments.spread != 1.0:
+        options += ["--spread", f"{arguments.spread:g}"]
+    for name in ("reward", "set", "draw"):
+        for value in getattr(arguments, name):
+            options += [f"--{name}", value]
+    return options

@@ -1,4 +1,4 @@
-"""The learning curve: a table, and a figure of it."""
+"""Writes the learning curve of a search: a table, and a figure of it."""
 
 import csv
 from collections.abc import Sequence
@@ -11,32 +11,41 @@ from snakesim_operator.features.figures.inherited import PLAIN_TEXT, import_matp
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
-    """`curve.csv` and `curve.png` in a folder."""
+    """Write `curve.csv` and `curve.png` into a folder."""
     with exported(folder / "curve.csv") as partial, partial.open("x", newline="") as file:
         table = csv.DictWriter(file, list(asdict(generations[0])))
         table.writeheader()
-        table.writerows(asdict(one) for one in generations)
-    _draw(folder / "curve.png", generations)
+        table.writerows(asdict(generation) for generation in generations)
+    _write_figure(folder / "curve.png", generations)
 
 
-def _draw(file: Path, generations: Sequence[Generation]) -> None:
+def _write_figure(file: Path, generations: Sequence[Generation]) -> None:
     import_matplotlib()
     from matplotlib import rc_context
 
     with rc_context(PLAIN_TEXT):
-        _draw_plain(file, generations)
+        _draw_curve(file, generations)
 
 
-def _draw_plain(file: Path, generations: Sequence[Generation]) -> None:
-    from matplotlib.figure import Figure  # no window, whatever the display
+def _draw_curve(file: Path, generations: Sequence[Generation]) -> None:
+    """Draw rewards over episodes: of each population, and of the mean policy where it was checked."""
+    from matplotlib.figure import Figure  # needs no window, whatever the display
+
+    episodes = [generation.episodes for generation in generations]
+    best_rewards = [generation.best_reward for generation in generations]
+    mean_rewards = [generation.mean_reward for generation in generations]
+    checked_episodes: list[int] = []
+    check_rewards: list[float] = []
+    for generation in generations:
+        if generation.check_reward is not None:
+            checked_episodes.append(generation.episodes)
+            check_rewards.append(generation.check_reward)
 
     figure = Figure(figsize=(6, 3.5), layout="constrained")
     axes = figure.subplots()
-    ran = [one.episodes for one in generations]
-    axes.plot(ran, [one.best_reward for one in generations], ":", color="0.5", label="best of a generation")
-    axes.plot(ran, [one.mean_reward for one in generations], color="0.5", label="mean of a generation")
-    checked = [(one.episodes, one.check_reward) for one in generations if one.check_reward is not None]
-    axes.plot(*zip(*checked, strict=True), "o-", color="tab:blue", label="mean policy, on other fields")
+    axes.plot(episodes, best_rewards, ":", color="0.5", label="best of a generation")
+    axes.plot(episodes, mean_rewards, color="0.5", label="mean of a generation")
+    axes.plot(checked_episodes, check_rewards, "o-", color="tab:blue", label="mean policy, on other fields")
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)

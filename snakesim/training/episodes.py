@@ -1,4 +1,4 @@
-"""Episodes of policies, in a process for each processor, or on the workers of a Dask cluster."""
+"""Runs episodes of policies, in a process for each processor or on the workers of a Dask cluster."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -13,82 +13,115 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.base.worker_pool import WorkerPool
 
 RETRIES = 2  # of an episode whose worker died
-Values = Mapping[str, float]
+Values = Mapping[str, float]  # parameters of a policy, by name
 Arguments = Mapping[str, Any]  # of `SnakeEnv`
-Map = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]  # what each call returns, in their order
-_SEATS: list[tuple[Arguments, SnakeEnv]] = []  # of this process: one environment
+Map = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]
+"""Calls a function with each of several argument lists, and returns the results in their order."""
+_CACHED_ENVS: list[tuple[Arguments, SnakeEnv]] = []  # the environment of this process, at most one
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What came of one. Energy: sum over joints of |torque x velocity| over time."""
+    """The result of one episode."""
 
-    paid: float
+    paid: float  # sum of rewards
     advance_m: float
-    energy_j: float
+    energy_j: float  # sum over joints of |torque x velocity| over time
     time_s: float
-    goal: bool
+    goal: bool  # whether the goal was reached
 
 
 class Episodes:
-    """Runs them. The same policies and fields give the same numbers, with any number of processes."""
+    """Runs episodes, within a `with` block.
+
+    The same policies and fields give the same numbers with any number of processes.
+    """
 
     def __init__(self, arguments: Arguments, workers: int | None = None, cluster: str | None = None) -> None:
-        """cluster: address of a Dask scheduler. Raises ConfigError, NotConnectedError."""
+        """Load the scenario in this process; `with` starts the workers.
+
+        Args:
+            arguments: Arguments of `SnakeEnv`.
+            workers: Number of processes on this computer; None starts one for each processor.
+            cluster: Address of a Dask scheduler, whose workers are used instead.
+
+        Raises:
+            ConfigError: An argument of `SnakeEnv` is wrong.
+        """
         self._arguments = dict(arguments)
         self._workers = workers
         self._cluster = cluster
         self._opened = ExitStack()
-        env = _seat(self._arguments)
+        env = _cached_env(self._arguments)
         self.axes = [joint.axis for joint in env.description.joints]
         self.sizes = {name: len(part.names) for name, part in env.parts.items()}
 
     def __enter__(self) -> Self:
-        self._map = self._map_here() if self._cluster is None else self._map_there(self._cluster)
+        if self._cluster is None:
+            self._map = self._start_workers()
+        else:
+            self._map = self._connect_to_cluster(self._cluster)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._opened.close()
 
     def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[Episode]]:
-        """Every policy on every field; those that a scene cannot have are left out."""
-        made = [Policy.of(values, self.axes, self.sizes) for values in policies]
-        jobs = [(self._arguments, policy, field) for policy in made for field in fields]
-        found = self._map(_episode, jobs)
-        return [
-            [episode for episode in found[start : start + len(fields)] if episode is not None]
-            for start in range(0, len(found), len(fields))
-        ]
+        """Run every policy on every field.
 
-    def _map_here(self) -> Map:
+        Args:
+            policies: Parameters of each policy.
+            fields: Seeds of the random fields.
+
+        Returns:
+            The episodes of each policy. Fields without room for their obstacles are left out.
+        """
+        jobs: list[tuple[Arguments, Policy, int]] = []
+        for values in policies:
+            policy = Policy.of(values, self.axes, self.sizes)
+            jobs += [(self._arguments, policy, field) for field in fields]
+        results = self._map(_run_episode, jobs)
+        episodes: list[list[Episode]] = []
+        for start in range(0, len(results), len(fields)):
+            of_policy = results[start : start + len(fields)]
+            episodes.append([episode for episode in of_policy if episode is not None])
+        return episodes
+
+    def _start_workers(self) -> Map:
         return self._opened.enter_context(WorkerPool(self._workers)).map
 
-    def _map_there(self, address: str) -> Map:
-        from snakesim_operator.base.dask_cluster import connected  # of another extra
+    def _connect_to_cluster(self, address: str) -> Map:
+        """Connect to a Dask scheduler. Raises ConfigError, NotConnectedError."""
+        from snakesim_operator.base.dask_cluster import connected  # Dask is of another extra
 
         client = self._opened.enter_context(connected(address))
         executor = client.get_executor(pure=False, retries=RETRIES)
         return lambda function, calls: list(executor.map(function, *zip(*calls, strict=True)))
 
 
-def _seat(arguments: Arguments) -> SnakeEnv:
-    """The environment of this process; another one for other arguments."""
-    if not _SEATS or _SEATS[-1][0] != arguments:
-        _SEATS[:] = [(arguments, SnakeEnv(**{**arguments, "observe": OBSERVE, "action": "position"}))]
-    return _SEATS[-1][1]
+def _cached_env(arguments: Arguments) -> SnakeEnv:
+    """Return the environment of this process. It is made anew when the arguments change."""
+    if not _CACHED_ENVS or _CACHED_ENVS[-1][0] != arguments:
+        env = SnakeEnv(**{**arguments, "observe": OBSERVE, "action": "position"})
+        _CACHED_ENVS[:] = [(arguments, env)]
+    return _CACHED_ENVS[-1][1]
 
 
-def _episode(arguments: Arguments, policy: Policy, field: int) -> Episode | None:
-    env = _seat(arguments)
+def _run_episode(arguments: Arguments, policy: Policy, field: int) -> Episode | None:
+    """Run one episode in a worker. None: the obstacles of this field find no place."""
+    env = _cached_env(arguments)
     try:
-        seen, info = env.reset(seed=field)
-    except ConfigError:  # obstacles that find no place
+        observation, info = env.reset(seed=field)
+    except ConfigError:
         return None
-    paid = energy = 0.0
+    paid = 0.0
+    energy_j = 0.0
     over = False
     while not over:
-        seen, reward, terminated, truncated, info = env.step(policy.targets(np.asarray(seen)))
-        paid, energy = paid + reward, energy + info["energy_j"]
+        target_rad = policy.targets(np.asarray(observation))
+        observation, reward, terminated, truncated, info = env.step(target_rad)
+        paid += reward
+        energy_j += info["energy_j"]
         over = terminated or truncated
     env.close()
-    return Episode(paid, info["advance_m"], energy, info["time_s"], info["ended"] == "goal")
+    return Episode(paid, info["advance_m"], energy_j, info["time_s"], info["ended"] == "goal")

@@ -1,4 +1,4 @@
-"""A trained policy as an ONNX file with the metadata that the controller `policy` asks for."""
+"""Writes a trained policy as an ONNX file, with the metadata that the controller `policy` needs."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,9 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import exported
 
 LEARNED = "snakesim.learned"
-OPSET, IR = 17, 10  # that onnxruntime 1.20 reads
-NODES = (  # as `Policy.targets`
+OPSET = 17  # the newest ones that onnxruntime 1.20 reads
+IR_VERSION = 10
+NODES = (  # operator, inputs, output; together they compute `Policy.targets`
     ("MatMul", ("seen", "time"), "time_s"),
     ("Mul", ("time_s", "omega"), "turned"),
     ("Sub", ("turned", "lag"), "phase"),
@@ -37,10 +38,17 @@ NODES = (  # as `Policy.targets`
 
 
 def learned_by(policy: str) -> dict[str, float]:
-    """The numbers of a policy that was trained here, shipped or a file. Raises ConfigError."""
-    _, told = opened(policy)
+    """Return the parameters of a policy that `snakesim train` has written.
+
+    Args:
+        policy: Name of a shipped policy, or path of an ONNX file.
+
+    Raises:
+        ConfigError: There is no such policy, or another program has written it.
+    """
+    _, metadata = opened(policy)
     try:
-        return msgspec.json.decode(told.get(LEARNED, ""), type=dict[str, float])
+        return msgspec.json.decode(metadata.get(LEARNED, ""), type=dict[str, float])
     except msgspec.MsgspecError:
         raise ConfigError(
             f"--from {policy}: does not tell what `snakesim train` has learned; give a policy.onnx that it has written"
@@ -48,10 +56,20 @@ def learned_by(policy: str) -> dict[str, float]:
 
 
 def export(file: Path, policy: Policy, values: Mapping[str, float], frame_skip: int, again: Sequence[str]) -> None:
-    """Write it. values: the learned numbers, and again: the command that finds them, are told in the metadata."""
+    """Write a policy into an ONNX file.
+
+    Args:
+        file: The file to write; an existing one is replaced.
+        policy: The arrays of the policy.
+        values: Its parameters, which are kept in the metadata.
+        frame_skip: Ticks of the robot for each action.
+        again: The command that finds the same policy, which is kept in the metadata.
+    """
     width, joints = policy.time.shape
-    numbers = {"ramp_per_s": RAMP_PER_S, "one": 1.0, "felt_rad": FELT_RAD}
-    arrays = {**vars(policy), **{name: np.array(value, np.float32) for name, value in numbers.items()}}
+    constants = {"ramp_per_s": RAMP_PER_S, "one": 1.0, "felt_rad": FELT_RAD}
+    arrays = dict(vars(policy))
+    for name, value in constants.items():
+        arrays[name] = np.array(value, np.float32)
     graph = helper.make_graph(
         [helper.make_node(kind, list(inputs), [output]) for kind, inputs, output in NODES],
         "policy",
@@ -59,7 +77,7 @@ def export(file: Path, policy: Policy, values: Mapping[str, float], frame_skip: 
         [helper.make_tensor_value_info("target_rad", TensorProto.FLOAT, [1, joints])],
         [numpy_helper.from_array(array, name) for name, array in arrays.items()],
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
     properties = {
         OBSERVATIONS: ",".join(OBSERVE),
         ACTION: "position",

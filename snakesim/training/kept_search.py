@@ -1,6 +1,6 @@
-"""What a search keeps in its folder so that it can go on after it was stopped: `search.jsonl`.
+"""Keeps the results of a search in its folder, so that a search that was stopped can be resumed: `search.jsonl`.
 
-The first line has the command, each further one the rewards of a generation. CMA-ES with a seed asks for the same
+The first line has the command, each further one the rewards of a generation. CMA-ES with a seed proposes the same
 policies again when it gets the same rewards, so nothing else is needed.
 """
 
@@ -84,7 +84,7 @@ def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[Ke
 
 
 def _read(path: Path, expected: _Header) -> list[KeptGeneration]:
-    """The generations of the same search. A last line that was cut by a kill or a full disk is left out."""
+    """Return the generations of the same search. A last line that was cut by a kill or a full disk is left out."""
     try:
         content = path.read_bytes()
     except OSError as error:

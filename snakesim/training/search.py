@@ -1,4 +1,4 @@
-"""The search for a policy: CMA-ES over the parameters of a form, on fields that are drawn anew each generation."""
+"""Searches a policy by CMA-ES over the parameters of a form, on fields that are new in each generation."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ from snakesim.training.form import FORMS
 from snakesim.training.kept_search import Check, KeptGeneration
 
 CHECK_EVERY = 5  # generations
-FIRST_FIELD, CHECK_FIELD, OTHER_FIELDS = 1_000_001, 2_000_001, 10_000_000  # nothing is learned on fields from 1 on
+FIRST_FIELD = 1_000_001  # seed of the first field that is searched on; evaluations use fields from 1 on
+CHECK_FIELD = 2_000_001  # seed of the first field that policies are checked on
+OTHER_FIELDS = 10_000_000  # step to other seeds when no field of a generation has room for its obstacles
 
 
 @dataclass(frozen=True)
@@ -67,31 +69,35 @@ def search(
             asked for again, but not run.
     """
     parameters = FORMS[form]
-    starts = np.array([begin.get(name, one.start) for name, one in parameters.items()])
-    sigmas = effort.spread * np.array([one.sigma for one in parameters.values()])
+    starts = np.array([begin.get(name, parameter.start) for name, parameter in parameters.items()])
+    sigmas = effort.spread * np.array([parameter.sigma for parameter in parameters.values()])
     optimizer = cmaes.CMA(np.zeros(len(starts)), 1.0, seed=effort.seed, population_size=effort.population)
     best: dict[str, float] = {}
     best_reward = -np.inf
 
-    def values(asked: np.ndarray) -> dict[str, float]:
-        return dict(zip(parameters, (starts + sigmas * asked).tolist(), strict=True))
+    def name_values(point: np.ndarray) -> dict[str, float]:
+        """Return the parameters for a point of the search, which has one sigma as its unit."""
+        return dict(zip(parameters, (starts + sigmas * point).tolist(), strict=True))
 
     for number in range(effort.generations + 1):
         is_last = number == effort.generations
-        mean = values(optimizer.mean)
-        asked = [] if is_last else [optimizer.ask() for _ in range(effort.population)]
+        mean = name_values(optimizer.mean)
+        points = [] if is_last else [optimizer.ask() for _ in range(effort.population)]
         if number < len(kept):
             done = kept[number]
         else:
+            is_checked = is_last or number % CHECK_EVERY == 0
+            policies = [name_values(point) for point in points]
             done = KeptGeneration(
-                check=_check(episodes, mean, effort) if is_last or number % CHECK_EVERY == 0 else None,
-                rewards=_rewards(episodes, [values(one) for one in asked], number, effort),
+                check=_check(episodes, mean, effort) if is_checked else None,
+                rewards=_run_generation(episodes, policies, number, effort),
             )
         if done.check is not None and done.check.reward > best_reward:
             best = mean
             best_reward = done.check.reward
         if not is_last:
-            optimizer.tell([(one, -reward) for one, reward in zip(asked, done.rewards, strict=True)])
+            losses = [-reward for reward in done.rewards]
+            optimizer.tell(list(zip(points, losses, strict=True)))
         yield Step(_row(number, done, effort), done, best, best_reward)
 
 
@@ -102,17 +108,22 @@ def _check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) -> C
     return Check(mean_of(ran, "paid"), mean_of(ran, "advance_m"), mean_of(ran, "goal"))
 
 
-def _rewards(episodes: Episodes, policies: Sequence[Mapping[str, float]], number: int, effort: Effort) -> list[float]:
+def _run_generation(
+    episodes: Episodes, policies: Sequence[Mapping[str, float]], number: int, effort: Effort
+) -> list[float]:
     """Run the policies of a generation on its fields; return the mean reward of each."""
     if not policies:
         return []
     first = FIRST_FIELD + number * effort.fields
-    while not all(ran := episodes.run(policies, range(first, first + effort.fields))):
-        first += OTHER_FIELDS  # none of these has room for its obstacles
-    return [mean_of(one, "paid") for one in ran]
+    ran = episodes.run(policies, range(first, first + effort.fields))
+    while not all(ran):  # no field of these has room for its obstacles
+        first += OTHER_FIELDS
+        ran = episodes.run(policies, range(first, first + effort.fields))
+    return [mean_of(of_policy, "paid") for of_policy in ran]
 
 
 def _row(number: int, done: KeptGeneration, effort: Effort) -> Generation:
+    """Return the row of the learning curve for a generation."""
     rewards = done.rewards or [np.nan]
     check = done.check
     return Generation(
@@ -126,6 +137,6 @@ def _row(number: int, done: KeptGeneration, effort: Effort) -> Generation:
     )
 
 
-def mean_of(ran: Sequence[Episode], what: str) -> float:
-    """Mean of a number of episodes."""
-    return float(np.mean([getattr(episode, what) for episode in ran]))
+def mean_of(ran: Sequence[Episode], name: str) -> float:
+    """Return the mean of an attribute over episodes."""
+    return float(np.mean([getattr(episode, name) for episode in ran]))

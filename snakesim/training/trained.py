@@ -1,5 +1,6 @@
-"""`snakesim train`: search, and keep the newest state of it in a folder."""
+"""Runs the search of `snakesim train`, and keeps its newest state in a folder."""
 
+import math
 import resource
 import time
 from collections.abc import Mapping, Sequence
@@ -66,7 +67,7 @@ def train(
                 for step in search(episodes, form, effort, start, kept.generations):
                     curve.append(step.row)
                     if len(curve) > known:
-                        say(_line(step.row))
+                        say(_describe(step.row))
                         policy = Policy.of(step.best, episodes.axes, episodes.sizes)
                         export(out / POLICY, policy, step.best, FRAME_SKIP, again)
                         write_curve(out, curve)
@@ -94,9 +95,10 @@ def _say_stopped(newest: Step | None, out: Path) -> None:
     )
 
 
-def _line(row: Generation) -> str:
+def _describe(row: Generation) -> str:
+    """Return a line about a generation for the terminal."""
     line = f"generation {row.generation}: {row.episodes} episodes"
-    if row.mean_reward == row.mean_reward:  # none in the last one, which is a check alone
+    if not math.isnan(row.mean_reward):  # the last generation is only checked
         line += f", reward {row.mean_reward:.2f}, best {row.best_reward:.2f}"
     if row.check_reward is not None:
         line += f"; checked {row.check_reward:.2f}: {row.check_advance_m:.2f} m, goal {row.check_goals:.0%}"

@@ -1,4 +1,4 @@
-"""What all figures share: their style, and time from the first tick on."""
+"""The style of all figures, and lines over time."""
 
 from typing import Any
 
@@ -26,5 +26,13 @@ STYLE: Any = {
 
 
 def over_time(axes: Axes, record: RunRecord, values: Floats, name: str = "", **look: str | float) -> None:
-    """A line, (ticks,), from the first tick on."""
+    """Plot values, (ticks,), over the time since the first tick.
+
+    Args:
+        axes: Axes to plot into.
+        record: The run, which has the times.
+        values: (ticks,) values.
+        name: Name in the legend.
+        **look: Properties of the line, as matplotlib's `plot` takes them.
+    """
     axes.plot(record.time_s - zero_s(record), values, label=name, **look)  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""Figures 8 to 13 of the SnakeSIM paper, of any run whose controller solved for contact forces.
+"""Draws figures 8 to 13 of the SnakeSIM paper, for any run whose controller solved for contact forces.
 
 8   the obstacle triplet: body, contacts, the forces that were solved for, and the tether's f_s
 9   the joint that propels, its obstacle, the torque and the counter force, near
@@ -26,14 +26,38 @@ from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.time_axis import end_s
 
-MOMENTS = 4
-ARROW_M = 0.25  # of the strongest force
-BODY, OBSTACLE, SOLVED, COMMANDED = "#9aa5b1", "#d9dde2", "#c0392b", "#2c6fbb"
-MEASURED, REFERENCE = "#2c6fbb", "#c0392b"
+MAX_MOMENTS = 4  # in figure 10
+MAX_JOINTS = 4  # in figures 12 and 13
+ARROW_M = 0.25  # length of the largest force
+LABEL_OFFSET_PT = (3, 3)
+FORCE_FONT_SIZE = 6.5
+TITLE_FONT_SIZE = 8.0
+
+BODY = "#9aa5b1"
+OBSTACLE = "#d9dde2"
+SOLVED = "#c0392b"
+COMMANDED = "#2c6fbb"
+MEASURED = "#2c6fbb"
+REFERENCE = "#c0392b"
+
+DrawSignal = Callable[[Axes, RunRecord, int], None]
+"""Draws a signal of the joint with this index into the axes."""
 
 
 def figures(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> dict[str, Figure]:
-    """By name. Raises ConfigError for a run in which nothing was solved for."""
+    """Draw the figures of a run.
+
+    Args:
+        record: The run.
+        width_in: Width of a column of the paper in inches.
+        span_s: Begin and end of the part of the run to draw, in s on the time axis.
+
+    Returns:
+        The figures by name, such as "figure-8".
+
+    Raises:
+        ConfigError: The controller solved for no forces in this span.
+    """
     instants = balanced_instants(record, *span_s)
     if not instants:
         raise ConfigError(
@@ -41,165 +65,211 @@ def figures(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> 
             "obstacle_triplet and obstacle_aided, with a pose and a recording; signals can be drawn of any run"
         )
     first = instants[0]
-    moments = [instants[i] for i in np.unique(np.linspace(0, len(instants) - 1, MOMENTS).astype(int))]
-    turns = propulsion_intervals(record)
-    joints = most_used_joints(turns, 4)
-    whole = (span_s[0], min(span_s[1], end_s(record)))
+    moment_indices = np.unique(np.linspace(0, len(instants) - 1, MAX_MOMENTS).astype(int))
+    moments = [instants[i] for i in moment_indices]
+    intervals = propulsion_intervals(record)
+    joints = most_used_joints(intervals, MAX_JOINTS)
+    drawn_span_s = (span_s[0], min(span_s[1], end_s(record)))
     return {
-        "figure-8": _view(record, first, width_in),
-        "figure-9": _near(record, first, width_in),
-        "figure-10": _moments(record, moments, width_in),
-        "figure-11": _torques(record, width_in, whole),
-        "figure-12": _joints(record, joints, turns, width_in, whole, _angle),
-        "figure-13": _joints(record, joints, turns, width_in, whole, _torque),
+        "figure-8": _draw_triplet(record, first, width_in),
+        "figure-9": _draw_propelling_joint(record, first, width_in),
+        "figure-10": _draw_moments(record, moments, width_in),
+        "figure-11": _draw_all_torques(record, width_in, drawn_span_s),
+        "figure-12": _draw_joints(record, joints, intervals, width_in, drawn_span_s, _plot_angle),
+        "figure-13": _draw_joints(record, joints, intervals, width_in, drawn_span_s, _plot_torque),
     }
 
 
-def _view(record: RunRecord, instant: Instant, width_in: float) -> Figure:
+def _draw_triplet(record: RunRecord, instant: Instant, width_in: float) -> Figure:
+    """Draw body, obstacles and forces from above."""
     figure = Figure((width_in, width_in))
     axes = figure.subplots()
-    _ground(axes, record, instant)
-    _forces(axes, _solved(instant))
-    across, tall = (float(np.diff(limits)[0]) for limits in (axes.get_xlim(), axes.get_ylim()))
-    figure.set_figheight(width_in * min(tall / across, 1.0) + 0.4)
+    _plot_scene(axes, record, instant)
+    _plot_forces(axes, _require_balance(instant))
+    width_m = float(np.diff(axes.get_xlim())[0])
+    height_m = float(np.diff(axes.get_ylim())[0])
+    figure.set_figheight(width_in * min(height_m / width_m, 1.0) + 0.4)
     return figure
 
 
-def _near(record: RunRecord, instant: Instant, width_in: float) -> Figure:
-    """Around the joint that propels: the last contact is that which its torque presses on."""
+def _draw_propelling_joint(record: RunRecord, instant: Instant, width_in: float) -> Figure:
+    """Draw the surroundings of the joint that propels. Its torque presses on the last contact."""
     figure = Figure((width_in, 0.75 * width_in))
-    axes, balance = figure.subplots(), _solved(instant)
-    _ground(axes, record, instant)
-    _forces(axes, balance)
-    contact = balance.contacts[-1]
-    points = [np.array(contact.position_w[:2])]
-    if (joint := instant.propulsion_joint) is not None:
-        at = nodes_xy_w(record, instant.row)[joint + 1]
+    axes = figure.subplots()
+    balance = _require_balance(instant)
+    _plot_scene(axes, record, instant)
+    _plot_forces(axes, balance)
+    contact_w = np.array(balance.contacts[-1].position_w[:2])
+    points = [contact_w]
+    joint = instant.propulsion_joint
+    if joint is not None:
+        joint_w = nodes_xy_w(record, instant.row)[joint + 1]
         torque_nm = record.torque_nm[instant.row, joint]
-        axes.plot(*at, "o", color=rcParams["text.color"], markersize=5)
-        axes.annotate(f"$\\tau$ {torque_nm:.2f} N·m", at, (6, -12), textcoords="offset points")
-        axes.plot(*np.column_stack([at, points[0]]), "--", color=rcParams["text.color"], linewidth=0.7)
-        points.append(at)
-    low, high = np.min(points, axis=0) - ARROW_M, np.max(points, axis=0) + ARROW_M
+        axes.plot(*joint_w, "o", color=rcParams["text.color"], markersize=5)
+        axes.annotate(f"$\\tau$ {torque_nm:.2f} N·m", joint_w, (6, -12), textcoords="offset points")
+        lever = np.column_stack([joint_w, contact_w])
+        axes.plot(*lever, "--", color=rcParams["text.color"], linewidth=0.7)
+        points.append(joint_w)
+    low = np.min(points, axis=0) - ARROW_M
+    high = np.max(points, axis=0) + ARROW_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     return figure
 
 
-def _moments(record: RunRecord, moments: Sequence[Instant], width_in: float) -> Figure:
+def _draw_moments(record: RunRecord, moments: Sequence[Instant], width_in: float) -> Figure:
+    """Draw a row for each moment: the scene from above, and the force polygon beside it."""
     figure = Figure((2 * width_in, 0.62 * width_in * len(moments)))
     rows = figure.subplots(len(moments), 2, width_ratios=(2, 1), squeeze=False)
-    for (above, polygon), instant, letter in zip(rows, moments, "abcd", strict=False):
-        _ground(above, record, instant)
-        _forces(above, _solved(instant))
-        above.set_title(f"({letter}) {instant.time_s:.1f} s", loc="left", fontsize=8.0)
-        _polygon(polygon, _solved(instant))
+    for (scene_axes, polygon_axes), instant, letter in zip(rows, moments, "abcd", strict=False):
+        balance = _require_balance(instant)
+        _plot_scene(scene_axes, record, instant)
+        _plot_forces(scene_axes, balance)
+        scene_axes.set_title(f"({letter}) {instant.time_s:.1f} s", loc="left", fontsize=TITLE_FONT_SIZE)
+        _plot_force_polygon(polygon_axes, balance)
     return figure
 
 
-def _torques(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> Figure:
+def _draw_all_torques(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> Figure:
+    """Draw the torques of all joints over time, one above the other, at one scale."""
     names = [joint.name for joint in record.description.joints]
     figure = Figure((2 * width_in, 0.22 * len(names) + 0.6))
     axes = figure.subplots()
-    largest = float(np.nanmax(np.abs(record.torque_nm))) or 1.0
-    for joint, values in enumerate(record.torque_nm.T):
-        over_time(axes, record, joint + 0.45 * values / largest, color=MEASURED)
+    max_torque_nm = float(np.nanmax(np.abs(record.torque_nm))) or 1.0
+    for joint, torque_nm in enumerate(record.torque_nm.T):
+        over_time(axes, record, joint + 0.45 * torque_nm / max_torque_nm, color=MEASURED)
         axes.axhline(joint, color=OBSTACLE, linewidth=0.5, zorder=0)
     axes.set_yticks(range(len(names)), names)
     axes.set_xlim(*span_s)
-    axes.set(xlabel="time [s]", title=f"torque; a row's height is ±{largest / 0.9:.1f} N·m")
+    axes.set(xlabel="time [s]", title=f"torque; a row's height is ±{max_torque_nm / 0.9:.1f} N·m")
     return figure
 
 
-def _joints(
+def _draw_joints(
     record: RunRecord,
     joints: Sequence[int],
-    turns: Sequence[Propulsion],
+    intervals: Sequence[Propulsion],
     width_in: float,
     span_s: tuple[float, float],
-    draw: Callable[[Axes, RunRecord, int], None],
+    plot_signal: DrawSignal,
 ) -> Figure:
+    """Draw a signal of some joints over time, with an arrow over each interval in which the joint propelled."""
     figure = Figure((width_in, 1.25 * len(joints) + 0.3))
-    every = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, joint, letter in zip(every, joints, "abcd", strict=False):
-        draw(axes, record, joint)
+    all_axes = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, joint, letter in zip(all_axes, joints, "abcd", strict=False):
+        plot_signal(axes, record, joint)
         top = axes.get_ylim()[1]
-        for turn in (one for one in turns if one.joint == joint):
-            ends = {"xy": (turn.end_s, top), "xytext": (turn.start_s, top)}
-            axes.annotate("", **ends, arrowprops={"arrowstyle": "<->", "linewidth": 0.7}, annotation_clip=False)
-        axes.set_title(f"({letter}) {record.description.joints[joint].name}", loc="left", fontsize=8.0)
-    every[0].legend(loc="best")
-    every[-1].set_xlim(*span_s)
-    every[-1].set_xlabel("time [s]")
+        for interval in intervals:
+            if interval.joint != joint:
+                continue
+            axes.annotate(
+                "",
+                xy=(interval.end_s, top),
+                xytext=(interval.start_s, top),
+                arrowprops={"arrowstyle": "<->", "linewidth": 0.7},
+                annotation_clip=False,
+            )
+        name = record.description.joints[joint].name
+        axes.set_title(f"({letter}) {name}", loc="left", fontsize=TITLE_FONT_SIZE)
+    all_axes[0].legend(loc="best")
+    all_axes[-1].set_xlim(*span_s)
+    all_axes[-1].set_xlabel("time [s]")
     return figure
 
 
-def _angle(axes: Axes, record: RunRecord, joint: int) -> None:
+def _plot_angle(axes: Axes, record: RunRecord, joint: int) -> None:
     over_time(axes, record, record.angle_rad[:, joint], "measured", color=MEASURED)
     over_time(axes, record, reference_rad(record, joint), "reference", color=REFERENCE, linestyle="--")
     axes.set_ylabel("angle [rad]")
 
 
-def _torque(axes: Axes, record: RunRecord, joint: int) -> None:
+def _plot_torque(axes: Axes, record: RunRecord, joint: int) -> None:
     over_time(axes, record, record.torque_nm[:, joint], "measured", color=MEASURED)
     over_time(axes, record, commanded_torque_nm(record, joint), "commanded", color=REFERENCE, linestyle="--")
     axes.set_ylabel("torque [N·m]")
 
 
-def _ground(axes: Axes, record: RunRecord, instant: Instant) -> None:
-    """Obstacles and body, to scale; the window is that round the body."""
-    nodes = nodes_xy_w(record, instant.row)
-    for item in record.placed:
-        one = item.obstacle
-        if one.shape == "box":
-            axes.add_patch(Polygon(outline_w(one), closed=True, color=OBSTACLE))
+def _plot_scene(axes: Axes, record: RunRecord, instant: Instant) -> None:
+    """Plot obstacles and body to scale, and limit the axes to the surroundings of the body."""
+    nodes_w = nodes_xy_w(record, instant.row)
+    for placed in record.placed:
+        obstacle = placed.obstacle
+        if obstacle.shape == "box":
+            axes.add_patch(Polygon(outline_w(obstacle), closed=True, color=OBSTACLE))
         else:
-            axes.add_patch(Circle(one.position_w[:2], one.radius_m, color=OBSTACLE))
-    for a, b, link in zip(nodes[:-1], nodes[1:], record.description.links, strict=True):
-        along = (b - a) / max(float(np.hypot(*(b - a))), 1e-9)
-        aside = link.radius_m * np.array([-along[1], along[0]])
-        axes.add_patch(Polygon([a + aside, b + aside, b - aside, a - aside], closed=True, color=BODY, linewidth=0))
-    for joint in nodes[1:-1]:
-        axes.add_patch(Circle(tuple(joint), record.description.links[0].radius_m, color=BODY, linewidth=0))
-    axes.plot(*nodes[1:-1].T, ".", color="white", markersize=2.0)
+            axes.add_patch(Circle(obstacle.position_w[:2], obstacle.radius_m, color=OBSTACLE))
+    _plot_body(axes, record, nodes_w)
     axes.set_aspect("equal")
-    low, high = nodes.min(axis=0) - ARROW_M, nodes.max(axis=0) + ARROW_M
+    low = nodes_w.min(axis=0) - ARROW_M
+    high = nodes_w.max(axis=0) + ARROW_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
 
 
-def _forces(axes: Axes, balance: Balance) -> None:
-    scale = ARROW_M / max(*balance.size_n, balance.commanded_n)
-    solved = zip(balance.contacts, balance.contact_n, balance.size_n, strict=True)
-    drawn = [
-        (contact.position_w[:2], force, f"$f_{i + 1}$ {size:.1f} N", SOLVED)
-        for i, (contact, force, size) in enumerate(solved)
-    ]
-    tether = f"$f_s$ {balance.commanded_n:.1f} N"
-    drawn.append((balance.contacts[0].position_w[:2], balance.tether_n, tether, COMMANDED))
-    for at, force, name, color in drawn:
-        tip = np.array(at) + scale * np.asarray(force)
-        _arrow(axes, at, tip, color)
-        axes.annotate(name, (tip[0], tip[1]), (3, 3), textcoords="offset points", fontsize=6.5, color=color)
+def _plot_body(axes: Axes, record: RunRecord, nodes_w: Floats) -> None:
+    """Plot links and joints. nodes_w: (joints + 2, 2), the tail, the joints and the head."""
+    joints_w = nodes_w[1:-1]
+    for rear, front, link in zip(nodes_w[:-1], nodes_w[1:], record.description.links, strict=True):
+        length_m = max(float(np.hypot(*(front - rear))), 1e-9)
+        along = (front - rear) / length_m
+        side = link.radius_m * np.array([-along[1], along[0]])
+        corners = [rear + side, front + side, front - side, rear - side]
+        axes.add_patch(Polygon(corners, closed=True, color=BODY, linewidth=0))
+    for joint_w in joints_w:
+        axes.add_patch(Circle(tuple(joint_w), record.description.links[0].radius_m, color=BODY, linewidth=0))
+    axes.plot(*joints_w.T, ".", color="white", markersize=2.0)
 
 
-def _polygon(axes: Axes, balance: Balance) -> None:
-    """f_s and the contact forces head to tail, in newtons, and their resultant."""
-    corners = balance.corners_n
-    names = ["$f_s$", *(f"$f_{i + 1}$" for i in range(len(balance.contacts)))]
-    for i, (a, b, name) in enumerate(zip(corners[:-1], corners[1:], names, strict=True)):
-        _arrow(axes, a, b, COMMANDED if i == 0 else SOLVED)
-        axes.annotate(name, (a + b) / 2, (3, 3), textcoords="offset points", fontsize=6.5)
-    _arrow(axes, corners[1], corners[-1], rcParams["text.color"])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    air = 0.15 * float(np.max(high - low))
-    axes.set(xlim=(low[0] - air, high[0] + air), ylim=(low[1] - air, high[1] + air), xlabel="[N]")
+def _plot_forces(axes: Axes, balance: Balance) -> None:
+    """Plot the contact forces f_i at their contacts, and the tether's force f_s at the first contact."""
+    m_per_n = ARROW_M / max(*balance.size_n, balance.commanded_n)
+    for i, contact in enumerate(balance.contacts):
+        label = f"$f_{i + 1}$ {balance.size_n[i]:.1f} N"
+        _plot_force(axes, contact.position_w[:2], m_per_n * np.asarray(balance.contact_n[i]), label, SOLVED)
+    label = f"$f_s$ {balance.commanded_n:.1f} N"
+    first_w = balance.contacts[0].position_w[:2]
+    _plot_force(axes, first_w, m_per_n * np.asarray(balance.tether_n), label, COMMANDED)
+
+
+def _plot_force(axes: Axes, start: Sequence[float], arrow: Floats, label: str, color: str) -> None:
+    tip = np.array(start) + arrow
+    _plot_arrow(axes, start, tip, color)
+    axes.annotate(
+        label, (tip[0], tip[1]), LABEL_OFFSET_PT, textcoords="offset points", fontsize=FORCE_FONT_SIZE, color=color
+    )
+
+
+def _plot_force_polygon(axes: Axes, balance: Balance) -> None:
+    """Plot f_s and the contact forces in N, each from the tip of the one before, and their resultant."""
+    corners_n = balance.corners_n
+    contact_labels = [f"$f_{i + 1}$" for i in range(len(balance.contacts))]
+    labels = ["$f_s$", *contact_labels]
+    for i, label in enumerate(labels):
+        start = corners_n[i]
+        end = corners_n[i + 1]
+        _plot_arrow(axes, start, end, COMMANDED if i == 0 else SOLVED)
+        middle = (start + end) / 2
+        axes.annotate(label, middle, LABEL_OFFSET_PT, textcoords="offset points", fontsize=FORCE_FONT_SIZE)
+    _plot_arrow(axes, corners_n[1], corners_n[-1], rcParams["text.color"])
+    low = corners_n.min(axis=0)
+    high = corners_n.max(axis=0)
+    margin_n = 0.15 * float(np.max(high - low))
+    axes.set(xlim=(low[0] - margin_n, high[0] + margin_n), ylim=(low[1] - margin_n, high[1] + margin_n))
+    axes.set(xlabel="[N]")
     axes.set_aspect("equal")
 
 
-def _arrow(axes: Axes, start: Floats | tuple[float, ...], end: Floats | tuple[float, ...], color: str) -> None:
-    look = {"arrowstyle": "-|>", "color": color, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 7}
-    axes.annotate("", xy=tuple(end), xytext=tuple(start), arrowprops=look)
+def _plot_arrow(axes: Axes, start: Floats | Sequence[float], end: Floats | Sequence[float], color: str) -> None:
+    style = {
+        "arrowstyle": "-|>",
+        "color": color,
+        "linewidth": 1.0,
+        "shrinkA": 0,
+        "shrinkB": 0,
+        "mutation_scale": 7,
+    }
+    axes.annotate("", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=style)
 
 
-def _solved(instant: Instant) -> Balance:
+def _require_balance(instant: Instant) -> Balance:
+    """Return the forces of an instant for which the controller solved."""
     assert instant.balance is not None, "balanced instants have one"
     return instant.balance

@@ -30,7 +30,7 @@ ENVELOPE_BYTES = 4096  # key and encoding beside a payload
 
 
 def access_control(lab: Lab) -> dict[str, Any]:
-    """Zenoh's `access_control` section."""
+    """Return Zenoh's `access_control` section for the routers of a lab."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -50,7 +50,7 @@ def access_control(lab: Lab) -> dict[str, Any]:
 
 
 def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
-    """The rules of one identity: keys that have messages and flow in common stand in one."""
+    """Return the rules of one identity. Keys with the same messages and flow share a rule."""
     messages: dict[tuple[str, str], set[str]] = defaultdict(set)  # by key and flow
     for flow, message, key in _permitted(identity, lab):
         messages[key, flow].add(message)
@@ -70,7 +70,7 @@ def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
 
 
 def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
-    """Everything that passes between a router and an identity, with whole keys."""
+    """Yield everything that may pass between a router and an identity, with whole keys."""
     if identity.role is None:  # another router, which has checked what it forwards
         for flow in ("ingress", "egress"):
             for message in EVERY_MESSAGE:
@@ -90,7 +90,7 @@ def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
 
 
 def size_limits() -> list[dict[str, Any]]:
-    """Zenoh's `low_pass_filter`: the most bytes that a message may have, by key. Longer ones are dropped."""
+    """Return Zenoh's `low_pass_filter`: the maximum size of a message, by key. Routers drop longer ones."""
     images = [row.key for row in keys.SPACE if row.message in IMAGES]
     queries = [row.key for row in keys.SPACE if row.kind == "query"]
     small = [keys.JOINT_COMMAND, keys.INTENT, keys.DONE_ALL]

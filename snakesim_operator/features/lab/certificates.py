@@ -1,8 +1,8 @@
-"""The lab's own authority, and a short-lived certificate for every identity.
+"""Creates the lab's own certificate authority, and a short-lived certificate for every identity.
 
-There is no revocation list: who loses a machine removes it from the lab file and restarts the routers with the rendered
-rules, which shuts that name out at once; its certificate ends a few days later by itself. Private keys are P-256, only
-their owner may read them, and nothing here prints them.
+There is no revocation list. If a machine is lost, the administrator removes it from the lab file and restarts the
+routers with the rendered rules, which refuse its name at once; its certificate expires a few days later. Private keys
+are P-256, only their owner may read them, and nothing here prints them.
 """
 
 import os
@@ -27,20 +27,25 @@ from snakesim_operator.features.lab.lab_file import Lab
 
 AUTHORITY = "authority"
 CLOCK_SLACK = timedelta(minutes=10)  # a robot's clock may be behind
-RENEW_AT = 1 / 3  # of its life left, and it is renewed
+RENEW_AT = 1 / 3  # a certificate is renewed when less than this part of its life is left
 
 
 @dataclass(frozen=True)
 class Issuer:
-    """Who signs."""
+    """The certificate authority: what signs certificates."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
 def make_authority(folder: Path, lab: Lab) -> Issuer:
-    """The authority in a folder; a new one when there is none. Its key stays there, and goes to no machine."""
-    at_certificate, at_key = folder / f"{AUTHORITY}.pem", folder / f"{AUTHORITY}.key"
+    """Return the authority in a folder; if there is none, create it. Its key is copied to no machine.
+
+    Raises:
+        ConfigError: The files in the folder are damaged, or other users may read them.
+    """
+    at_certificate = folder / f"{AUTHORITY}.pem"
+    at_key = folder / f"{AUTHORITY}.key"
     if at_certificate.exists() or at_key.exists():
         return _read_authority(at_certificate, at_key)
     _make_private(folder)
@@ -64,13 +69,13 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())
     )
-    _write(at_key, _pem_of(key), 0o600)
+    _write(at_key, _encode_key(key), 0o600)
     _write(at_certificate, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
     return Issuer(certificate, key)
 
 
 def _make_private(folder: Path) -> None:
-    """A new folder that is its owner's alone. One that is there stays as it is, and must be so already."""
+    """Create a folder that only its owner may use. Raises ConfigError for an existing one that others may use."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         folder.mkdir(mode=0o700)
@@ -86,9 +91,10 @@ def _make_private(folder: Path) -> None:
 
 
 def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
-    warned = readable_by_all(at_key)
-    if warned:
-        raise ConfigError(f"{warned}; as this is the lab's authority, anybody may have joined: better make a new one")
+    """Read the authority and check that certificate and key belong together. Raises ConfigError."""
+    warning = readable_by_all(at_key)
+    if warning:
+        raise ConfigError(f"{warning}; as this is the lab's authority, anybody may have joined: better make a new one")
     try:
         certificate = x509.load_pem_x509_certificate(read_bytes(at_certificate))
         key = serialization.load_pem_private_key(read_bytes(at_key), None)
@@ -105,27 +111,37 @@ def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
 
 
 def issue(issuer: Issuer, identity: Identity, lab: Lab, life: timedelta | None = None) -> tuple[bytes, bytes]:
-    """A new certificate and its private key, as PEM. life: from now on; None: as the lab file says."""
+    """Create a certificate and its private key.
+
+    Args:
+        issuer: The authority that signs.
+        identity: What the certificate is for.
+        lab: The lab.
+        life: How long the certificate is valid; None takes `certificate_days` of the lab file.
+
+    Returns:
+        Certificate and private key as PEM.
+    """
     key = ec.generate_private_key(ec.SECP256R1())
-    router = identity.role is None
-    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *[ExtendedKeyUsageOID.SERVER_AUTH] * router]
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity.common_name)])
+    if life is None:
+        life = timedelta(days=lab.file.certificate_days)
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    if identity.role is None:  # a router
+        purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
     builder = (
-        _builder(
-            x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity.common_name)]),
-            issuer.certificate.subject,
-            timedelta(days=lab.file.certificate_days) if life is None else life,
-        )
+        _builder(subject, issuer.certificate.subject, life)
         .public_key(key.public_key())
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.SubjectAlternativeName(_names(identity, lab)), critical=False)
     )
     certificate = builder.sign(issuer.key, hashes.SHA256())
-    return certificate.public_bytes(serialization.Encoding.PEM), _pem_of(key)
+    return certificate.public_bytes(serialization.Encoding.PEM), _encode_key(key)
 
 
 def _names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
-    """What a router is reached at, which who connects compares; a role is reached nowhere, and has only its name."""
+    """Return the address of a router, which its clients compare; a role has no address, only its name."""
     address = lab.file.machines[identity.machine].address if identity.role is None else None
     if address is None:
         return [x509.DNSName(identity.common_name.replace("_", "-"))]
@@ -138,10 +154,17 @@ def _names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
 def write_certificates(
     lab: Lab, folder: Path, authority: Path, *, rotate: bool = False
 ) -> list[tuple[Identity, str, datetime]]:
-    """Certificates of all identities, in `folder/MACHINE/tls`. Returns each with what was done, and its end.
+    """Write the certificates of all identities into `folder/MACHINE/tls`.
 
-    What is done is `made`, `renewed` or `kept`. rotate: renew all of them; otherwise those of another authority, for
-    another address, or with less than a third of their life left.
+    Args:
+        lab: The lab.
+        folder: The output folder.
+        authority: The folder of the authority.
+        rotate: Renew all certificates. Otherwise those of another authority, for another address, or with less than
+            RENEW_AT of their life left are renewed.
+
+    Returns:
+        Each identity with what was done ("made", "renewed" or "kept"), and the end of its certificate.
     """
     issuer = make_authority(authority, lab)
     root = issuer.certificate.public_bytes(serialization.Encoding.PEM)
@@ -149,39 +172,44 @@ def write_certificates(
     for identity in identities(lab):
         tls = folder / identity.machine / "tls"
         tls.mkdir(parents=True, exist_ok=True)
-        at = tls / f"{identity.label}.pem"
-        kept = _still_valid(at, issuer, identity, lab)
-        state = "made" if kept is None and not at.exists() else "renewed" if kept is None or rotate else "kept"
+        path = tls / f"{identity.label}.pem"
+        is_valid = _is_still_valid(path, issuer, identity, lab)
+        if not is_valid and not path.exists():
+            state = "made"
+        elif not is_valid or rotate:
+            state = "renewed"
+        else:
+            state = "kept"
         if state != "kept":
             certificate, key = issue(issuer, identity, lab)
-            _write(at.with_suffix(".key"), key, 0o600)
-            _write(at, certificate, 0o644)
+            _write(path.with_suffix(".key"), key, 0o600)
+            _write(path, certificate, 0o644)
         _write(tls / f"{AUTHORITY}.pem", root, 0o644)
-        done.append((identity, state, read_certificate(at).not_valid_after_utc))
+        done.append((identity, state, read_certificate(path).not_valid_after_utc))
     return done
 
 
 def read_certificate(at: Path) -> x509.Certificate:
-    """A certificate in a file. Raises ConfigError."""
+    """Read a certificate from a file. Raises ConfigError."""
     try:
         return x509.load_pem_x509_certificate(read_bytes(at))
     except ValueError as error:
         raise ConfigError(f"{at}: not a certificate: {error}; remove it and run `snakesim deploy certs`") from None
 
 
-def _still_valid(at: Path, issuer: Issuer, identity: Identity, lab: Lab) -> x509.Certificate | None:
-    """The certificate that is there, if it may stay."""
-    if not at.exists() or not at.with_suffix(".key").exists():
-        return None
-    found = read_certificate(at)
+def _is_still_valid(path: Path, issuer: Issuer, identity: Identity, lab: Lab) -> bool:
+    """Return whether the certificate at a path is there, and need not be renewed."""
+    if not path.exists() or not path.with_suffix(".key").exists():
+        return False
+    certificate = read_certificate(path)
     try:
-        found.verify_directly_issued_by(issuer.certificate)
+        certificate.verify_directly_issued_by(issuer.certificate)
     except (ValueError, TypeError, InvalidSignature):
-        return None
-    names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    life = found.not_valid_after_utc - found.not_valid_before_utc
-    left = found.not_valid_after_utc - datetime.now(UTC)
-    return found if list(names) == _names(identity, lab) and left > life * RENEW_AT else None
+        return False
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    life = certificate.not_valid_after_utc - certificate.not_valid_before_utc
+    left = certificate.not_valid_after_utc - datetime.now(UTC)
+    return list(names) == _names(identity, lab) and left > life * RENEW_AT
 
 
 def _builder(subject: x509.Name, issuer: x509.Name, life: timedelta) -> x509.CertificateBuilder:
@@ -196,7 +224,7 @@ def _builder(subject: x509.Name, issuer: x509.Name, life: timedelta) -> x509.Cer
     )
 
 
-def _pem_of(key: ec.EllipticCurvePrivateKey) -> bytes:
+def _encode_key(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )

@@ -1,7 +1,7 @@
-"""`snakesim deploy check`: checks that a running lab is as its lab file says.
+"""Checks for `snakesim deploy check` that a running lab is as its lab file says.
 
-It connects as each identity in turn, with the certificates in the output folder, and moves nothing: it subscribes,
-looks for liveliness tokens, and asks with empty queries, which a host refuses.
+The check connects as each identity in turn, with the certificates in the output folder, and moves nothing: it
+subscribes, looks for liveliness tokens, and sends empty queries, which a host refuses.
 """
 
 import json
@@ -39,8 +39,7 @@ CONNECT_MS = 2000
 LISTEN_S = 1.0
 CLOCK_LIMIT_S = 0.5  # by which a clock may differ; Zenoh's routers restamp what is further in the future
 ASKABLE = (keys.LEASE, keys.LIFECYCLE)  # an empty query there has no effect
-# Who is behind a key that is published all the time.
-WRITERS = {
+WRITERS = {  # the process that publishes at a key all the time
     keys.CLOCK: HOST,
     keys.WORLD: "guidance",
     keys.TRAJECTORY: "navigation",
@@ -50,29 +49,39 @@ WRITERS = {
 
 @dataclass
 class Findings:
-    """What is said, and what of it is wrong."""
+    """Prints the results of the checks, and counts the wrong ones."""
 
     say: Say
     wrong: int = 0
 
     def passed(self, text: str) -> None:
-        """As it should be."""
+        """Print a result that is as it should be."""
         self.say(f"  {text}")
 
     def failed(self, text: str) -> None:
-        """Not as it should be."""
+        """Print a result that is wrong, and count it."""
         self.wrong += 1
         self.say(f"! {text}")
 
 
 def check(lab: Lab, folder: Path, say: Say = say) -> int:
-    """Check everything. folder: of `deploy certs`. Returns 0 when all is as the lab file says, 1 otherwise."""
+    """Check certificates, routers, robots and roles of a lab.
+
+    Args:
+        lab: The lab.
+        folder: The output folder of `deploy certs`.
+        say: Prints a line.
+
+    Returns:
+        The exit code: 0 when all is as the lab file says, 1 otherwise.
+    """
     found = Findings(say)
     say("certificates")
     for identity in identities(lab):
         _check_certificate(identity, folder, found)
     say("routers")
-    if not [name for name in lab.file.routers if _check_router(name, lab, folder, found)]:
+    reached = [name for name in lab.file.routers if _check_router(name, lab, folder, found)]
+    if not reached:
         say("no router can be reached, and so neither robots nor roles can be looked at")
         return 1
     for robot in lab.file.robots:
@@ -81,27 +90,34 @@ def check(lab: Lab, folder: Path, say: Say = say) -> int:
     say("roles: what each may ask")
     for identity in identities(lab):
         if identity.role is not None:
-            _check_role(identity, lab, folder, found)
-    say("all is as it should be" if not found.wrong else f"{found.wrong} marked with ! need a look")
-    return 1 if found.wrong else 0
+            _check_role(identity, identity.role, lab, folder, found)
+    if found.wrong:
+        say(f"{found.wrong} marked with ! need a look")
+        return 1
+    say("all is as it should be")
+    return 0
 
 
 def _check_certificate(identity: Identity, folder: Path, found: Findings) -> None:
-    at = _tls(identity, folder) / f"{identity.label}.pem"
+    """Check that the certificate of an identity is there and valid, and that only its owner can read its key."""
+    path = _certificate_path(identity, folder)
     try:
-        certificate = read_certificate(at)
+        certificate = read_certificate(path)
     except ConfigError as error:
         found.failed(f"{identity.common_name}: {error}")
         return
-    _check_end(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
-    if wrong := readable_by_all(at.with_suffix(".key")):
-        found.failed(f"{identity.common_name}: {wrong}, and renew it with `snakesim deploy certs --rotate`")
+    _check_expiry(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
+    warning = readable_by_all(path.with_suffix(".key"))
+    if warning:
+        found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim deploy certs --rotate`")
 
 
-def _check_end(what: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
+def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
+    """Check that a certificate is valid for more than the part of its life at which it is renewed."""
     end = certificate.not_valid_after_utc
-    left, life = end - datetime.now(UTC), end - certificate.not_valid_before_utc
-    text = f"{what}: ends {end:%Y-%m-%d %H:%M} UTC, in {left.total_seconds() / 86400:.1f} days"
+    life = end - certificate.not_valid_before_utc
+    left = end - datetime.now(UTC)
+    text = f"{name}: ends {end:%Y-%m-%d %H:%M} UTC, in {left.total_seconds() / 86400:.1f} days"
     if left > life * RENEW_AT:
         found.passed(text)
     else:
@@ -109,7 +125,7 @@ def _check_end(what: str, certificate: x509.Certificate, remedy: str, found: Fin
 
 
 def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
-    """Whether it accepts only clients with a certificate, and which one it shows itself. False: not reached."""
+    """Check that a router accepts our clients, and which certificate it shows. Return False if it is not reached."""
     endpoint = lab.endpoint(name)
     identity = Identity(lab.file.routers[name].machine, None, name)
     try:
@@ -119,37 +135,44 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
             f"{name}: nothing answers on {endpoint}: {error}; start it on {identity.machine}, or open the port"
         )
         return False
-    anybody = next((other for other in identities(lab) if other.role is not None), None)
-    if anybody is None:
+    client = next((other for other in identities(lab) if other.role is not None), None)
+    if client is None:
         return True
-    settings = _settings(anybody, lab, folder, [endpoint])
+    settings = _probe_settings(client, lab, folder, [endpoint])
     try:
         with open_probe(json.dumps(settings)) as probe:
             found.passed(f"{name}: {endpoint}, round trip {1e3 * probe.round_trip_s():.2f} ms")
     except NotConnectedError as error:
-        found.failed(f"{name}: {endpoint} lets {anybody.common_name} not in: {error}")
+        found.failed(f"{name}: {endpoint} lets {client.common_name} not in: {error}")
         return True
     tls = settings["transport"]["link"]["tls"]
-    shown = _shown_certificate(endpoint, tls)
-    kept = read_certificate(_tls(identity, folder) / f"{identity.label}.pem")
+    shown = _read_shown_certificate(endpoint, tls)
+    kept = read_certificate(_certificate_path(identity, folder))
     if shown.serial_number != kept.serial_number:
-        _check_end(f"{name} shows an earlier certificate", shown, f"restart it on {identity.machine}", found)
+        _check_expiry(f"{name} shows an earlier certificate", shown, f"restart it on {identity.machine}", found)
+    _check_refuses_strangers(name, settings, found)
+    return True
+
+
+def _check_refuses_strangers(name: str, settings: dict[str, Any], found: Findings) -> None:
+    """Check that a router refuses a client without a certificate. settings: those of a client with one."""
+    tls = settings["transport"]["link"]["tls"]
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
     try:
         with open_probe(json.dumps(settings)):
             found.failed(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
     except NotConnectedError:
         found.passed(f"{name}: refuses clients without a certificate")
-    return True
 
 
 def _plain_connection(endpoint: str) -> socket.socket:
+    """Connect to a router without TLS. Raises OSError."""
     host, _, port = endpoint.removeprefix("tls/").rpartition(":")
     return socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_MS / 1000)
 
 
-def _shown_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
-    """What a router shows to who connects."""
+def _read_shown_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
+    """Return the certificate that a router shows to its clients. tls: the files of a client."""
     host = endpoint.removeprefix("tls/").rpartition(":")[0].strip("[]")
     context = ssl.create_default_context(cafile=tls["root_ca_certificate"])
     context.load_cert_chain(tls["connect_certificate"], tls["connect_private_key"])
@@ -157,40 +180,72 @@ def _shown_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
         return x509.load_der_x509_certificate(wrapped.getpeercert(binary_form=True) or b"")
 
 
+@dataclass(frozen=True)
+class _RobotState:
+    """What the processes of a robot publish."""
+
+    status: Status | None
+    description: Description | None
+    live_services: frozenset[str]  # names of the services with a liveliness token
+    processes: list[Process]
+    clock_offsets_s: dict[str, float]  # by key: how far the publisher's clock is ahead of this computer's
+
+
 def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
-    """Its processes: where they run, which version, what is set up differently, and their clocks."""
-    held = [identity for identity in identities(lab) if robot in identity.robots(lab)]
-    watcher = max(held, key=lambda identity: list(Role).index(identity.role or Role.ROBOT))
+    """Check the processes of a robot: where they run, their versions and settings, and their clocks."""
+    involved = [identity for identity in identities(lab) if robot in identity.robots(lab)]
+    watcher = max(involved, key=lambda identity: list(Role).index(identity.role or Role.ROBOT))
     try:
-        with _session(watcher, robot, lab, folder) as session:
-            status = session.latest(keys.STATUS, Status, LISTEN_S)
-            description = session.latest(keys.DESCRIPTION, Description, LISTEN_S) if status is not None else None
-            live = session.present(keys.PROCESS_ALL)
-            reader = session.latched_reader(keys.PROCESS_ALL, Process)
-            with open_probe(json.dumps({**_settings(watcher, lab, folder), "namespace": robot})) as probe:
-                ahead = probe.clock_offsets_s(list(WRITERS), LISTEN_S)
-            entries = reader.drain()
+        state = _observe_robot(watcher, robot, lab, folder)
     except NotConnectedError as error:
         found.failed(f"cannot be looked at as {watcher.common_name}: {error}")
         return
-    if status is not None:
-        found.passed(f"{status.lifecycle} - {status.why}")
-        check_what_moves(lab.file.robots[robot], description, found)
-    host = next((entry for entry in entries if entry.name == HOST), None)
-    expected = {HOST: lab.file.robots[robot].machine}
-    for identity in held:
-        expected |= dict.fromkeys(identity.services, identity.machine)
-        expected |= {RECORDER: identity.machine} if identity.role is Role.RECORDER else {}
-    for name, machine in expected.items():
-        running = [entry for entry in entries if entry.name == name]
-        if not running or not any(keys.service_of(key).rpartition("-")[0] == name for key in live):
+    if state.status is not None:
+        found.passed(f"{state.status.lifecycle} - {state.status.why}")
+        check_what_moves(lab.file.robots[robot], state.description, found)
+    host = next((process for process in state.processes if process.name == HOST), None)
+    for name, machine in _expected_processes(robot, lab, involved).items():
+        running = [process for process in state.processes if process.name == name]
+        if not running or name not in state.live_services:
             found.failed(f"{name}: not running; it belongs on {machine}")
-        for entry in running:
-            _check_process(entry, host, ahead, found)
+        for process in running:
+            _check_process(process, host, state.clock_offsets_s, found)
+
+
+def _observe_robot(watcher: Identity, robot: str, lab: Lab, folder: Path) -> _RobotState:
+    """Connect as one identity and collect what a robot publishes. Raises NotConnectedError."""
+    with _open_session(watcher, robot, lab, folder) as session:
+        status = session.latest(keys.STATUS, Status, LISTEN_S)
+        description = session.latest(keys.DESCRIPTION, Description, LISTEN_S) if status is not None else None
+        live_keys = session.present(keys.PROCESS_ALL)
+        reader = session.latched_reader(keys.PROCESS_ALL, Process)
+        settings = {**_probe_settings(watcher, lab, folder), "namespace": robot}
+        with open_probe(json.dumps(settings)) as probe:
+            clock_offsets_s = probe.clock_offsets_s(list(WRITERS), LISTEN_S)
+        processes = reader.drain()
+    live_services = frozenset(keys.service_of(key).rpartition("-")[0] for key in live_keys)
+    return _RobotState(status, description, live_services, processes, clock_offsets_s)
+
+
+def _expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[str, str]:
+    """Return the machine of each process that the lab file gives a robot."""
+    expected = {HOST: lab.file.robots[robot].machine}
+    for identity in involved:
+        for service in identity.services:
+            expected[service] = identity.machine
+        if identity.role is Role.RECORDER:
+            expected[RECORDER] = identity.machine
+    return expected
 
 
 def check_what_moves(robot: Robot, description: Description | None, found: Findings) -> None:
-    """A robot that the lab file names a bus for must not be emulated, and the other way round."""
+    """Check that a robot is emulated if, and only if, the lab file names no bus for it.
+
+    Args:
+        robot: The robot's entry in the lab file.
+        description: What its host publishes; None if it publishes none.
+        found: The findings, which are extended.
+    """
     words = describe_what_moves(description)
     if description is None:
         found.failed(words)
@@ -202,56 +257,74 @@ def check_what_moves(robot: Robot, description: Description | None, found: Findi
         found.passed(words)
 
 
-def _check_process(entry: Process, host: Process | None, ahead: dict[str, float], found: Findings) -> None:
-    found.passed(f"{entry.name}: on {entry.machine}, process {entry.pid}, snakesim {entry.version}")
-    if host is not None and entry.version != host.version:
-        found.failed(f"{entry.name}: snakesim {entry.version}, but the host has {host.version}")
-    for difference in differences(entry, host) if host is not None else ():
-        found.failed(f"{entry.name}: {difference}")
+def _check_process(process: Process, host: Process | None, clock_offsets_s: dict[str, float], found: Findings) -> None:
+    """Check version and settings of a process against those of the host, and its clock against ours."""
+    found.passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
+    if host is not None:
+        if process.version != host.version:
+            found.failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
+        for difference in differences(process, host):
+            found.failed(f"{process.name}: {difference}")
     for key, writer in WRITERS.items():
-        if writer == entry.name and key in ahead:
-            tell = found.passed if abs(ahead[key]) < CLOCK_LIMIT_S else found.failed
-            tell(f"{entry.name}: clock {ahead[key]:+.3f} s against this computer's")
+        if writer != process.name or key not in clock_offsets_s:
+            continue
+        offset_s = clock_offsets_s[key]
+        text = f"{process.name}: clock {offset_s:+.3f} s against this computer's"
+        if abs(offset_s) < CLOCK_LIMIT_S:
+            found.passed(text)
+        else:
+            found.failed(text)
 
 
-def _check_role(identity: Identity, lab: Lab, folder: Path, found: Findings) -> None:
-    """Whether it gets in, and whether the routers answer as the table of roles says."""
+def _check_role(identity: Identity, role: Role, lab: Lab, folder: Path, found: Findings) -> None:
+    """Check that an identity can connect, and that the routers answer it as the table of roles says."""
     try:
-        with open_probe(json.dumps(_settings(identity, lab, folder))) as probe:
-            trip_ms = 1e3 * probe.round_trip_s()
+        with open_probe(json.dumps(_probe_settings(identity, lab, folder))) as probe:
+            round_trip_ms = 1e3 * probe.round_trip_s()
             for robot in lab.file.robots:
-                own = robot in identity.robots(lab)
-                for line in (line for line in TABLE if line.key in ASKABLE):
-                    granted = own and "ask" in line.acts(identity.role or Role.VIEWER)
+                is_involved = robot in identity.robots(lab)
+                for line in TABLE:
+                    if line.key not in ASKABLE:
+                        continue
+                    granted = is_involved and "ask" in line.acts(role)
                     answers = probe.answers(f"{robot}/{line.key}")
                     query = f"{identity.common_name}: {robot}/{line.key}"
                     if answers > granted:
                         found.failed(f"{query} answers, though the role may not ask; the router has other rules")
                     elif answers < granted:
                         found.failed(f"{query} does not answer, though the role may ask; no host, or other rules")
-            found.passed(f"{identity.common_name}: round trip {trip_ms:.2f} ms")
+            found.passed(f"{identity.common_name}: round trip {round_trip_ms:.2f} ms")
     except NotConnectedError as error:
         found.failed(f"{identity.common_name}: not let in: {error}")
 
 
 @contextmanager
-def _session(identity: Identity, robot: str, lab: Lab, folder: Path) -> Iterator[Session]:
-    """A session of ours as one identity."""
+def _open_session(identity: Identity, robot: str, lab: Lab, folder: Path) -> Iterator[Session]:
+    """Open a session to a robot as one identity. Raises NotConnectedError."""
     with TemporaryDirectory() as scratch:
         path = Path(scratch) / "session.json5"
-        path.write_text(json.dumps(_settings(identity, lab, folder)), encoding="utf-8")
-        with open_session(Link.of_file(read_session(path), robot), CONNECT_MS / 1000) as session:
+        path.write_text(json.dumps(_probe_settings(identity, lab, folder)), encoding="utf-8")
+        link = Link.of_file(read_session(path), robot)
+        with open_session(link, CONNECT_MS / 1000) as session:
             yield session
 
 
-def _settings(identity: Identity, lab: Lab, folder: Path, endpoints: list[str] | None = None) -> dict[str, Any]:
-    """Of an identity's session, for whole keys, with the certificate that lies here."""
+def _probe_settings(identity: Identity, lab: Lab, folder: Path, endpoints: list[str] | None = None) -> dict[str, Any]:
+    """Return Zenoh's settings for a session as one identity, with whole keys and the certificate in `folder`.
+
+    endpoints: routers to connect to; None takes all of the lab.
+    """
     settings = session_settings(identity, lab)
     settings.pop("namespace", None)
-    settings["connect"] |= {"timeout_ms": CONNECT_MS, "endpoints": endpoints or lab.endpoints()}
-    settings["transport"]["link"]["tls"] |= tls_files(identity, str(_tls(identity, folder)), "connect")
+    settings["connect"]["timeout_ms"] = CONNECT_MS
+    settings["connect"]["endpoints"] = endpoints or lab.endpoints()
+    settings["transport"]["link"]["tls"] |= tls_files(identity, str(_tls_folder(identity, folder)), "connect")
     return settings
 
 
-def _tls(identity: Identity, folder: Path) -> Path:
+def _tls_folder(identity: Identity, folder: Path) -> Path:
     return folder.absolute() / identity.machine / "tls"
+
+
+def _certificate_path(identity: Identity, folder: Path) -> Path:
+    return _tls_folder(identity, folder) / f"{identity.label}.pem"

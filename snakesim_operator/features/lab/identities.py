@@ -20,21 +20,25 @@ class Identity:
 
     @property
     def label(self) -> str:
-        """Its name on its machine, and of its files: `gnc.planar13`, `router.main`."""
+        """The name on its machine and of its files: `gnc.planar13`, `router.main`."""
         return f"{self.role or ROUTER}.{self.of}"
 
     @property
     def common_name(self) -> str:
-        """Its name in the certificate, in the access rules and in the routers' logs: `gnc.planar13.ws1`."""
+        """The name in the certificate, in the access rules and in the routers' logs: `gnc.planar13.ws1`."""
         return f"{self.label}.{self.machine}"
 
     def robots(self, lab: Lab) -> list[str]:
-        """The robots that it has to do with."""
-        return list(lab.file.robots) if self.of == ALL else [self.of] * (self.role is not None)
+        """Return the robots whose keys the identity may use; none for a router."""
+        if self.of == ALL:
+            return list(lab.file.robots)
+        if self.role is None:
+            return []
+        return [self.of]
 
 
 def identities(lab: Lab) -> Iterator[Identity]:
-    """All of a lab: routers, robots, then the roles in the file's order."""
+    """Yield all identities of a lab: routers, robots, then the roles in the file's order."""
     for name, router in lab.file.routers.items():
         yield Identity(router.machine, None, name)
     for name, robot in lab.file.robots.items():

@@ -71,11 +71,11 @@ class Lab:
     path: Path
 
     def endpoints(self) -> list[str]:
-        """Where the routers listen, in the file's order."""
+        """Return the endpoints of the routers, in the file's order."""
         return [self.endpoint(name) for name in self.file.routers]
 
     def endpoint(self, router: str) -> str:
-        """Where a router listens: `tls/ADDRESS:PORT`."""
+        """Return the endpoint of a router: `tls/ADDRESS:PORT`."""
         entry = self.file.routers[router]
         address = self.file.machines[entry.machine].address or ""
         return f"tls/[{address}]:{entry.port}" if ":" in address else f"tls/{address}:{entry.port}"

@@ -1,4 +1,4 @@
-"""The programs of ours that run on a lab's machines all the time: routers, hosts, services, recorders."""
+"""The programs that run on a lab's machines all the time: routers, hosts, services and recorders."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ STATE = "/var/lib/snakesim"
 
 @dataclass(frozen=True)
 class Program:
-    """One of them. People start theirs themselves: operators, viewers and administrators have none."""
+    """A program that a machine starts by itself. Operators, viewers and administrators start theirs by hand."""
 
     identity: Identity
     about: str
@@ -26,9 +26,11 @@ class Program:
 
     @property
     def name(self) -> str:
-        """Of its unit and its container."""
-        label = self.identity.label if not self.of_robot else f"{self.kind}.{self.of_robot}"
-        return f"snakesim-{label}" + (f"-{self.service}" if self.service else "")
+        """The name of its unit and its container."""
+        label = f"{self.kind}.{self.of_robot}" if self.of_robot else self.identity.label
+        if self.service:
+            return f"snakesim-{label}-{self.service}"
+        return f"snakesim-{label}"
 
     @property
     def kind(self) -> str:
@@ -37,7 +39,7 @@ class Program:
 
 
 def programs(lab: Lab, machine: str) -> Iterator[Program]:
-    """All of one machine."""
+    """Yield all programs of one machine."""
     folder = lab.file.machines[machine].folder
     for identity in identities(lab):
         if identity.machine != machine:
@@ -68,7 +70,7 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
 
 
 def _scenario(robot: Robot) -> tuple[str, ...]:
-    """Returns the scenario and what changes it: the same for the host and for its services, which compare it."""
+    """Return the options for the scenario. Host and services get the same, because they compare them."""
     words = [robot.scenario, "--backend", robot.backend]
     if uses_bus(robot):
         words += ["--clock-mode", "realtime"]  # the only one of drives on a bus, whatever the scenario says

@@ -1,4 +1,4 @@
-"""Writes what each machine of a lab needs into a folder of its own. Certificates lie beside it: see `certificates`."""
+"""Writes the files of each machine of a lab into a folder of its own; `certificates` adds the certificates."""
 
 import json
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ WRITTEN = "rendered.txt"  # names of the files that were written, so that the ne
 
 
 def render(lab: Lab, folder: Path) -> list[Path]:
-    """Write everything; returns the files. Those of an earlier call that are no longer in the lab are removed."""
+    """Write the files of all machines; return their paths. Files of an earlier lab are removed."""
     files = dict(rendered(lab))
     written: list[Path] = []
     for machine in lab.file.machines:
@@ -39,7 +39,7 @@ def _written_before(place: Path) -> list[str]:
 
 
 def rendered(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
-    """Every file as ((machine, path in the machine's folder), text)."""
+    """Yield every file as ((machine, path in the machine's folder), text)."""
     for identity in identities(lab):
         settings = router_settings(identity, lab) if identity.role is None else session_settings(identity, lab)
         text = f"// {_origin(lab, identity.common_name)}\n{json.dumps(settings, indent=2)}\n"  # JSON is JSON5

@@ -1,4 +1,4 @@
-"""systemd units, CAN bring-up and a compose file for a lab's machines, from the templates beside this file."""
+"""Renders systemd units, CAN bring-up and a compose file for a lab's machines, from the templates in this folder."""
 
 import re
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ NEEDS_QUOTES = re.compile(r"[\s';]")
 
 
 def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
-    """A machine's files as (path, text). origin: a line that says where they come from."""
+    """Yield the files of a machine as (path, text). origin: a line that names their source."""
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         undefined=StrictUndefined,
@@ -28,29 +28,34 @@ def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]
     )
     entry = lab.file.machines[machine]
     found = list(programs(lab, machine))
-    given = {"machine": entry, "origin": origin, "state": STATE, "uid": CONTAINER_USER}
-    given["priority"] = SERVICE_PRIORITY
+    variables = {
+        "machine": entry,
+        "origin": origin,
+        "state": STATE,
+        "uid": CONTAINER_USER,
+        "priority": SERVICE_PRIORITY,
+    }
     unit = templates.get_template("unit.j2")
     for program in found:
-        text = unit.render(**given, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
+        text = unit.render(**variables, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
         yield f"systemd/{program.name}.service", text
     for robot in lab.file.robots.values():
         for interface in can_interfaces(robot) if robot.machine == machine else ():
-            text = templates.get_template("can.j2").render(**given, interface=interface)
+            text = templates.get_template("can.j2").render(**variables, interface=interface)
             yield f"systemd/snakesim-{interface.name}.service", text
     if found:
         commands = [(program, ["snakesim", *program.arguments]) for program in found]
-        yield "compose.yaml", templates.get_template("compose.j2").render(**given, programs=commands)
+        yield "compose.yaml", templates.get_template("compose.j2").render(**variables, programs=commands)
 
 
 def _command_line(lab: Lab, program: Program) -> str:
-    """Returns it as systemd splits it: the file's types allow no double quotes, `%`, `$` or backslashes."""
+    """Return the command as systemd splits it. The file's types allow no double quotes, `%`, `$` or backslashes."""
     words = (lab.file.machines[program.identity.machine].program, *program.arguments)
     return " ".join(f'"{word}"' if NEEDS_QUOTES.search(word) else word for word in words)
 
 
 def _addresses(lab: Lab) -> list[str]:
-    """Of the routers, if all of them are numbers."""
+    """Return the addresses of the routers, or none if one of them is a name."""
     found = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
     try:
         return sorted({str(ip_address(address)) for address in found})

@@ -1,4 +1,4 @@
-"""Zenoh's configuration of a lab's routers and sessions, as stock Zenoh reads it: nothing of ours is in there."""
+"""Creates the configuration of a lab's routers and sessions, as an unmodified Zenoh reads it."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ LEASE_MS = 2000  # after which a silent link is given up
 
 
 def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
-    """A router: TLS on the machine's address, a certificate asked of everybody, and the access rules."""
+    """Return the settings of a router: TLS on the machine's address, required certificates, and the access rules."""
     earlier = list(lab.file.routers)[: list(lab.file.routers).index(identity.of)]
     folder = f"{lab.file.machines[identity.machine].folder}/tls"
     tls = {**tls_files(identity, folder, "listen"), **tls_files(identity, folder, "connect"), "enable_mtls": True}
@@ -35,7 +35,7 @@ def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
 
 
 def session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
-    """A session of one role: a client of the routers, with its certificate, listening nowhere."""
+    """Return the settings of a session of one role: a client of the routers that does not listen."""
     folder = f"{lab.file.machines[identity.machine].folder}/tls"
     settings: dict[str, Any] = {
         "mode": "client",
@@ -64,7 +64,7 @@ def _link(tls: dict[str, Any]) -> dict[str, Any]:
 
 
 def tls_files(identity: Identity, folder: str, side: str) -> dict[str, Any]:
-    """The authority, and the certificate and key of an identity, in a folder; side: `listen` or `connect`."""
+    """Return the paths of the authority and of an identity's certificate and key. side: `listen` or `connect`."""
     return {
         "root_ca_certificate": f"{folder}/authority.pem",
         f"{side}_certificate": f"{folder}/{identity.label}.pem",

@@ -1,4 +1,7 @@
-"""A URDF's row of bodies -> chain, module and links: the line of the joints becomes x, `up` becomes z."""
+"""Converts the bodies of a URDF into the chain, module and links of a robot file.
+
+In the robot file's body frame the line through the joints is x, from tail to head, and the direction `up` is z.
+"""
 
 import math
 from typing import Any
@@ -13,16 +16,72 @@ from snakesim_operator.features.robots.imported import UPS, Imported, Order
 from snakesim_operator.features.robots.urdf_tree import Body, Joint, Row
 from snakesim_operator.features.robots.xml_tree import Element
 
-DIGITS_M = 9  # lengths are rounded to a nanometre, which removes the noise of adding transforms
-OFF_LINE = 0.05  # of the mean distance between joints: a joint further beside the line is an error
-OBLIQUE = math.cos(math.radians(1.0))
+LENGTH_DIGITS = 9  # lengths are rounded to a nanometer, which removes the noise of adding transforms
+VALUE_DIGITS = 10  # significant digits of masses and inertias
+MAX_OFFSET_RATIO = 0.05  # of a joint from the line of all joints, relative to the mean distance between joints
+MIN_AXIS_COSINE = math.cos(math.radians(1.0))  # a joint's axis may be tilted by 1 degree
 MIN_TILT_RAD = 1e-5  # of an axis; less is the rounding of the file
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
-MIN_GAP_M, MAX_GAP_M, MIN_MASS_KG = 0.001, 2, 0.001
+MIN_OFFSET_M = 1e-6  # of a joint; less is the rounding of the file
+ASSUMED_RADIUS_RATIO = 0.35  # radius of a link without geometry, relative to the mean distance between joints
+MIN_LENGTH_M = 0.001
+MAX_GAP_M = 2
+MIN_MASS_KG = 0.001
+MOMENT_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
 
 
-def _axes_of_body(row: Row, order: Order, urdf: Element) -> Floats:
-    """body_from_root (3, 3): x from tail to head, z up."""
+def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Floats]:
+    """Put chain, module and links into the values of a robot file.
+
+    Args:
+        found: The import, whose values and report are extended.
+        row: Bodies and joints of the URDF, tail to head.
+        order: How to read the URDF.
+        urdf: The root element of the URDF.
+
+    Returns:
+        link_from_root, (4, 4) with lengths in m, of every link, tail to head.
+
+    Raises:
+        ConfigError: The joints are not on a line, or turn about another axis than y or z.
+    """
+    body_from_root = _find_body_axes(row, order, urdf)
+    scale = order.scale
+    if scale != 1.0:
+        found.changes.add(
+            f"--scale {scale:g}: lengths times {scale:g}, inertias times {scale**2:g}; masses in kg, effort, damping "
+            f"and friction in N·m stay as they are"
+        )
+
+    # Joints, in the body frame.
+    positions_b = np.array([body_from_root @ joint.origin for joint in row.joints]) * scale
+    line_b = np.array([0.0, *positions_b[0][1:]])  # y and z of the line are those of the first joint
+    on_line = positions_b - line_b
+    joints_x = on_line[:, 0]
+    gap_m = float(np.mean(np.diff(joints_x)))
+    _check_gap(row, joints_x, gap_m, urdf)
+    axes = [_read_axis(found, joint, body_from_root @ joint.axis) for joint in row.joints]
+    for joint, axis, offset_m in zip(row.joints, axes, on_line, strict=True):
+        _check_on_line(found, joint, axis, offset_m, gap_m)
+
+    # Outlines, from which the capsules follow.
+    outlines = [_place_outline(body, body_from_root, line_b, scale) for body in row.bodies]
+    radius_m = _choose_radius(outlines, gap_m, found)
+    _report_shapes(found, row, radius_m, scale)
+    lengths = _measure_lengths(joints_x, outlines, radius_m, found, row)
+
+    # Links.
+    starts_x = [joints_x[0] - lengths[0], *joints_x]
+    frames = [_link_from_root(body_from_root, np.array([x, *positions_b[0][1:]])) for x in starts_x]
+    links: list[dict[str, Any]] = []
+    for i, body in enumerate(row.bodies):
+        links.append(_convert_link(found, i, body, frames[i], lengths[i], radius_m, scale))
+    _put_links(found.table, links, axes, radius_m, urdf.source)
+    _put_names(found, row, axes, body_from_root)
+    return frames
+
+
+def _find_body_axes(row: Row, order: Order, urdf: Element) -> Floats:
+    """Return body_from_root, (3, 3): x from tail to head, z up. Raises ConfigError."""
     along = row.joints[-1].origin - row.joints[0].origin
     if np.linalg.norm(along) < 1e-9:
         raise urdf.wrong("has its first and last joint at the same place, so that the chain has no direction")
@@ -36,66 +95,46 @@ def _axes_of_body(row: Row, order: Order, urdf: Element) -> Floats:
     return np.vstack([x, np.cross(z, x), z])
 
 
-def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Floats]:
-    """Chain, module and links. Returns link_from_root, (4, 4) in m, of every link, tail to head."""
-    turn = _axes_of_body(row, order, urdf)
-    scale = order.scale
-    if scale != 1.0:
-        found.changes.add(
-            f"--scale {scale:g}: lengths times {scale:g}, inertias times {scale**2:g}; masses in kg, effort, damping "
-            f"and friction in N·m stay as they are"
-        )
-    places = np.array([turn @ joint.origin for joint in row.joints]) * scale
-    on_line = places - [0.0, *places[0][1:]]  # x as it is; y and z from the first joint
-    gap_m = float(np.mean(np.diff(on_line[:, 0])))
-    if not gap_m <= MAX_GAP_M:
-        widest = row.joints[1 + int(np.argmax(np.diff(on_line[:, 0])))]
-        raise urdf.wrong(
-            f"has joints {gap_m:g} m apart, and a link has {MAX_GAP_M} m at most; in mm? Give --scale 0.001. The "
-            f"widest gap is before joint {widest.place()}"
-        )
-    axes = [_axis(found, joint, turn @ joint.axis) for joint in row.joints]
-    for joint, axis, at in zip(row.joints, axes, on_line, strict=True):
-        _check_on_line(found, joint, axis, at, gap_m)
-    outlines = [_outline(body, turn, places[0], scale) for body in row.bodies]
-    radius_m = _radius(outlines, gap_m, found)
-    _report_shapes(found, row, radius_m, scale)
-    lengths = _lengths(on_line[:, 0], outlines, radius_m, found, row)
-    starts = [on_line[0, 0] - lengths[0], *on_line[:, 0]]
-    frames = [_link_from_root(turn, np.array([start, *places[0][1:]])) for start in starts]
-    links = [
-        _link(found, i, body, frame, length, radius_m, scale)
-        for i, (body, frame, length) in enumerate(zip(row.bodies, frames, lengths, strict=True))
-    ]
-    _put_links(found.table, links, axes, radius_m, urdf.source)
-    _put_names(found, row, axes, turn)
-    return frames
+def _check_gap(row: Row, joints_x: Floats, gap_m: float, urdf: Element) -> None:
+    """Raise ConfigError when the joints are so far apart that the unit of length must be wrong."""
+    if gap_m <= MAX_GAP_M:
+        return
+    widest = row.joints[1 + int(np.argmax(np.diff(joints_x)))]
+    raise urdf.wrong(
+        f"has joints {gap_m:g} m apart, and a link has {MAX_GAP_M} m at most; in mm? Give --scale 0.001. The "
+        f"widest gap is before joint {widest.place()}"
+    )
 
 
-def _put_names(found: Imported, row: Row, axes: list[str], turn: Floats) -> None:
-    """Our names and theirs, and which joints turn the other way round."""
+def _put_names(found: Imported, row: Row, axes: list[str], body_from_root: Floats) -> None:
+    """Report the new names of links and joints, and keep which joints turn the other way round."""
     for i, body in enumerate(row.bodies):
         if body.links != [f"link_{i}"]:
             found.names.append(f"link_{i}: {', '.join(body.places)}")
     for i, (joint, axis) in enumerate(zip(row.joints, axes, strict=True)):
         name = f"joint_{i + 1}"
-        negated = float((turn @ joint.axis)[2 if axis == "yaw" else 1]) < 0
+        axis_b = body_from_root @ joint.axis
+        component = 2 if axis == "yaw" else 1
+        negated = float(axis_b[component]) < 0
         found.negated.append(negated)
         if joint.name != name or negated:
-            found.names.append(f"{name}: {joint.place()}, {axis}{', its angle negated' if negated else ''}")
+            note = ", its angle negated" if negated else ""
+            found.names.append(f"{name}: {joint.place()}, {axis}{note}")
 
 
-def _link_from_root(turn: Floats, start_b: Floats) -> Floats:
+def _link_from_root(body_from_root: Floats, start_b: Floats) -> Floats:
+    """Return the frame, (4, 4), of a link that begins at `start_b`."""
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = turn, -start_b
+    frame[:3, :3] = body_from_root
+    frame[:3, 3] = -start_b
     return frame
 
 
-def _axis(found: Imported, joint: Joint, axis_b: Floats) -> str:
-    """Yaw or pitch. A small tilt is removed, which is reported."""
+def _read_axis(found: Imported, joint: Joint, axis_b: Floats) -> str:
+    """Return "yaw" or "pitch". A small tilt is removed and reported. Raises ConfigError for an oblique axis."""
     for name, component, letter in (("yaw", 2, "z"), ("pitch", 1, "y")):
-        along = abs(float(axis_b[component]))
-        if along <= OBLIQUE:
+        cosine = abs(float(axis_b[component]))
+        if cosine <= MIN_AXIS_COSINE:
             continue
         tilt_rad = float(np.linalg.norm(np.delete(axis_b, component)))
         if tilt_rad > MIN_TILT_RAD:
@@ -109,36 +148,52 @@ def _axis(found: Imported, joint: Joint, axis_b: Floats) -> str:
     )
 
 
-def _check_on_line(found: Imported, joint: Joint, axis: str, at: Floats, gap_m: float) -> None:
-    """Report where a joint is moved onto the line of the others. Raises ConfigError when it is far beside it."""
-    across, along_axis = (at[1], at[2]) if axis == "yaw" else (at[2], at[1])
-    beside_m = abs(float(across))
-    if beside_m > OFF_LINE * gap_m:
+def _check_on_line(found: Imported, joint: Joint, axis: str, offset_m: Floats, gap_m: float) -> None:
+    """Report where a joint is moved onto the line of the others. Raises ConfigError when it is far beside it.
+
+    Args:
+        found: The import, whose report is extended.
+        joint: The joint.
+        axis: "yaw" or "pitch".
+        offset_m: (3,) position of the joint in the body frame; y and z count from the line.
+        gap_m: Mean distance between joints.
+    """
+    if axis == "yaw":
+        across = offset_m[1]
+        along_axis = offset_m[2]
+    else:
+        across = offset_m[2]
+        along_axis = offset_m[1]
+    across_m = abs(float(across))
+    along_axis_m = abs(float(along_axis))
+    if across_m > MAX_OFFSET_RATIO * gap_m:
         raise joint.element.wrong(
-            f"is {beside_m * 1e3:.1f} mm beside the line through the first and the last joint; a robot file has all "
+            f"is {across_m * 1e3:.1f} mm beside the line through the first and the last joint; a robot file has all "
             f"joints on a line, at zero angles"
         )
-    if beside_m > 1e-6:
+    if across_m > MIN_OFFSET_M:
         found.changes.add(
-            f"<origin> moved by {beside_m * 1e3:.3g} mm, onto the line of the other joints", joint.place("origin")
+            f"<origin> moved by {across_m * 1e3:.3g} mm, onto the line of the other joints", joint.place("origin")
         )
-    if abs(along_axis) > 1e-6:
+    if along_axis_m > MIN_OFFSET_M:
         found.changes.add(
-            f"<origin> moved by {abs(float(along_axis)) * 1e3:.3g} mm along the joint's own axis, which changes no "
-            f"motion",
+            f"<origin> moved by {along_axis_m * 1e3:.3g} mm along the joint's own axis, which changes no motion",
             joint.place("origin"),
         )
 
 
-def _outline(body: Body, turn: Floats, line_b: Floats, scale: float) -> Floats | None:
-    """(n, 3): x along the body, y and z from the line through the joints; None when nothing is known of it."""
+def _place_outline(body: Body, body_from_root: Floats, line_b: Floats, scale: float) -> Floats | None:
+    """Return the outline of a body, (n, 3): x along the robot, y and z from the line through the joints.
+
+    None means that the body has no geometry.
+    """
     if not body.points:
         return None
-    return np.vstack(body.points) @ turn.T * scale - [0.0, line_b[1], line_b[2]]
+    return np.vstack(body.points) @ body_from_root.T * scale - line_b
 
 
 def _report_shapes(found: Imported, row: Row, radius_m: float, scale: float) -> None:
-    """Name every shape that became a capsule, with its sizes."""
+    """Report every shape that became a capsule, with its sizes."""
     for body in row.bodies:
         if _is_capsule(body, radius_m / scale):
             continue
@@ -151,127 +206,195 @@ def _report_shapes(found: Imported, row: Row, radius_m: float, scale: float) -> 
 
 
 def _is_capsule(body: Body, radius: float) -> bool:
-    """Whether its shapes are those of an exported capsule, a cylinder and two spheres, of this radius."""
+    """Return whether the shapes of a body are an exported capsule of this radius: a cylinder and two spheres."""
     if sorted(shape.tag for shape in body.shapes) != ["cylinder", "sphere", "sphere"]:
         return False
     return all(math.isclose(shape.number("radius"), radius, rel_tol=1e-6) for shape in body.shapes)
 
 
-def _radius(outlines: list[Floats | None], gap_m: float, found: Imported) -> float:
-    """The radius of all links: of the widest one. Assumptions and changes are reported."""
-    radii = [None if points is None else float(np.hypot(points[:, 1], points[:, 2]).max()) for points in outlines]
-    known = [radius for radius in radii if radius is not None]
-    if not known:
-        assumed_m = round(0.35 * gap_m, DIGITS_M)
+def _choose_radius(outlines: list[Floats | None], gap_m: float, found: Imported) -> float:
+    """Return the radius of all links in m: that of the widest one. Assumptions and changes are reported."""
+    radii = {f"link_{i}": _measure_radius(points) for i, points in enumerate(outlines) if points is not None}
+    if not radii:
+        assumed_m = round(ASSUMED_RADIUS_RATIO * gap_m, LENGTH_DIGITS)
         found.assumptions.add(
-            f"no link has geometry; its radius is taken as 0.35 of the joints' distance: {assumed_m:.3g} m"
+            f"no link has geometry; its radius is taken as {ASSUMED_RADIUS_RATIO} of the joints' distance: "
+            f"{assumed_m:.3g} m"
         )
         return assumed_m
-    widest = round(max(known), DIGITS_M)
-    missing = [f"link_{i}" for i, radius in enumerate(radii) if radius is None]
-    narrow = [f"link_{i} ({r * 1e3:.1f} mm)" for i, r in enumerate(radii) if r is not None and r < widest * 0.99]
+    widest_m = round(max(radii.values()), LENGTH_DIGITS)
+    missing = [f"link_{i}" for i, points in enumerate(outlines) if points is None]
     if missing:
-        found.assumptions.add(f"{', '.join(missing)}: no geometry; the radius is the others', {widest * 1e3:.1f} mm")
-    if narrow:
+        found.assumptions.add(f"{', '.join(missing)}: no geometry; the radius is the others', {widest_m * 1e3:.1f} mm")
+    narrower = [f"{name} ({radius * 1e3:.1f} mm)" for name, radius in radii.items() if radius < widest_m * 0.99]
+    if narrower:
         found.changes.add(
-            f"every link is a capsule of {widest * 1e3:.1f} mm, the widest; narrower: {', '.join(narrow)}"
+            f"every link is a capsule of {widest_m * 1e3:.1f} mm, the widest; narrower: {', '.join(narrower)}"
         )
-    return widest
+    return widest_m
 
 
-def _lengths(
+def _measure_radius(points: Floats) -> float:
+    """Return the largest distance of points, (n, 3), from the x axis."""
+    return float(np.hypot(points[:, 1], points[:, 2]).max())
+
+
+def _measure_lengths(
     joints_x: Floats, outlines: list[Floats | None], radius_m: float, found: Imported, row: Row
 ) -> list[float]:
-    """Of every link, in m; the capsules' caps at both ends are not counted."""
-    gaps = [round(float(gap), DIGITS_M) for gap in np.diff(joints_x)]
+    """Return the length of every link in m, without the caps of its capsule. Raises ConfigError for a folded robot."""
+    gaps = [round(float(gap), LENGTH_DIGITS) for gap in np.diff(joints_x)]
     if min(gaps) < 0:
         raise ConfigError("the joints are not in order along the chain at zero angles: it is folded")
     for i, gap in enumerate(gaps):
-        if gap < MIN_GAP_M:
+        if gap < MIN_LENGTH_M:
             found.changes.add(
-                f"joint_{i + 1} and joint_{i + 2} are {gap * 1e3:.2f} mm apart; here {MIN_GAP_M * 1e3:g} mm",
+                f"joint_{i + 1} and joint_{i + 2} are {gap * 1e3:.2f} mm apart; here {MIN_LENGTH_M * 1e3:g} mm",
                 row.joints[i + 1].place("origin"),
             )
-    middle = [max(gap, MIN_GAP_M) for gap in gaps]
+    inner_m = [max(gap, MIN_LENGTH_M) for gap in gaps]
     last = len(outlines) - 1
-    tail_m = _end_length(found, 0, outlines[0], joints_x[0], -1, radius_m, middle)
-    head_m = _end_length(found, last, outlines[last], joints_x[-1], 1, radius_m, middle)
-    return [tail_m, *middle, head_m]
+    tail_m = _measure_end(found, 0, outlines[0], joints_x[0], -1, radius_m, inner_m)
+    head_m = _measure_end(found, last, outlines[last], joints_x[-1], 1, radius_m, inner_m)
+    return [tail_m, *inner_m, head_m]
 
 
-def _end_length(
-    found: Imported, index: int, outline: Floats | None, joint_x: float, outward: int, radius_m: float, middle: Any
+def _measure_end(
+    found: Imported,
+    index: int,
+    outline: Floats | None,
+    joint_x: float,
+    outward: int,
+    radius_m: float,
+    inner_m: list[float],
 ) -> float:
-    """Of tail or head, from its joint to where its cap begins, in m. outward: the sign of x towards its end."""
+    """Return the length in m of the tail or the head, from its joint to where its cap begins.
+
+    Args:
+        found: The import, whose report is extended.
+        index: Index of the link.
+        outline: (n, 3) points of the link in the body frame; None if it has no geometry.
+        joint_x: x of its joint in the body frame.
+        outward: Sign of x towards the end of the robot: -1 at the tail, 1 at the head.
+        radius_m: Radius of all links.
+        inner_m: Lengths of the links between tail and head.
+    """
     if outline is None:
-        assumed_m = round(float(np.mean(middle)) / 2, DIGITS_M)
+        assumed_m = round(float(np.mean(inner_m)) / 2, LENGTH_DIGITS)
         found.assumptions.add(
             f"link_{index} has no geometry; its length is taken as half of the others': {assumed_m:g} m"
         )
         return assumed_m
-    reach = round(float((outward * (outline[:, 0] - joint_x)).max()) - radius_m, DIGITS_M)
-    if reach < MIN_GAP_M:
+    extent_m = float((outward * (outline[:, 0] - joint_x)).max())
+    length_m = round(extent_m - radius_m, LENGTH_DIGITS)
+    if length_m < MIN_LENGTH_M:
         found.changes.add(
-            f"link_{index} ends {(reach + radius_m) * 1e3:.1f} mm from its joint, less than its cap of "
-            f"{radius_m * 1e3:.1f} mm; here {(MIN_GAP_M + radius_m) * 1e3:.1f} mm"
+            f"link_{index} ends {(length_m + radius_m) * 1e3:.1f} mm from its joint, less than its cap of "
+            f"{radius_m * 1e3:.1f} mm; here {(MIN_LENGTH_M + radius_m) * 1e3:.1f} mm"
         )
-        return MIN_GAP_M
-    return reach
+        return MIN_LENGTH_M
+    return length_m
 
 
-def _link(
-    found: Imported, i: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
+def _convert_link(
+    found: Imported, index: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
 ) -> dict[str, Any]:
-    """As in [[links]]; without what is as in its capsule. frame: link_from_root, (4, 4) in m."""
-    mass_places = [mass.place for mass in body.masses]
-    inertia_places = [moments.place for moments in body.inertias]
+    """Return an entry of [[links]], without the values that an evenly filled capsule has anyway.
+
+    Args:
+        found: The import, whose report is extended.
+        index: Index of the link.
+        body: Mass, center of mass and inertia, in the root's frame and the file's unit of length.
+        frame: link_from_root, (4, 4) with lengths in m.
+        length_m: Length of the link.
+        radius_m: Radius of the link.
+        scale: Meters per unit of length of the file.
+    """
     if body.mass_kg < MIN_MASS_KG:
         found.changes.add(
-            f"link_{i} has a mass of {body.mass_kg:g} kg; here {MIN_MASS_KG:g} kg, evenly in its capsule, and the "
+            f"link_{index} has a mass of {body.mass_kg:g} kg; here {MIN_MASS_KG:g} kg, evenly in its capsule, and the "
             f"<origin> and <inertia> of its <inertial> do not count",
-            *mass_places,
+            *[mass.place for mass in body.masses],
         )
         return {"length_m": length_m, "mass_kg": MIN_MASS_KG}
-    turn = frame[:3, :3]
-    center = turn @ body.center * scale + frame[:3, 3]
-    inertia = turn @ body.inertia @ turn.T * scale**2
-    link: dict[str, Any] = {"length_m": length_m, "mass_kg": _digits(body.mass_kg)}
-    least, middle, most = np.linalg.eigvalsh(inertia).tolist()
-    capsule = np.array(capsule_inertia(length_m, radius_m, link["mass_kg"]))
-    dust = 1e-9 * np.abs(inertia).max()  # of turning it
-    moments = np.array([inertia[at] if abs(inertia[at]) > dust else 0.0 for at in PAIRS])
-    if least <= 0 or least + middle < most * (1 - 1e-6):
+    rotation = frame[:3, :3]
+    center_m = rotation @ body.center * scale + frame[:3, 3]
+    inertia = rotation @ body.inertia @ rotation.T * scale**2
+    mass_kg = _round_value(body.mass_kg)
+    capsule = np.array(capsule_inertia(length_m, radius_m, mass_kg))
+    moments = _list_moments(inertia)
+    if not _is_possible_inertia(inertia):
         found.changes.add(
-            f"link_{i} has an inertia that no body has, {', '.join(f'{value:.4g}' for value in moments)} kg·m² (ixx, "
-            f"iyy, izz, ixy, ixz, iyz); here that of its capsule, {', '.join(f'{value:.4g}' for value in capsule[:3])}",
-            *inertia_places,
+            f"link_{index} has an inertia that no body has, {_join_values(moments)} kg·m² (ixx, "
+            f"iyy, izz, ixy, ixz, iyz); here that of its capsule, {_join_values(capsule[:3])}",
+            *[element.place for element in body.inertias],
         )
         moments = capsule
-    evenly = np.allclose(moments, capsule, rtol=1e-6, atol=1e-6 * capsule.max())
-    if not (evenly and np.allclose(center, [length_m / 2, 0, 0], atol=1e-8)):
-        link["center_m"] = [round(float(c), DIGITS_M) + 0.0 for c in center]
-    if not evenly:
-        link["inertia_kg_m2"] = [_digits(float(moment)) for moment in moments]
+
+    link: dict[str, Any] = {"length_m": length_m, "mass_kg": mass_kg}
+    is_even = np.allclose(moments, capsule, rtol=1e-6, atol=1e-6 * capsule.max())
+    is_centered = np.allclose(center_m, [length_m / 2, 0, 0], atol=1e-8)
+    if not (is_even and is_centered):
+        link["center_m"] = [round(float(value), LENGTH_DIGITS) + 0.0 for value in center_m]  # + 0.0: no -0.0
+    if not is_even:
+        link["inertia_kg_m2"] = [_round_value(float(moment)) for moment in moments]
     return link
 
 
-def _digits(value: float) -> float:
-    return float(f"{value:.10g}")
+def _list_moments(inertia: Floats) -> Floats:
+    """Return ixx, iyy, izz, ixy, ixz, iyz of a matrix, (3, 3); the noise of rotating it becomes 0."""
+    noise = 1e-9 * np.abs(inertia).max()
+    return np.array([inertia[index] if abs(inertia[index]) > noise else 0.0 for index in MOMENT_INDICES])
+
+
+def _is_possible_inertia(inertia: Floats) -> bool:
+    """Return whether a body can have this inertia, (3, 3).
+
+    Its principal moments must be positive, and the largest is at most the sum of the two others.
+    """
+    smallest, middle, largest = np.linalg.eigvalsh(inertia).tolist()
+    return smallest > 0 and smallest + middle >= largest * (1 - 1e-6)
+
+
+def _join_values(values: Floats) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
+
+
+def _round_value(value: float) -> float:
+    """Return a number with VALUE_DIGITS significant digits."""
+    return float(f"{value:.{VALUE_DIGITS}g}")
 
 
 def _put_links(table: Table, links: list[dict[str, Any]], axes: list[str], radius_m: float, source: str) -> None:
-    """As [module] alone where the links are a row of equal modules, else as [[links]] too."""
-    period = next(p for p in range(1, len(axes) + 1) if all(axes[i] == axes[i % p] for i in range(len(axes))))
-    middle = links[1:-1]
-    lengths, masses = [link["length_m"] for link in middle], [link["mass_kg"] for link in middle]
-    length_m, mass_kg = (v[0] if len(set(v)) == 1 else _digits(float(np.mean(v))) for v in (lengths, masses))
-    table.put("chain", {"modules": len(axes), "axes": axes[:period]}, source)
+    """Put [chain] and [module]; [[links]] follow unless the links are a row of equal modules."""
+    inner = links[1:-1]
+    length_m = _common_value([link["length_m"] for link in inner])
+    mass_kg = _common_value([link["mass_kg"] for link in inner])
+    table.put("chain", {"modules": len(axes), "axes": axes[: _find_period(axes)]}, source)
     table.put("module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source)
-    shares = [0.5] + [1.0] * len(middle) + [0.5]
-    if not all(_is_fraction(link, share, length_m, mass_kg) for link, share in zip(links, shares, strict=True)):
-        table.put("links", links, source)
+    fractions = [0.5] + [1.0] * len(inner) + [0.5]  # tail and head are half a module each
+    for link, fraction in zip(links, fractions, strict=True):
+        if not _is_fraction(link, fraction, length_m, mass_kg):
+            table.put("links", links, source)
+            return
 
 
-def _is_fraction(link: dict[str, Any], share: float, length_m: float, mass_kg: float) -> bool:
-    same = np.allclose([link["length_m"], link["mass_kg"]], [share * length_m, share * mass_kg], rtol=1e-9)
-    return same and len(link) == 2
+def _find_period(axes: list[str]) -> int:
+    """Return the number of joints after which the order of their axes repeats."""
+    for period in range(1, len(axes)):
+        if all(axes[i] == axes[i % period] for i in range(len(axes))):
+            return period
+    return len(axes)
+
+
+def _common_value(values: list[float]) -> float:
+    """Return the value that all have, or else their mean."""
+    if len(set(values)) == 1:
+        return values[0]
+    return _round_value(float(np.mean(values)))
+
+
+def _is_fraction(link: dict[str, Any], fraction: float, length_m: float, mass_kg: float) -> bool:
+    """Return whether a link is this fraction of a module, and has no other values of its own."""
+    is_same = np.allclose([link["length_m"], link["mass_kg"]], [fraction * length_m, fraction * mass_kg], rtol=1e-9)
+    return is_same and len(link) == 2

@@ -1,4 +1,4 @@
-"""`snakesim robot import` and `snakesim robot export`."""
+"""Runs `snakesim robot import` and `snakesim robot export`."""
 
 from pathlib import Path
 
@@ -23,18 +23,33 @@ HEADS = {
 
 
 def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = False) -> int:
-    """Write a robot file from a URDF, and say what differs. Raises ConfigError."""
+    """Write a robot file from a URDF, and print what differs.
+
+    Args:
+        file: The URDF.
+        order: How to read it.
+        out: The robot file to write; None takes the robot's name.
+        as_json: Print the report as JSON.
+
+    Returns:
+        The exit code, 0.
+
+    Raises:
+        ConfigError: The URDF cannot be imported, or the robot file exists already.
+    """
     found = robot_of(file, order)
     path = out or Path(f"{found.robot.name}.toml")
     _check_new(path, ".toml", file)
     notes = [f"From {file.name}, by `snakesim robot import`."]
     for key, lines in found.report.items():
-        notes += ["", f"{HEADS[key]}:", *(f"  {line}" for line in lines)] if lines else []
+        if lines:
+            notes += ["", f"{HEADS[key]}:"]
+            notes += [f"  {line}" for line in lines]
     write_text(path, toml_of(found.table.values, [printable(note) for note in notes]))
     if as_json:
         say_json({"file": str(path), **found.report})
         return 0
-    shown = _end_of_terminal(notes)
+    shown = _count_shown(notes)
     for note in notes[1:shown]:
         say(note)
     if shown < len(notes):
@@ -49,19 +64,30 @@ def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = 
     return 0
 
 
-def _end_of_terminal(notes: list[str]) -> int:
-    """How many notes the terminal shows: the values of looks, many lines of no consequence, are in the file only."""
+def _count_shown(notes: list[str]) -> int:
+    """Return how many notes the terminal shows. Values that only change the looks are in the file alone."""
     looks = [i for i, note in enumerate(notes) if note.startswith(f"  {LOOKS_HEADING}")]
     return looks[0] + 1 if looks else len(notes)
 
 
 def _whole_length_m(robot: RobotFile) -> float:
-    """From the tip of the tail to the tip of the head, with the rounded caps that `length_m` leaves out."""
+    """Return the length between the tips of tail and head, with the rounded caps that `length_m` leaves out."""
     return robot.length_m + 2 * robot.module.radius_m
 
 
 def export_robot(name: str, out: Path | None) -> int:
-    """Write a URDF from a robot file. Raises ConfigError."""
+    """Write a URDF from a robot file.
+
+    Args:
+        name: Name of a shipped robot, or path of a robot file.
+        out: The URDF to write; None takes the robot's name.
+
+    Returns:
+        The exit code, 0.
+
+    Raises:
+        ConfigError: There is no such robot, or the URDF exists already.
+    """
     robot = decode(read_part(name, "robots"), RobotFile)
     path = out or Path(f"{robot.name}.urdf")
     _check_new(path, ".urdf", None)

@@ -1,4 +1,4 @@
-"""A robot file -> URDF, for RViz, Gazebo and other readers; `snakesim robot import` reads it back without a loss.
+"""Exports a robot file as URDF, for RViz, Gazebo and others. `snakesim robot import` reads it back without a loss.
 
 Links are `link_0` (tail, the root) to the head, joints `joint_1` on. A capsule is written as a cylinder and two
 spheres, since URDF has none. What URDF has no words for follows in <snakesim> elements, which other readers skip.
@@ -18,12 +18,12 @@ from snakesim_operator.features.robots.urdf_sensors import gazebo_lines
 
 GEOMETRY = ("name", "chain", "module", "links")  # what links, joints and the robot's own name say
 AXES = {"yaw": "0 0 1", "pitch": "0 1 0"}
-COLOUR = "0.87 0.45 0.12 1"
-LOOK = f'<material name="orange"><color rgba="{COLOUR}"/></material>'
+COLOR = "0.87 0.45 0.12 1"
+LOOK = f'<material name="orange"><color rgba="{COLOR}"/></material>'
 
 
 def urdf_of(robot: RobotFile) -> str:
-    """The text of the URDF."""
+    """Return the text of the URDF of a robot."""
     lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(robot.name)}>"]
     lines.append(f"  {LOOK}")
     links = robot.links or [
@@ -32,8 +32,8 @@ def urdf_of(robot: RobotFile) -> str:
     ]
     for i, link in enumerate(links):
         if i > 0:
-            lines += _joint(robot, i, links[i - 1].length_m)
-        lines += _link(i, link, robot.module.radius_m)
+            lines += _joint_element(robot, i, links[i - 1].length_m)
+        lines += _link_element(i, link, robot.module.radius_m)
     lines += gazebo_lines(robot)
     for key, value in values_beside_urdf(robot).items():
         lines.append(f"  <snakesim key={quoteattr(key)} value={quoteattr(json.dumps(value, ensure_ascii=False))}/>")
@@ -41,13 +41,13 @@ def urdf_of(robot: RobotFile) -> str:
 
 
 def values_beside_urdf(robot: RobotFile) -> dict[str, Any]:
-    """What URDF has no words for, and what it has words for and only some readers take; by dotted key."""
+    """Return the values that URDF cannot express, or that not all readers of URDF take, by dotted key."""
     rest = {key: value for key, value in msgspec.to_builtins(robot).items() if key not in GEOMETRY}
     return dict(_by_section(rest))
 
 
 def _by_section(values: dict[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value with its dotted key; a list is one value, whatever is in it."""
+    """Yield every value with its dotted key; a list is one value."""
     for key, value in values.items():
         if isinstance(value, dict):
             yield from _by_section(value, f"{within}{key}.")
@@ -55,9 +55,11 @@ def _by_section(values: dict[str, Any], within: str = "") -> Iterator[tuple[str,
             yield f"{within}{key}", value
 
 
-def _joint(robot: RobotFile, number: int, from_rear_m: float) -> list[str]:
+def _joint_element(robot: RobotFile, number: int, from_rear_m: float) -> list[str]:
+    """Return the lines of a joint. from_rear_m: length of the link behind it."""
     joint = robot.joint_table[number - 1]
-    limits, motor = joint.limits, joint.motor
+    limits = joint.limits
+    motor = joint.motor
     return [
         f'  <joint name="joint_{number}" type="revolute">',
         f'    <parent link="link_{number - 1}"/>',
@@ -71,7 +73,8 @@ def _joint(robot: RobotFile, number: int, from_rear_m: float) -> list[str]:
     ]
 
 
-def _link(number: int, link: Link, radius_m: float) -> list[str]:
+def _link_element(number: int, link: Link, radius_m: float) -> list[str]:
+    """Return the lines of a link. Its capsule is written as a cylinder and two spheres."""
     center = " ".join(map(repr, link.center))
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     moments = " ".join(f'{name}="{value!r}"' for name, value in zip(names, link.inertia(radius_m), strict=True))

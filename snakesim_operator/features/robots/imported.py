@@ -1,4 +1,4 @@
-"""What an import of a URDF is asked for, and what it returns: values of a robot file, and a report on all of them."""
+"""The options of an import of a URDF, and its result: values of a robot file, and a report on them."""
 
 import re
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ class Order:
 
     tail: str | None = None  # a link at the tail; none: the root link
     up: str = "z"  # axis of the root link's frame that points up
-    scale: float = 1.0  # metres per unit of length of the file
+    scale: float = 1.0  # meters per unit of length of the file
     like: str = "planar13"  # the robot file with what URDF has no words for
 
 
@@ -33,12 +33,15 @@ class Notes:
         known.extend(place for place in places if place not in known)
 
     def lines(self) -> list[str]:
-        """Every sentence with its places, in the order in which they were added."""
-        return [f"{sentence}: {joined(places)}" if places else sentence for sentence, places in self._places.items()]
+        """Return every sentence with its places, in the order in which they were added."""
+        lines: list[str] = []
+        for sentence, places in self._places.items():
+            lines.append(f"{sentence}: {joined(places)}" if places else sentence)
+        return lines
 
 
 def joined(places: list[str]) -> str:
-    """Places in a row; lines alone share one word, as in `lines 5, 12`."""
+    """Return places as text; if all are lines, they share one word, as in `lines 5, 12`."""
     if len(places) > 1 and all(place.startswith("line ") for place in places):
         return f"lines {', '.join(place.removeprefix('line ') for place in places)}"
     return ", ".join(places)
@@ -46,7 +49,7 @@ def joined(places: list[str]) -> str:
 
 @dataclass
 class Imported:
-    """The values of a robot file, and what to know about them."""
+    """The values of a robot file, and the report on their import."""
 
     table: Table
     names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
@@ -78,7 +81,7 @@ class Imported:
 
     @property
     def report(self) -> dict[str, list[str]]:
-        """All of it, by its heading for scripts."""
+        """All lines of the report, by their heading for scripts."""
         return {
             "names": self.names,
             "changed": self.changed,
@@ -89,12 +92,22 @@ class Imported:
 
     @property
     def robot(self) -> RobotFile:
-        """Checked. Raises ConfigError."""
+        """The checked robot file.
+
+        Raises:
+            ConfigError: A value is not allowed in a robot file.
+        """
         return decode(self.table, RobotFile)
 
-    def plain_name(self, name: str, otherwise: str, element: Element) -> str:
-        """A name as a robot file may have it, reported when it differs. otherwise: instead of an empty one."""
-        allowed = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:40] or otherwise
+    def plain_name(self, name: str, default: str, element: Element) -> str:
+        """Return a name as a robot file may have it. A change is reported.
+
+        Args:
+            name: The name in the URDF.
+            default: Replaces an empty name.
+            element: The element that has the name.
+        """
+        allowed = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:40] or default
         if allowed != name:
             self.changes.add(
                 f"<{element.tag} name> {short(name)!r} became {allowed!r}: letters, digits, _ and -, 40 at most",

@@ -1,9 +1,9 @@
-"""URDF -> the values of a robot file, and a report on everything that was changed, assumed or left out.
+"""Imports a URDF: the values of a robot file, and a report on everything that was changed, assumed or left out.
 
 A robot file is a straight row of links along x, whose joints turn about z (yaw) or y (pitch). So the straight line
 through the joints, at zero angles, becomes x from tail to head, and `up` becomes z. Lengths, masses, inertias, limits
-and friction come from the URDF; what it has no words for from its <snakesim> elements, as `snakesim robot export`
-writes them, or else from another robot file.
+and friction come from the URDF. What URDF cannot express comes from the <snakesim> elements that `snakesim robot
+export` writes, or else from another robot file.
 
 No value of the file is dropped and none is taken from elsewhere without a line in the report. That holds by
 construction: elements and attributes that no function has read are reported (`Element.unused`), and so is every default
@@ -34,9 +34,20 @@ FROM_URDF = ("name", "about", "chain", "module")
 
 
 def robot_of(file: Path, order: Order) -> Imported:
-    """Read a URDF. Raises ConfigError for what is no snake, and for files that are not well formed."""
+    """Read a URDF as the values of a robot file.
+
+    Args:
+        file: Path of the URDF.
+        order: How to read it.
+
+    Returns:
+        The values, and a report on what was changed, assumed and left out.
+
+    Raises:
+        ConfigError: The file is not well formed, is no snake, or has numbers that no robot file may have.
+    """
     if not 1e-6 <= order.scale <= 1e3:
-        raise ConfigError(f"--scale {order.scale:g}: give metres per unit of length of the file, such as 0.001 for mm")
+        raise ConfigError(f"--scale {order.scale:g}: give meters per unit of length of the file, such as 0.001 for mm")
     urdf = parse_xml(read_bytes(file), str(file))
     if urdf.tag != "robot":
         raise urdf.wrong("is no URDF; its outermost element is <robot>")
@@ -50,18 +61,25 @@ def robot_of(file: Path, order: Order) -> Imported:
     if not own:
         put_sensors(found, urdf, row, frames, order.scale)
         _report_values_of_other(found, order)
-    found.table.values = dict(sorted(found.table.values.items(), key=lambda item: SECTIONS.get(item[0], len(SECTIONS))))
+    _sort_sections(found.table)
     robot = found.robot  # raises for numbers that no robot file may hold
     if own:
         _mark_exported(urdf, robot)
     for absence in urdf.absences:
         found.assumptions.add(absence.sentence, f"line {absence.element.line}")
     report_unused(found.omissions, urdf)
-    _doubt_shipped_name(found)
+    _report_shipped_name(found)
     return found
 
 
+def _sort_sections(table: Table) -> None:
+    """Put the sections into the order of a robot file; unknown ones come last."""
+    names = sorted(table.values, key=lambda name: SECTIONS.get(name, len(SECTIONS)))
+    table.values = {name: table.values[name] for name in names}
+
+
 def _put_name(found: Imported, urdf: Element, file: Path) -> None:
+    """Put the name of the robot; without one, that of the file."""
     name = urdf.optional("name")
     if name is None:
         found.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
@@ -69,7 +87,8 @@ def _put_name(found: Imported, urdf: Element, file: Path) -> None:
     found.table.put("name", found.plain_name(name, "robot", urdf), str(file))
 
 
-def _doubt_shipped_name(found: Imported) -> None:
+def _report_shipped_name(found: Imported) -> None:
+    """Report a name that a shipped robot has too."""
     name = found.table.values["name"]
     if name in shipped("robots"):
         found.omissions.add(
@@ -79,7 +98,7 @@ def _doubt_shipped_name(found: Imported) -> None:
 
 
 def _values_of_other(urdf: Element, order: Order) -> Table:
-    """The robot file with what URDF has no words for."""
+    """Return the values of the robot file `--like`, without those that describe that robot only."""
     table = read_part(order.like, "robots")
     for section in OF_ANOTHER_ROBOT:
         table.values.pop(section, None)
@@ -90,16 +109,16 @@ def _values_of_other(urdf: Element, order: Order) -> Table:
 
 
 def _exported_values(urdf: Element) -> Table:
-    """What an export of ours wrote beside the words of URDF."""
+    """Return the values in <snakesim> elements, as an export has written them. Raises ConfigError."""
     table = Table({}, urdf.source)
-    known: set[str] = set()
+    seen: set[str] = set()
     for element in urdf.all("snakesim"):
         key = element.get("key")
         if key.partition(".")[0] in GEOMETRY:
             raise element.wrong(f"has `key` = {short(key)!r}, which links and joints say; remove this element")
-        if key in known:
+        if key in seen:
             raise element.wrong(f"has `key` = {short(key)!r}, as another one has; remove one of them")
-        known.add(key)
+        seen.add(key)
         try:
             table.put(key, json.loads(element.get("value")), urdf.source)
         except ValueError as error:
@@ -108,7 +127,7 @@ def _exported_values(urdf: Element) -> Table:
 
 
 def _report_values_of_other(found: Imported, order: Order) -> None:
-    """Name every value that is as of the robot given by `--like`."""
+    """Report every value that was taken from the robot given by `--like`."""
     for section, values in found.table.values.items():
         if section in FROM_URDF:
             continue
@@ -125,14 +144,22 @@ def _report_values_of_other(found: Imported, order: Order) -> None:
 
 
 def _mark_exported(urdf: Element, robot: RobotFile) -> None:
-    """Mark what `snakesim robot export` derives from the same values; what was edited there is left to be reported."""
-    written = parse_xml("".join(["<robot>", LOOK, *gazebo_lines(robot), "</robot>"]).encode(), urdf.source)
+    """Mark as read what `snakesim robot export` derives from the same values, so that only edits are reported."""
+    text = "".join(["<robot>", LOOK, *gazebo_lines(robot), "</robot>"])
+    exported = parse_xml(text.encode(), urdf.source)
     for child in urdf.children:
-        if any(child.says_the_same_as(one) for one in written.children):
+        if any(child.says_the_same_as(other) for other in exported.children):
             child.read_all()
-    material = written.children[0]
+    exported_material = exported.children[0]
     for link in urdf.children:
-        for look in link.children if link.tag == "link" else []:
-            for child in look.children:
-                if child.tag == "material" and child.attributes == material.attributes and not child.children:
-                    child.read_all()
+        if link.tag != "link":
+            continue
+        for visual_or_collision in link.children:
+            _mark_material(visual_or_collision, exported_material)
+
+
+def _mark_material(parent: Element, exported: Element) -> None:
+    """Mark a reference to the exported material as read."""
+    for child in parent.children:
+        if child.tag == "material" and child.attributes == exported.attributes and not child.children:
+            child.read_all()

@@ -1,4 +1,7 @@
-"""Limits and friction of a URDF's joints: what most of them have holds for all, the others have exceptions."""
+"""Reads limits and friction of a URDF's joints.
+
+The most common value becomes the value of all joints in the robot file; joints with other values have exceptions.
+"""
 
 import math
 from collections import Counter
@@ -13,12 +16,12 @@ from snakesim_operator.features.robots.imported import Imported
 from snakesim_operator.features.robots.urdf_tree import Joint
 from snakesim_operator.features.robots.xml_tree import Element
 
-MAX_LIMIT_RAD = 6.2832  # two half turns; what is more has been written in degrees
+MAX_LIMIT_RAD = 6.2832  # one revolution; a larger number must be in degrees
 
 
 @dataclass(frozen=True)
 class JointNumber:
-    """A number that URDF has for a joint, and where a robot file keeps it."""
+    """A number that a URDF has for a joint, and its place in a robot file."""
 
     tag: str
     attribute: str
@@ -26,12 +29,12 @@ class JointNumber:
     key: str
     unit: str
     maximum: float  # as in snakesim_hal.model.joints
-    usual: float  # more is no error, and worth a question
-    other_unit: str  # in which it is written by mistake
+    usual: float  # a larger one is allowed, and reported as doubtful
+    other_unit: str  # in which it is often written by mistake
 
     @property
     def is_limit(self) -> bool:
-        """Whether it bounds what a motor does. Such a number is above 0; friction and damping may be 0."""
+        """Whether the number limits the motor. A limit must be above 0; friction and damping may be 0."""
         return self.section == "limits"
 
 
@@ -44,32 +47,42 @@ NUMBERS = (
 
 
 @dataclass(frozen=True)
-class Turning:
-    """How far a joint turns, by our sign."""
+class AngleRange:
+    """The range of a joint, by the robot file's sign."""
 
     lower_rad: float
     upper_rad: float
 
 
 def put_limits(found: Imported, joints: list[Joint], source: str, *, own: bool) -> None:
-    """Put what the joints say into a robot file's values. Raises ConfigError.
+    """Put limits and friction into the values of a robot file.
 
-    own: the values are those of the same robot, as exported. Then only what the joints say otherwise is put.
+    Args:
+        found: The import, whose values and report are extended.
+        joints: The joints, tail to head.
+        source: The file, for error messages.
+        own: Whether the values so far are those of the same robot, as it was exported. Then only differences are put.
+
+    Raises:
+        ConfigError: A number is out of its range.
     """
-    angles = [_read_turning(found, joint, negated) for joint, negated in zip(joints, found.negated, strict=True)]
+    ranges = [_read_range(found, joint, negated) for joint, negated in zip(joints, found.negated, strict=True)]
     if not own:
-        _put_common_angles(found, angles, source)
+        _put_common_range(found, ranges, source)
     built = decode(found.table, RobotFile).joint_table
-    columns = {number.key: _complete(found, number, joints, built, own=own) for number in NUMBERS}
+    columns = {number.key: _complete_column(found, number, joints, built, own=own) for number in NUMBERS}
     if not own:
         for number in NUMBERS:
             [(common, _)] = Counter(columns[number.key]).most_common(1)
             found.table.put(f"{number.section}.{number.key}", common, source)
-    _put_exceptions(found, joints, angles, columns, source)
+    _put_exceptions(found, joints, ranges, columns, source)
 
 
-def _read_turning(found: Imported, joint: Joint, negated: bool) -> Turning:
-    """As the URDF says, at most half a turn to either side. negated: our angle is minus the URDF's."""
+def _read_range(found: Imported, joint: Joint, negated: bool) -> AngleRange:
+    """Return the range of a joint, at most half a revolution to either side. Raises ConfigError.
+
+    negated: whether the robot file's angle is minus the URDF's.
+    """
     element = joint.element
     if element.attributes["type"] == "continuous":
         found.changes.add(
@@ -77,7 +90,7 @@ def _read_turning(found: Imported, joint: Joint, negated: bool) -> Turning:
             f"`cable_turns`",
             joint.place(),
         )
-        return Turning(-MAX_TURN_RAD, MAX_TURN_RAD)
+        return AngleRange(-MAX_TURN_RAD, MAX_TURN_RAD)
     limit = element.first("limit")
     if limit is None:
         raise element.wrong("is revolute and has no <limit>; add lower and upper, in rad")
@@ -88,36 +101,46 @@ def _read_turning(found: Imported, joint: Joint, negated: bool) -> Turning:
             f"of joint {joint.name!r} is {lower:g} to {upper:g} rad; a joint must be able to turn to either side of "
             f"zero: `lower` below 0, `upper` above 0"
         )
-    return Turning(-upper, -lower) if negated else Turning(lower, upper)
+    if negated:
+        return AngleRange(-upper, -lower)
+    return AngleRange(lower, upper)
 
 
 def _read_limit_rad(found: Imported, joint: Joint, limit: Element, attribute: str) -> float:
-    """One side of the range, cut to half a turn; the cut is reported."""
-    said = limit.number(attribute, "0")
-    if abs(said) > MAX_LIMIT_RAD:
-        radians = math.radians(said)
+    """Return one side of the range, cut to half a revolution. The cut is reported. Raises ConfigError."""
+    given = limit.number(attribute, "0")
+    if abs(given) > MAX_LIMIT_RAD:
+        radians = math.radians(given)
         raise limit.wrong(
-            f"of joint {joint.name!r} has `{attribute}` = {said:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at most. "
+            f"of joint {joint.name!r} has `{attribute}` = {given:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at most. "
             f"URDF has radians: if this is in degrees, write {radians:.5g}. A joint without end stops has "
             f'type="continuous"'
         )
-    if abs(said) <= MAX_TURN_RAD:
-        return said
-    cut = MAX_TURN_RAD if said > 0 else -MAX_TURN_RAD
+    if abs(given) <= MAX_TURN_RAD:
+        return given
+    cut = MAX_TURN_RAD if given > 0 else -MAX_TURN_RAD
     found.changes.add(
-        f"`{attribute}` = {said:g} rad became {cut:g} rad, half a turn, which is the most that a robot file has; if "
+        f"`{attribute}` = {given:g} rad became {cut:g} rad, half a turn, which is the most that a robot file has; if "
         f"these are degrees, write radians",
         joint.place("limit"),
     )
     return cut
 
 
-def _complete(
+def _complete_column(
     found: Imported, number: JointNumber, joints: Sequence[Joint], built: Sequence[BuiltJoint], *, own: bool
 ) -> list[float]:
-    """This number of every joint, tail to head, with an assumption, which is reported, where the file says none.
+    """Return a number of every joint, tail to head. Where the file gives none, a value is assumed and reported.
 
-    built: the joints by the values so far, which are those of the same robot (own), or else of `--like`.
+    Args:
+        found: The import, whose report is extended.
+        number: Which number.
+        joints: The joints of the URDF.
+        built: The joints by the values so far: of the same robot if `own`, otherwise of the robot `--like`.
+        own: Whether the values so far are those of the same robot.
+
+    Raises:
+        ConfigError: A joint has no motor, while others have one.
     """
     given = [_read_number(found, number, joint) for joint in joints]
     known = [value for value in given if value]
@@ -127,11 +150,11 @@ def _complete(
             completed.append(value)
             continue
         if value is not None and known:
-            raise _as_motorless(number, joint, max(known))
+            raise _motorless_error(number, joint, max(known))
         assumed, origin = _assume(number, as_built, known, own=own)
-        said = "no value" if value is None else f"{value:g}"
+        given_text = "no value" if value is None else f"{value:g}"
         found.assumptions.add(
-            f"<{number.tag} {number.attribute}> has {said}: {assumed:g} {number.unit}, {origin}",
+            f"<{number.tag} {number.attribute}> has {given_text}: {assumed:g} {number.unit}, {origin}",
             joint.place(number.tag),
         )
         completed.append(assumed)
@@ -139,8 +162,9 @@ def _complete(
 
 
 def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, own: bool) -> tuple[float, str]:
-    """The value for a joint that says none, and where it is from."""
-    kept = getattr(built.limits if number.is_limit else built.motor, number.key)
+    """Return the value for a joint for which the file gives none, and the origin of this value."""
+    section = built.limits if number.is_limit else built.motor
+    kept = getattr(section, number.key)
     if own:
         return kept, f"as its <snakesim> element says of {number.section}.{number.key}"
     if not number.is_limit:
@@ -150,7 +174,7 @@ def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, o
     return kept, "as of the robot given by --like, because no joint says one"
 
 
-def _as_motorless(number: JointNumber, joint: Joint, other: float) -> Exception:
+def _motorless_error(number: JointNumber, joint: Joint, other: float) -> Exception:
     limit = joint.element.first("limit") or joint.element
     return limit.wrong(
         f"of joint {joint.name!r} has `{number.attribute}` = 0 {number.unit}, and other joints have up to {other:g}: a "
@@ -160,15 +184,15 @@ def _as_motorless(number: JointNumber, joint: Joint, other: float) -> Exception:
 
 
 def _read_number(found: Imported, number: JointNumber, joint: Joint) -> float | None:
-    """As the file says, checked; None when it says nothing."""
+    """Return a number of a joint, or None if the file gives none. Raises ConfigError for one out of its range."""
     element = joint.element.first(number.tag)
     if element is None or number.attribute not in element.attributes:
         return None
     value = element.number(number.attribute)
     if not 0 <= value <= number.maximum:
-        least = "above 0" if number.is_limit else "0 or more"
+        bound = "above 0" if number.is_limit else "0 or more"
         raise element.wrong(
-            f"of joint {joint.name!r} has `{number.attribute}` = {value:g} {number.unit}; expected {least} and at most "
+            f"of joint {joint.name!r} has `{number.attribute}` = {value:g} {number.unit}; expected {bound} and at most "
             f"{number.maximum:g} {number.unit}. Is it in {number.other_unit}, or does it stand for no limit?"
         )
     if value > number.usual:
@@ -179,10 +203,10 @@ def _read_number(found: Imported, number: JointNumber, joint: Joint) -> float | 
     return value
 
 
-def _put_common_angles(found: Imported, angles: list[Turning], source: str) -> None:
-    """`angle_rad`, and the sides where they differ."""
+def _put_common_range(found: Imported, ranges: list[AngleRange], source: str) -> None:
+    """Put the most common range: `angle_rad`, and the other side if the range is not symmetric."""
     table = found.table
-    common = Counter(angles).most_common(1)[0][0]
+    common = Counter(ranges).most_common(1)[0][0]
     limits = table.values.get("limits", {})
     for side in ("angle_min_rad", "angle_max_rad"):
         limits.pop(side, None)
@@ -194,21 +218,30 @@ def _put_common_angles(found: Imported, angles: list[Turning], source: str) -> N
 
 
 def _put_exceptions(
-    found: Imported, joints: list[Joint], angles: list[Turning], columns: dict[str, list[float]], source: str
+    found: Imported, joints: list[Joint], ranges: list[AngleRange], columns: dict[str, list[float]], source: str
 ) -> None:
-    """What differs in one joint from the sections for all."""
-    differ: dict[str, list[str]] = {}
+    """Put what differs in one joint from the sections for all joints.
+
+    Args:
+        found: The import, whose values and report are extended.
+        joints: The joints of the URDF, tail to head.
+        ranges: Their ranges.
+        columns: Their other numbers, by the key of the robot file.
+        source: The file, for error messages.
+    """
+    differences: dict[str, list[str]] = {}
     for i, built in enumerate(decode(found.table, RobotFile).joint_table):
-        wanted = [
-            ("angle_min_rad", angles[i].lower_rad, built.limits.lower_rad, "rad"),
-            ("angle_max_rad", angles[i].upper_rad, built.limits.upper_rad, "rad"),
+        compared = [
+            ("angle_min_rad", ranges[i].lower_rad, built.limits.lower_rad, "rad"),
+            ("angle_max_rad", ranges[i].upper_rad, built.limits.upper_rad, "rad"),
         ]
         for number in NUMBERS:
             section = built.limits if number.is_limit else built.motor
-            wanted.append((number.key, columns[number.key][i], getattr(section, number.key), number.unit))
-        for key, theirs, ours, unit in wanted:
-            if theirs != ours:
-                found.table.put(f"joints.{built.name}.{key}", theirs, source)
-                differ.setdefault(key, []).append(f"{built.name} ({joints[i].name}) {theirs:g} {unit}")
-    for key, values in differ.items():
+            compared.append((number.key, columns[number.key][i], getattr(section, number.key), number.unit))
+        for key, in_urdf, in_sections, unit in compared:
+            if in_urdf == in_sections:
+                continue
+            found.table.put(f"joints.{built.name}.{key}", in_urdf, source)
+            differences.setdefault(key, []).append(f"{built.name} ({joints[i].name}) {in_urdf:g} {unit}")
+    for key, values in differences.items():
         found.changes.add(f"{key} differs from that of the others: {', '.join(values)}")

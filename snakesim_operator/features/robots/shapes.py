@@ -1,4 +1,4 @@
-"""Shapes of a URDF as points whose hull holds them: box, cylinder, capsule, sphere and mesh."""
+"""Reads the shapes of a URDF as points whose convex hull encloses them: box, cylinder, capsule, sphere and mesh."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from snakesim_operator.features.robots.imported import Notes
 from snakesim_operator.features.robots.meshes import find_mesh, vertices
 from snakesim_operator.features.robots.xml_tree import Element
 
-RIM = 32  # points of a cylinder's rim
+RIM_POINTS = 32  # of a cylinder
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,11 @@ class Shape:
 
 
 def read_shape(element: Element) -> Shape:
-    """Read a shape. Raises ConfigError for an unknown one, and for a size that is zero or negative."""
+    """Read a shape.
+
+    Raises:
+        ConfigError: The shape is unknown, or a size is zero or negative.
+    """
     match element.tag:
         case "box":
             return Shape("box", _positive(element, "size", element.numbers("size", 3)))
@@ -37,7 +41,7 @@ def read_shape(element: Element) -> Shape:
             return Shape("sphere", _positive(element, "radius", [element.number("radius")]))
         case "mesh":
             scale = element.numbers("scale", 3, "1 1 1")
-            if not all(1e-12 < abs(one) < 1e12 for one in scale):
+            if not all(1e-12 < abs(factor) < 1e12 for factor in scale):
                 raise element.wrong(f"has `scale` = {element.get('scale')!r}; expected factors that are not 0")
             return Shape("mesh", scale, element.get("filename"))
         case _:
@@ -45,7 +49,17 @@ def read_shape(element: Element) -> Shape:
 
 
 def outline(shape: Shape, element: Element, file: Path, omissions: Notes) -> Floats | None:
-    """Points whose hull holds a shape, in its frame, (n, 3); None for a mesh that cannot be read, which is reported."""
+    """Return points whose convex hull encloses a shape.
+
+    Args:
+        shape: The shape.
+        element: Its element, for the report.
+        file: The URDF, from which mesh files are looked for.
+        omissions: Gets a note when a mesh file cannot be read.
+
+    Returns:
+        (n, 3) points in the shape's frame, in the file's unit of length; None for a mesh that cannot be read.
+    """
     match shape.kind:
         case "box":
             corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -60,25 +74,40 @@ def outline(shape: Shape, element: Element, file: Path, omissions: Notes) -> Flo
 
 
 def _positive(element: Element, attribute: str, sizes: list[float]) -> list[float]:
+    """Return the sizes. Raises ConfigError unless all of them are above 0."""
     if not all(0 < size < 1e9 for size in sizes):
         raise element.wrong(f"has `{attribute}` = {element.get(attribute)!r}; expected sizes above 0")
     return sizes
 
 
-def _tube(radius: float, half: float, *, with_caps: bool) -> Floats:
-    turn = np.arange(RIM) * 2 * math.pi / RIM
-    rim = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.full(RIM, half)])
-    tips = [[0, 0, half + radius], [0, 0, -half - radius]] if with_caps else np.empty((0, 3))
-    return np.vstack([rim, rim * [1, 1, -1], tips])
+def _circle() -> tuple[Floats, Floats]:
+    """Return cosines and sines of RIM_POINTS angles around a circle."""
+    angles_rad = np.arange(RIM_POINTS) * 2 * math.pi / RIM_POINTS
+    return np.cos(angles_rad), np.sin(angles_rad)
+
+
+def _tube(radius: float, half_length: float, *, with_caps: bool) -> Floats:
+    """Return both rims of a cylinder along z; with caps also the tips of a capsule."""
+    cosines, sines = _circle()
+    upper_rim = np.column_stack([radius * cosines, radius * sines, np.full(RIM_POINTS, half_length)])
+    lower_rim = upper_rim * [1, 1, -1]
+    if not with_caps:
+        return np.vstack([upper_rim, lower_rim])
+    tip = half_length + radius
+    return np.vstack([upper_rim, lower_rim, [[0, 0, tip], [0, 0, -tip]]])
 
 
 def _ball(radius: float) -> Floats:
-    turn = np.arange(RIM) * 2 * math.pi / RIM
-    ring = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(RIM)])
-    return radius * np.vstack([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
+    """Return three great circles of a sphere."""
+    cosines, sines = _circle()
+    in_xy = np.column_stack([cosines, sines, np.zeros(RIM_POINTS)])
+    in_xz = in_xy[:, [0, 2, 1]]
+    in_yz = in_xy[:, [2, 0, 1]]
+    return radius * np.vstack([in_xy, in_xz, in_yz])
 
 
 def _mesh(shape: Shape, element: Element, file: Path, omissions: Notes) -> Floats | None:
+    """Return the vertices of a mesh file, or None, with a note, if it cannot be read."""
     path = find_mesh(shape.mesh, file)
     try:
         if path is None:

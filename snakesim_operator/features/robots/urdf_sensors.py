@@ -1,7 +1,7 @@
-"""Sensors in Gazebo's words, as URDF files carry them: <gazebo reference="LINK"><sensor type="..."> both ways.
+"""Reads and writes the sensors of a URDF: <gazebo reference="LINK"><sensor type="...">, as Gazebo defines them.
 
-IMU, contacts, depth cameras and lidars. A robot file's IMU and contact sensors are on every link, so that one of them
-in the URDF stands for all. What a sensor says that a robot file has no words for is left unread, and so is reported.
+These are IMUs, contact sensors, depth cameras and lidars. The IMU and the contact sensor of a robot file are on every
+link, so one of them in the URDF stands for all. Values that a robot file cannot hold are not read, and so reported.
 """
 
 import math
@@ -13,47 +13,63 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import short
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.sensors import DepthCamera
+from snakesim_hal.model.sensors import DepthCamera, RangeSensor
 from snakesim_operator.features.robots.imported import Imported
 from snakesim_operator.features.robots.urdf_tree import Row, rotation
 from snakesim_operator.features.robots.xml_tree import Element
 
-EVERYWHERE = {"imu": "imu", "contact": "contacts"}  # kind of Gazebo -> its section in [sensors]
-DEPTH = ("depth", "depth_camera", "rgbd_camera")
-RANGE = ("ray", "gpu_ray", "lidar", "gpu_lidar")
-MAX_ROLL_RAD = 0.01
+ON_EVERY_LINK = {"imu": "imu", "contact": "contacts"}  # Gazebo's type -> its section in [sensors]
+DEPTH_TYPES = ("depth", "depth_camera", "rgbd_camera")
+RANGE_TYPES = ("ray", "gpu_ray", "lidar", "gpu_lidar")
+MAX_ROLL_RAD = 0.01  # about the viewing direction; more is reported
+POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms
 DEFAULT_RATE_HZ = {"imu": 100.0, "contacts": 100.0, "depth": 20.0, "range": 20.0}  # as in snakesim_hal.model.sensors
 
 
 def put_sensors(found: Imported, urdf: Element, row: Row, frames: list[Floats], scale: float) -> None:
-    """Put a URDF's sensors into a robot file's values. frames: link_from_root (4, 4) of every link, in m."""
-    link_of = {name: i for i, body in enumerate(row.bodies) for name in body.links}
+    """Put the sensors of a URDF into the values of a robot file.
+
+    Args:
+        found: The import, whose values and report are extended.
+        urdf: The root element of the URDF.
+        row: Bodies and joints of the URDF, tail to head.
+        frames: link_from_root, (4, 4) with lengths in m, of every link.
+        scale: Meters per unit of length of the file.
+
+    Raises:
+        ConfigError: A value of a sensor is wrong.
+    """
+    link_indices = {name: i for i, body in enumerate(row.bodies) for name in body.links}
     for gazebo in urdf.all("gazebo"):
         reference = gazebo.attributes.get("reference", "")
         for sensor in gazebo.all("sensor"):
             kind = sensor.attributes.get("type", "")
-            if kind in EVERYWHERE:
+            if kind in ON_EVERY_LINK:
                 gazebo.optional("reference")
-                _put_everywhere(found, sensor, EVERYWHERE[kind], reference)
-            elif kind in (*DEPTH, *RANGE) and reference in link_of:
+                _put_on_every_link(found, sensor, ON_EVERY_LINK[kind], reference)
+            elif kind in (*DEPTH_TYPES, *RANGE_TYPES) and reference in link_indices:
                 gazebo.optional("reference")
-                link = link_of[reference]
-                root_from_link = row.bodies[link].frames[reference]
-                link_from_here = frames[link] @ _in_metres(root_from_link, scale)
-                _put_mounted(found, sensor, link, link_from_here, scale)
+                link = link_indices[reference]
+                root_from_reference = _scale_lengths(row.bodies[link].frames[reference], scale)
+                link_from_reference = frames[link] @ root_from_reference
+                _put_on_one_link(found, sensor, link, link_from_reference, scale)
             else:
                 sensor.read = False
-                known = ", ".join((*EVERYWHERE, *DEPTH, *RANGE))
-                found.omissions.add(
-                    f"a sensor whose `type` is {short(kind)!r}, in an element whose `reference` is "
-                    f"{short(reference)!r}, left out: a robot file has {known}, on a link",
-                    f"line {sensor.line}",
-                    f"line {gazebo.line}",
-                )
+                _report_other_sensor(found, gazebo, sensor, kind, reference)
 
 
-def _put_everywhere(found: Imported, sensor: Element, section: str, reference: str) -> None:
-    """An IMU or a contact sensor: with one of them every link has one."""
+def _report_other_sensor(found: Imported, gazebo: Element, sensor: Element, kind: str, reference: str) -> None:
+    known = ", ".join((*ON_EVERY_LINK, *DEPTH_TYPES, *RANGE_TYPES))
+    found.omissions.add(
+        f"a sensor whose `type` is {short(kind)!r}, in an element whose `reference` is "
+        f"{short(reference)!r}, left out: a robot file has {known}, on a link",
+        f"line {sensor.line}",
+        f"line {gazebo.line}",
+    )
+
+
+def _put_on_every_link(found: Imported, sensor: Element, section: str, reference: str) -> None:
+    """Put an IMU or a contact sensor."""
     sensor.optional("type")
     name = sensor.optional("name") or ""
     found.changes.add(
@@ -61,81 +77,91 @@ def _put_everywhere(found: Imported, sensor: Element, section: str, reference: s
         f"and has no name",
         sensor.place,
     )
-    rate_hz = _rate_hz(found, sensor, section)
-    listed = found.table.values.get("sensors", {}).get(section) or {}
-    found.table.put(f"sensors.{section}", listed | rate_hz, sensor.source)
+    rate = _read_rate(found, sensor, section)
+    existing = found.table.values.get("sensors", {}).get(section) or {}
+    found.table.put(f"sensors.{section}", existing | rate, sensor.source)
 
 
-def _put_mounted(found: Imported, sensor: Element, link: int, link_from_here: Floats, scale: float) -> None:
-    """A camera or a lidar, at its place on a link."""
+def _put_on_one_link(found: Imported, sensor: Element, link: int, link_from_reference: Floats, scale: float) -> None:
+    """Put a camera or a lidar at its place on a link."""
     kind = sensor.get("type")
-    group = "depth" if kind in DEPTH else "range"
+    section = "depth" if kind in DEPTH_TYPES else "range"
     name = sensor.get("name", "sensor")
-    values: dict[str, Any] = _rate_hz(found, sensor, group)
+    values: dict[str, Any] = _read_rate(found, sensor, section)
     values["name"] = found.plain_name(name, "sensor", sensor)
     values["link"] = link
-    pose = link_from_here @ _in_metres(_pose(sensor), scale)
-    values |= _place(found, pose, sensor)
-    if group == "depth":
-        values |= _camera(found, sensor)
+    reference_from_sensor = _scale_lengths(_read_pose(sensor), scale)
+    values |= _convert_pose(found, link_from_reference @ reference_from_sensor, sensor)
+    if section == "depth":
+        values |= _read_camera(found, sensor)
     else:
-        values |= _lidar(found, sensor, values)
-    listed = found.table.values.get("sensors", {}).get(group, [])
-    found.table.put(f"sensors.{group}", [*listed, values], sensor.source)
+        values |= _read_lidar(found, sensor, values["yaw_rad"])
+    existing = found.table.values.get("sensors", {}).get(section, [])
+    found.table.put(f"sensors.{section}", [*existing, values], sensor.source)
 
 
-def _rate_hz(found: Imported, sensor: Element, group: str) -> dict[str, Any]:
-    """Its rate; without one, or with 0, that of the robot file holds, which is reported."""
-    said = sensor.first("update_rate")
-    rate_hz = 0.0 if said is None else said.text_numbers(1)[0]
+def _read_rate(found: Imported, sensor: Element, section: str) -> dict[str, Any]:
+    """Return `rate_hz` of a sensor; nothing if the file gives none or 0. Then the robot file's rate is reported."""
+    element = sensor.first("update_rate")
+    rate_hz = 0.0 if element is None else element.text_numbers(1)[0]
     if rate_hz < 0:
         raise sensor.wrong(f"has <update_rate> {rate_hz:g} Hz; expected a number above 0")
     if rate_hz > 0:
         return {"rate_hz": rate_hz}
-    listed = found.table.values.get("sensors", {}).get(group)
-    kept = listed.get("rate_hz") if isinstance(listed, dict) else None
-    shown = DEFAULT_RATE_HZ[group] if kept is None else kept
-    words = "no value" if said is None else "0"
-    place = sensor.line if said is None else said.line
-    found.assumptions.add(f"<sensor><update_rate> has {words}: {shown:g} Hz", f"line {place}")
+    existing = found.table.values.get("sensors", {}).get(section)
+    kept_hz = existing.get("rate_hz") if isinstance(existing, dict) else None
+    assumed_hz = DEFAULT_RATE_HZ[section] if kept_hz is None else kept_hz
+    if element is None:
+        found.assumptions.add(f"<sensor><update_rate> has no value: {assumed_hz:g} Hz", f"line {sensor.line}")
+    else:
+        found.assumptions.add(f"<sensor><update_rate> has 0: {assumed_hz:g} Hz", f"line {element.line}")
     return {}
 
 
-def _pose(sensor: Element) -> Floats:
+def _read_pose(sensor: Element) -> Floats:
+    """Return the pose of a sensor in the frame of its link, (4, 4), in the file's unit of length."""
     element = sensor.first("pose")
-    placed = np.eye(4)
+    frame = np.eye(4)
     if element is None:
         sensor.note_absent("<pose>", "0 0 0 0 0 0")
-        return placed
-    *place, roll, pitch, yaw = element.text_numbers(6)
-    placed[:3, :3] = rotation(roll, pitch, yaw)
-    placed[:3, 3] = place
-    return placed
+        return frame
+    *position, roll, pitch, yaw = element.text_numbers(6)
+    frame[:3, :3] = rotation(roll, pitch, yaw)
+    frame[:3, 3] = position
+    return frame
 
 
-def _in_metres(frame: Floats, scale: float) -> Floats:
+def _scale_lengths(frame: Floats, scale: float) -> Floats:
+    """Return a frame, (4, 4), with its translation in m."""
     scaled = frame.copy()
     scaled[:3, 3] *= scale
     return scaled
 
 
-def _place(found: Imported, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
-    turn = link_from_sensor[:3, :3]
-    roll = math.atan2(turn[2, 1], turn[2, 2])
-    if abs(roll) > MAX_ROLL_RAD:
+def _convert_pose(found: Imported, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
+    """Return a pose, (4, 4), as position, yaw and pitch. A roll is reported, because a robot file has none."""
+    matrix = link_from_sensor[:3, :3]
+    roll_rad = math.atan2(matrix[2, 1], matrix[2, 2])
+    if abs(roll_rad) > MAX_ROLL_RAD:
         name = sensor.attributes.get("name", "")
         found.omissions.add(
-            f"sensor {short(name)!r} is rolled by {roll:.2f} rad about its viewing direction; a robot file has no roll",
+            f"sensor {short(name)!r} is rolled by {roll_rad:.2f} rad about its viewing direction; a robot file has no "
+            f"roll",
             f"line {sensor.line}",
         )
+    yaw_rad = math.atan2(matrix[1, 0], matrix[0, 0])
+    sine = max(-1.0, min(1.0, float(matrix[2, 0])))  # rounding may exceed 1
+    pitch_rad = -math.asin(sine)
+    # Adding 0.0 turns -0.0 into 0.0.
     return {
-        "position_m": [round(float(x), 9) + 0.0 for x in link_from_sensor[:3, 3]],
-        "yaw_rad": round(math.atan2(turn[1, 0], turn[0, 0]), 9) + 0.0,
-        "pitch_rad": round(-math.asin(max(-1.0, min(1.0, float(turn[2, 0])))), 9) + 0.0,
+        "position_m": [round(float(value), POSE_DIGITS) + 0.0 for value in link_from_sensor[:3, 3]],
+        "yaw_rad": round(yaw_rad, POSE_DIGITS) + 0.0,
+        "pitch_rad": round(pitch_rad, POSE_DIGITS) + 0.0,
     }
 
 
-def _camera(found: Imported, sensor: Element) -> dict[str, Any]:
+def _read_camera(found: Imported, sensor: Element) -> dict[str, Any]:
+    """Return color, field of view, size, range and noise of a depth camera."""
     values: dict[str, Any] = {"color": sensor.attributes["type"] == "rgbd_camera"}
     camera = sensor.first("camera")
     if camera is None:
@@ -146,13 +172,18 @@ def _camera(found: Imported, sensor: Element) -> dict[str, Any]:
     if image is None:
         camera.note_absent("<image>", "160 x 120 pixels")
     else:
-        values["width"] = _whole_number(image, "width", 160)
-        values["height"] = _whole_number(image, "height", 120)
-    return values | _range(camera, "clip", "near", "far", "0.1 to 5 m") | _noise(found, camera)
+        values["width"] = _read_whole_number(image, "width", 160)
+        values["height"] = _read_whole_number(image, "height", 120)
+    values |= _read_range(camera, "clip", "near", "far", "0.1 to 5 m")
+    values |= _read_noise(found, camera)
+    return values
 
 
-def _lidar(found: Imported, sensor: Element, placed: dict[str, Any]) -> dict[str, Any]:
-    """placed: its values so far. A scan that is not symmetric turns the sensor, which has no angle to begin with."""
+def _read_lidar(found: Imported, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+    """Return beams, field of view, range and noise of a lidar.
+
+    A robot file's scan is symmetric about the viewing direction, so another scan also changes the sensor's yaw.
+    """
     lidar = sensor.first("ray") or sensor.first("lidar")
     if lidar is None:
         sensor.note_absent("<lidar>", "one beam, from 0.02 to 5 m")
@@ -163,94 +194,122 @@ def _lidar(found: Imported, sensor: Element, placed: dict[str, Any]) -> dict[str
     if horizontal is None:
         lidar.note_absent("<scan><horizontal>", "one beam")
     else:
-        beams = _whole_number(horizontal, "samples", 1)
-        first_rad = horizontal.text_number("min_angle", 0.0)
-        last_rad = horizontal.text_number("max_angle", 0.0)
-        middle_rad = (first_rad + last_rad) / 2
-        values["beams"] = beams
-        values["fov_rad"] = last_rad - first_rad if beams > 1 else 0.0
-        if abs(middle_rad) > 1e-9:
-            values["yaw_rad"] = round(placed["yaw_rad"] + middle_rad, 9)
-            found.changes.add(
-                f"<min_angle> {first_rad:g} and <max_angle> {last_rad:g} rad are not symmetric: the sensor is turned "
-                f"by {middle_rad:g} rad",
-                f"line {horizontal.line}",
-            )
-        if beams == 1 and last_rad != first_rad:
-            found.changes.add(
-                f"<samples> 1 from {first_rad:g} to {last_rad:g} rad: one beam in the middle", f"line {horizontal.line}"
-            )
-    return values | _range(lidar, "range", "min", "max", "0.02 to 5 m") | _noise(found, lidar)
+        values |= _read_scan(found, horizontal, mounted_yaw_rad)
+    values |= _read_range(lidar, "range", "min", "max", "0.02 to 5 m")
+    values |= _read_noise(found, lidar)
+    return values
 
 
-def _whole_number(element: Element, tag: str, default: int) -> int:
-    """The number in a child. Raises ConfigError for a fraction."""
+def _read_scan(found: Imported, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+    """Return beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric."""
+    beams = _read_whole_number(horizontal, "samples", 1)
+    first_rad = horizontal.text_number("min_angle", 0.0)
+    last_rad = horizontal.text_number("max_angle", 0.0)
+    middle_rad = (first_rad + last_rad) / 2
+    values: dict[str, Any] = {"beams": beams, "fov_rad": last_rad - first_rad if beams > 1 else 0.0}
+    if abs(middle_rad) > 1e-9:
+        values["yaw_rad"] = round(mounted_yaw_rad + middle_rad, POSE_DIGITS)
+        found.changes.add(
+            f"<min_angle> {first_rad:g} and <max_angle> {last_rad:g} rad are not symmetric: the sensor is turned "
+            f"by {middle_rad:g} rad",
+            f"line {horizontal.line}",
+        )
+    if beams == 1 and last_rad != first_rad:
+        found.changes.add(
+            f"<samples> 1 from {first_rad:g} to {last_rad:g} rad: one beam in the middle", f"line {horizontal.line}"
+        )
+    return values
+
+
+def _read_whole_number(element: Element, tag: str, default: int) -> int:
+    """Return the number in a child. Raises ConfigError for a fraction."""
     value = element.text_number(tag, default)
     if value != int(value):
         raise element.wrong(f"has <{tag}> {value:g}; expected a whole number")
     return int(value)
 
 
-def _range(owner: Element, tag: str, least: str, most: str, otherwise: str) -> dict[str, Any]:
+def _read_range(owner: Element, tag: str, min_tag: str, max_tag: str, default: str) -> dict[str, Any]:
+    """Return the range of a sensor in m. default: words for the range that is assumed if the file gives none."""
     element = owner.first(tag)
     if element is None:
-        owner.note_absent(f"<{tag}>", otherwise)
+        owner.note_absent(f"<{tag}>", default)
         return {}
-    return {"range_min_m": element.text_number(least, 0.1), "range_max_m": element.text_number(most, 5.0)}
+    return {"range_min_m": element.text_number(min_tag, 0.1), "range_max_m": element.text_number(max_tag, 5.0)}
 
 
-def _noise(found: Imported, element: Element) -> dict[str, Any]:
+def _read_noise(found: Imported, element: Element) -> dict[str, Any]:
+    """Return the standard deviation of a sensor's noise in m."""
     noise = element.first("noise")
     if noise is None:
         element.note_absent("<noise>", "0 m")
         return {}
-    kind = noise.first("type")
-    said = (noise.attributes.get("type", "") if kind is None else kind.text).strip()
-    if kind is not None:
-        kind.read_text = True
-    noise.optional("type")
-    if said != "gaussian":
-        line = noise.line if kind is None else kind.line
-        found.changes.add(f"<noise><type> {short(said)!r} became gaussian, the one that there is", f"line {line}")
+    # Gazebo has the type in a child, older versions in an attribute.
+    type_element = noise.first("type")
+    type_attribute = noise.optional("type")
+    if type_element is not None:
+        type_element.read_text = True
+        kind = type_element.text.strip()
+        line = type_element.line
+    else:
+        kind = (type_attribute or "").strip()
+        line = noise.line
+    if kind != "gaussian":
+        found.changes.add(f"<noise><type> {short(kind)!r} became gaussian, the one that there is", f"line {line}")
     return {"noise_m": noise.text_number("stddev", 0.0)}
 
 
 def gazebo_lines(robot: RobotFile) -> list[str]:
-    """The sensors of a robot file as <gazebo> elements."""
+    """Return the sensors of a robot file as lines of XML with <gazebo> elements."""
     lines: list[str] = []
-    sensors, links = robot.sensors, [f"link_{i}" for i in range(robot.chain.modules + 1)]
-    for kind, sensor in (("imu", sensors.imu), ("contact", sensors.contacts)):
-        for link in links if sensor is not None else []:
-            lines += _gazebo(link, kind, f"{kind}_{link}", sensor.rate_hz if sensor else 0.0, [])
-    for sensor in (*sensors.depth, *sensors.range):
+    links = [f"link_{i}" for i in range(robot.chain.modules + 1)]
+    for kind, sensor in (("imu", robot.sensors.imu), ("contact", robot.sensors.contacts)):
+        if sensor is None:
+            continue
+        for link in links:
+            lines += _gazebo_element(link, kind, f"{kind}_{link}", sensor.rate_hz, [])
+    for sensor in (*robot.sensors.depth, *robot.sensors.range):
         index = robot.link_index(sensor.link)
         nose_m = (robot.link_lengths_m[index] + robot.module.radius_m, 0.0, 0.0)
         x, y, z = sensor.position_m or nose_m
-        body = [f"<pose>{x!r} {y!r} {z!r} 0 {sensor.pitch_rad!r} {sensor.yaw_rad!r}</pose>"]
-        ends = f"{sensor.range_min_m!r}", f"{sensor.range_max_m!r}"
-        noise = f"<noise><type>gaussian</type><stddev>{sensor.noise_m!r}</stddev></noise>"
+        pose = f"<pose>{x!r} {y!r} {z!r} 0 {sensor.pitch_rad!r} {sensor.yaw_rad!r}</pose>"
         if isinstance(sensor, DepthCamera):
             kind = "rgbd_camera" if sensor.color else "depth_camera"
-            body.append(
-                f"<camera><horizontal_fov>{sensor.fov_rad!r}</horizontal_fov>"
-                f"<image><width>{sensor.width}</width><height>{sensor.height}</height></image>"
-                f"<clip><near>{ends[0]}</near><far>{ends[1]}</far></clip>{noise}</camera>"
-            )
+            body = _camera_element(sensor)
         else:
-            kind, half = "gpu_lidar", sensor.fov_rad / 2
-            body.append(
-                f"<lidar><scan><horizontal><samples>{sensor.beams}</samples><min_angle>{-half!r}</min_angle>"
-                f"<max_angle>{half!r}</max_angle></horizontal></scan>"
-                f"<range><min>{ends[0]}</min><max>{ends[1]}</max></range>{noise}</lidar>"
-            )
-        lines += _gazebo(links[index], kind, sensor.name, sensor.rate_hz, body)
+            kind = "gpu_lidar"
+            body = _lidar_element(sensor)
+        lines += _gazebo_element(links[index], kind, sensor.name, sensor.rate_hz, [pose, body])
     return lines
 
 
-def _gazebo(link: str, kind: str, name: str, rate_hz: float, body: list[str]) -> list[str]:
-    inner = "".join([f"<update_rate>{escape(repr(rate_hz))}</update_rate>", *body])
+def _camera_element(sensor: DepthCamera) -> str:
+    return (
+        f"<camera><horizontal_fov>{sensor.fov_rad!r}</horizontal_fov>"
+        f"<image><width>{sensor.width}</width><height>{sensor.height}</height></image>"
+        f"<clip><near>{sensor.range_min_m!r}</near><far>{sensor.range_max_m!r}</far></clip>"
+        f"{_noise_element(sensor.noise_m)}</camera>"
+    )
+
+
+def _lidar_element(sensor: RangeSensor) -> str:
+    half_fov_rad = sensor.fov_rad / 2
+    return (
+        f"<lidar><scan><horizontal><samples>{sensor.beams}</samples><min_angle>{-half_fov_rad!r}</min_angle>"
+        f"<max_angle>{half_fov_rad!r}</max_angle></horizontal></scan>"
+        f"<range><min>{sensor.range_min_m!r}</min><max>{sensor.range_max_m!r}</max></range>"
+        f"{_noise_element(sensor.noise_m)}</lidar>"
+    )
+
+
+def _noise_element(noise_m: float) -> str:
+    return f"<noise><type>gaussian</type><stddev>{noise_m!r}</stddev></noise>"
+
+
+def _gazebo_element(link: str, kind: str, name: str, rate_hz: float, body: list[str]) -> list[str]:
+    content = "".join([f"<update_rate>{escape(repr(rate_hz))}</update_rate>", *body])
     return [
         f"  <gazebo reference={quoteattr(link)}>",
-        f"    <sensor type={quoteattr(kind)} name={quoteattr(name)}>{inner}</sensor>",
+        f"    <sensor type={quoteattr(kind)} name={quoteattr(name)}>{content}</sensor>",
         "  </gazebo>",
     ]

@@ -1,6 +1,7 @@
-"""URDF -> rigid bodies in a row: links that fixed joints connect are one body, with its mass and its outline.
+"""Reads the links and joints of a URDF as rigid bodies in a row.
 
-Everything is in the frame of the URDF's root link, with all joints at zero.
+Links that fixed joints connect are one body, with its mass and its outline. Everything is in the frame of the URDF's
+root link, with all joints at zero.
 """
 
 import math
@@ -15,8 +16,8 @@ from snakesim_operator.features.robots.imported import Imported
 from snakesim_operator.features.robots.shapes import outline, read_shape
 from snakesim_operator.features.robots.xml_tree import Element
 
-TURNING = ("revolute", "continuous")
-MAX_PLACE = 1e6  # of an origin, in the file's unit of length
+ROTARY = ("revolute", "continuous")
+MAX_COORDINATE = 1e6  # of an origin, in the file's unit of length
 MAX_MASS_KG = 100.0  # of a link; as in snakesim_hal.model.links
 MAX_INERTIA_KG_M2 = 100.0
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -24,50 +25,65 @@ MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 @dataclass
 class Body:
-    """Links that move as one."""
+    """A rigid body: links that move as one. Lengths are in the file's unit."""
 
+    # The links.
     links: list[str] = field(default_factory=list[str])
-    places: list[str] = field(default_factory=list[str])  # of these links, for a report
-    mass_kg: float = 0.0
-    moment: Floats = field(default_factory=lambda: np.zeros(3))  # mass x center
-    second: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # inertia about the root's origin
-    points: list[Floats] = field(default_factory=list[Floats])  # of the outline, each (n, 3)
-    shapes: list[Element] = field(default_factory=list[Element])  # that have these points
-    masses: list[Element] = field(default_factory=list[Element])
-    inertias: list[Element] = field(default_factory=list[Element])
+    places: list[str] = field(default_factory=list[str])  # of these links in the file, for a report
     frames: dict[str, Floats] = field(default_factory=dict[str, Floats])  # root_from_link of each link, (4, 4)
 
+    # Mass, summed over the links.
+    mass_kg: float = 0.0
+    moment: Floats = field(default_factory=lambda: np.zeros(3))  # mass x center of mass
+    second: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # inertia about the root's origin
+    masses: list[Element] = field(default_factory=list[Element])
+    inertias: list[Element] = field(default_factory=list[Element])
+
+    # Outline.
+    points: list[Floats] = field(default_factory=list[Floats])  # of each shape, (n, 3)
+    shapes: list[Element] = field(default_factory=list[Element])  # that have these points
+
     def add_mass(self, mass_kg: float, center: Floats, inertia: Floats) -> None:
-        """inertia: about the center, (3, 3)."""
+        """Add the mass of a link, by the parallel axis theorem: I += J + m (c·c E - c c^T).
+
+        Args:
+            mass_kg: Mass m of the link.
+            center: (3,) its center of mass c.
+            inertia: (3, 3) its inertia J about the center of mass.
+        """
         self.mass_kg += mass_kg
         self.moment += mass_kg * center
         self.second += inertia + mass_kg * (center @ center * np.eye(3) - np.outer(center, center))
 
     @property
     def center(self) -> Floats:
-        """Centre of mass."""
+        """The center of mass, (3,)."""
         return self.moment / self.mass_kg
 
     @property
     def inertia(self) -> Floats:
-        """About the center of mass, (3, 3)."""
+        """The inertia about the center of mass, (3, 3)."""
         c = self.center
         return self.second - self.mass_kg * (c @ c * np.eye(3) - np.outer(c, c))
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint that turns, between bodies `rear` and `front` of the row."""
+    """A rotary joint between two neighboring bodies of the row."""
 
     element: Element
     name: str
-    origin: Floats
-    axis: Floats  # about which the front body turns against the rear one, for a positive angle of ours
+    origin: Floats  # (3,)
+    axis: Floats  # (3,), about which the front body turns against the rear one for a positive angle
 
     def place(self, tag: str = "") -> str:
-        """Where it is, for a report; with a tag where its child of that tag is, if it has one."""
-        child = next((child for child in self.element.children if child.tag == tag), self.element)
-        return f"{short(self.name)} (line {child.line})"
+        """Return the place of the joint in the file, for a report.
+
+        Args:
+            tag: If the joint has a child of this tag, the line is that of the child.
+        """
+        place = next((child for child in self.element.children if child.tag == tag), self.element)
+        return f"{short(self.name)} (line {place.line})"
 
 
 @dataclass(frozen=True)
@@ -78,84 +94,113 @@ class Row:
     joints: list[Joint]
 
 
+@dataclass(frozen=True)
+class _Connection:
+    """A rotary joint of the tree, and the links on both sides of it."""
+
+    parent: str
+    child: str
+    joint: Joint
+
+
 @dataclass
 class _Tree:
-    """Links by their joints, from the root on."""
+    """The links, as the joints place them from the root link on."""
 
     frames: dict[str, Floats]  # root_from_link, (4, 4)
     body_of: dict[str, str]  # link -> the first link of its body
-    movable: list[tuple[str, str, Joint]] = field(default_factory=list[tuple[str, str, Joint]])  # parent, child, joint
+    connections: list[_Connection] = field(default_factory=list[_Connection])
 
 
 def row_of(found: Imported, urdf: Element, file: Path, *, tail: str | None) -> Row:
-    """Bodies and joints from the tail on. Raises ConfigError for what is no chain."""
-    links = _named(urdf, "link")
-    joints = _named(urdf, "joint")
-    tree = _walk(found, urdf, links, joints)
+    """Read bodies and joints, and order them from tail to head.
+
+    Args:
+        found: The import, whose report is extended.
+        urdf: The root element of the URDF.
+        file: Path of the URDF, from which its mesh files are looked for.
+        tail: A link at the tail; None takes the root link.
+
+    Raises:
+        ConfigError: The links are no chain, or a value in them is wrong.
+    """
+    links = _elements_by_name(urdf, "link")
+    joints = _elements_by_name(urdf, "joint")
+    tree = _walk_tree(found, urdf, links, joints)
     bodies: dict[str, Body] = {}
     for name, element in links.items():
+        frame = tree.frames[name]
         body = bodies.setdefault(tree.body_of[name], Body())
         body.links.append(name)
         body.places.append(element.place)
-        body.frames[name] = tree.frames[name]
-        _add_mass(found, body, element, tree.frames[name])
-        _add_shapes(found, body, element, tree.frames[name], file)
-    return _in_a_row(bodies, tree, tail, urdf)
+        body.frames[name] = frame
+        _add_mass(found, body, element, frame)
+        _add_shapes(found, body, element, frame, file)
+    return _order_bodies(bodies, tree, tail, urdf)
 
 
-def _named(urdf: Element, tag: str) -> dict[str, Element]:
-    found: dict[str, Element] = {}
+def _elements_by_name(urdf: Element, tag: str) -> dict[str, Element]:
+    """Return the elements of a tag by their names. Raises ConfigError for a name that two of them have."""
+    elements: dict[str, Element] = {}
     for element in urdf.all(tag):
-        if found.setdefault(element.get("name"), element) is not element:
+        name = element.get("name")
+        if name in elements:
             raise element.wrong("is there twice; give each a name of its own")
-    return found
+        elements[name] = element
+    return elements
 
 
 def transform(owner: Element) -> Floats:
-    """parent_from_child (4, 4) of its <origin>; none is the identity. Fixed axes: roll about x, pitch, then yaw."""
-    placed = np.eye(4)
+    """Return parent_from_child, (4, 4), of the <origin> of an element; without one it is the identity.
+
+    Raises:
+        ConfigError: The <origin> has no finite numbers, or is too far away.
+    """
+    frame = np.eye(4)
     origin = owner.first("origin")
     if origin is None:
         owner.note_absent("<origin>", "0 0 0")
-        return placed
-    place = origin.numbers("xyz", 3, "0 0 0")
-    if not all(abs(one) < MAX_PLACE for one in place):
-        raise origin.wrong(f"has `xyz` = {origin.get('xyz')!r}; expected lengths below {MAX_PLACE:g}")
-    placed[:3, 3] = place
-    placed[:3, :3] = rotation(*origin.numbers("rpy", 3, "0 0 0"))
-    return placed
+        return frame
+    position = origin.numbers("xyz", 3, "0 0 0")
+    if not all(abs(coordinate) < MAX_COORDINATE for coordinate in position):
+        raise origin.wrong(f"has `xyz` = {origin.get('xyz')!r}; expected lengths below {MAX_COORDINATE:g}")
+    frame[:3, 3] = position
+    frame[:3, :3] = rotation(*origin.numbers("rpy", 3, "0 0 0"))
+    return frame
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Floats:
-    """Of URDF's rpy, in rad, (3, 3)."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ about_y @ about_x
+    """Return the rotation matrix, (3, 3), of URDF's `rpy`: about the fixed axes x, then y, then z. Angles in rad."""
+    cos_roll = math.cos(roll)
+    sin_roll = math.sin(roll)
+    cos_pitch = math.cos(pitch)
+    sin_pitch = math.sin(pitch)
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    about_x = np.array([[1, 0, 0], [0, cos_roll, -sin_roll], [0, sin_roll, cos_roll]])
+    about_y = np.array([[cos_pitch, 0, sin_pitch], [0, 1, 0], [-sin_pitch, 0, cos_pitch]])
+    about_z = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
 
 
-def _walk(found: Imported, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
+def _walk_tree(found: Imported, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
     """Follow the joints from the root link to every other link. Raises ConfigError for what is no tree."""
     parent_of: dict[str, str] = {}
-    below: dict[str, list[tuple[str, Element]]] = {}
+    joints_below: dict[str, list[tuple[str, Element]]] = {}  # parent link -> child links with their joints
     for joint in joints.values():
-        parent = _end_of(joint, "parent", links)
-        child = _end_of(joint, "child", links)
+        parent = _read_end(joint, "parent", links)
+        child = _read_end(joint, "child", links)
         if child in parent_of:
             raise joint.wrong(f"and another joint both have the child {child!r}; a link has one parent")
         parent_of[child] = parent
-        below.setdefault(parent, []).append((child, joint))
-    roots = [name for name in links if name not in parent_of]
-    if len(roots) != 1:
-        named = f": {', '.join(map(short, roots[:8]))}" if roots else ""
-        raise urdf.wrong(f"needs one link without a parent, and has {len(roots)}{named}")
-    root = roots[0]
+        joints_below.setdefault(parent, []).append((child, joint))
+    root = _find_root(urdf, links, parent_of)
     tree = _Tree(frames={root: np.eye(4)}, body_of={root: root})
     waiting = [root]
     while waiting:
         parent = waiting.pop()
-        for child, element in below.get(parent, []):
-            alone_at_root = parent == root and len(below[parent]) == 1
+        for child, element in joints_below.get(parent, []):
+            alone_at_root = parent == root and len(joints_below[parent]) == 1
             _add_joint(found, tree, element, parent, child, alone_at_root=alone_at_root)
             waiting.append(child)
     if len(tree.frames) != len(links):
@@ -164,8 +209,17 @@ def _walk(found: Imported, urdf: Element, links: dict[str, Element], joints: dic
     return tree
 
 
-def _end_of(joint: Element, tag: str, links: dict[str, Element]) -> str:
-    """The link at one end of a joint."""
+def _find_root(urdf: Element, links: dict[str, Element], parent_of: dict[str, str]) -> str:
+    """Return the only link without a parent. Raises ConfigError when there is none, or several."""
+    roots = [name for name in links if name not in parent_of]
+    if len(roots) == 1:
+        return roots[0]
+    names = f": {', '.join(map(short, roots[:8]))}" if roots else ""
+    raise urdf.wrong(f"needs one link without a parent, and has {len(roots)}{names}")
+
+
+def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
+    """Return the link at one end of a joint. Raises ConfigError for a link that does not exist."""
     end = joint.first(tag)
     name = "" if end is None else end.get("link")
     if name not in links:
@@ -185,9 +239,9 @@ def _add_joint(found: Imported, tree: _Tree, element: Element, parent: str, chil
         return  # its <origin> has not been read, and so is reported
     frame = tree.frames[parent] @ transform(element)
     tree.frames[child] = frame
-    if kind in TURNING:
+    if kind in ROTARY:
         tree.body_of[child] = child
-        tree.movable.append((parent, child, _joint(found, element, frame)))
+        tree.connections.append(_Connection(parent, child, _read_joint(found, element, frame)))
     elif kind == "fixed":
         tree.body_of[child] = tree.body_of[parent]
         found.changes.add("fixed joints: the links on both sides became one", element.place)
@@ -195,28 +249,36 @@ def _add_joint(found: Imported, tree: _Tree, element: Element, parent: str, chil
         raise element.wrong(f"has the type {short(kind)!r}; a snake's joints are revolute, continuous or fixed")
 
 
-def _joint(found: Imported, element: Element, frame: Floats) -> Joint:
+def _read_joint(found: Imported, element: Element, frame: Floats) -> Joint:
+    """Read a rotary joint. Raises ConfigError for one that mimics another, and for an axis without direction.
+
+    frame: root_from_joint, (4, 4).
+    """
     if element.first("mimic") is not None:
         raise element.wrong("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
-    axis_element = element.first("axis")
-    if axis_element is None:
-        element.note_absent("<axis>", "1 0 0")
-        axis = np.array([1.0, 0.0, 0.0])
-    else:
-        axis = np.array(axis_element.numbers("xyz", 3, "1 0 0"))
-        length = float(np.linalg.norm(axis))
-        if not 1e-9 < length < 1e9:
-            raise axis_element.wrong(
-                f"of joint {element.get('name')!r} has `xyz` = {axis_element.get('xyz')!r} of length {length:g}; give "
-                f"a vector of length 1"
-            )
-        if abs(length - 1.0) > 1e-3:
-            found.changes.add(
-                f"<axis xyz> {axis_element.get('xyz')!r} has the length {length:.4g}; only its direction counts",
-                f"{short(element.get('name'))} (line {axis_element.line})",
-            )
-        axis = axis / length
+    axis = _read_axis(found, element)
     return Joint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis)
+
+
+def _read_axis(found: Imported, joint: Element) -> Floats:
+    """Return the axis of a joint in the joint's frame, (3,), as a vector of length 1."""
+    axis_element = joint.first("axis")
+    if axis_element is None:
+        joint.note_absent("<axis>", "1 0 0")
+        return np.array([1.0, 0.0, 0.0])
+    axis = np.array(axis_element.numbers("xyz", 3, "1 0 0"))
+    length = float(np.linalg.norm(axis))
+    if not 1e-9 < length < 1e9:
+        raise axis_element.wrong(
+            f"of joint {joint.get('name')!r} has `xyz` = {axis_element.get('xyz')!r} of length {length:g}; give "
+            f"a vector of length 1"
+        )
+    if abs(length - 1.0) > 1e-3:
+        found.changes.add(
+            f"<axis xyz> {axis_element.get('xyz')!r} has the length {length:.4g}; only its direction counts",
+            f"{short(joint.get('name'))} (line {axis_element.line})",
+        )
+    return axis / length
 
 
 def _add_mass(found: Imported, body: Body, link: Element, frame: Floats) -> None:
@@ -236,12 +298,14 @@ def _add_mass(found: Imported, body: Body, link: Element, frame: Floats) -> None
         raise mass.wrong(f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?")
     xx, xy, xz, yy, yz, zz = (_read_moment(moments, name) for name in MOMENTS)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    placed = frame @ transform(inertial)
-    body.add_mass(mass_kg, placed[:3, 3], placed[:3, :3] @ inertia @ placed[:3, :3].T)
+    root_from_inertial = frame @ transform(inertial)
+    rotation_matrix = root_from_inertial[:3, :3]
+    center = root_from_inertial[:3, 3]
+    body.add_mass(mass_kg, center, rotation_matrix @ inertia @ rotation_matrix.T)
 
 
 def _read_moment(moments: Element, name: str) -> float:
-    """A moment of inertia as in the file, in its unit of length."""
+    """Return a moment of inertia in the file's unit of length. Raises ConfigError for one that is too large."""
     value = moments.number(name, "0")
     if abs(value) > 1e15:
         raise moments.wrong(f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²")
@@ -249,70 +313,87 @@ def _read_moment(moments: Element, name: str) -> float:
 
 
 def _add_shapes(found: Imported, body: Body, link: Element, frame: Floats, file: Path) -> None:
-    """Add the outline of a link to its body: of <collision>, or else of <visual>."""
+    """Add the outline of a link to its body: that of <collision>, or else that of <visual>."""
     collisions = link.all("collision")
-    looks = [child for child in link.children if child.tag == "visual"]
+    visuals = [child for child in link.children if child.tag == "visual"]
     if collisions:
-        _mark_repeated(looks, collisions)
-    elif looks:
+        _mark_repeated(visuals, collisions)
+    elif visuals:
         link.all("visual")
         found.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
-    for element in collisions or looks:
+    for element in collisions or visuals:
         geometry = element.first("geometry")
         if geometry is None or not geometry.children:
             raise element.wrong("has no shape in <geometry>")
         shape = geometry.children[0]
         shape.read = True
         points = outline(read_shape(shape), shape, file, found.omissions)
-        placed = frame @ transform(element)
+        root_from_shape = frame @ transform(element)
         if points is not None:
-            body.points.append(points @ placed[:3, :3].T + placed[:3, 3])
+            body.points.append(points @ root_from_shape[:3, :3].T + root_from_shape[:3, 3])
             body.shapes.append(shape)
 
 
-def _mark_repeated(looks: list[Element], collisions: list[Element]) -> None:
-    """Mark a <visual> as read where a <collision> says the same, so that only what it says besides is reported."""
-    for look in looks:
-        if any(_has_the_shape_of(look, collision) for collision in collisions):
-            look.read = True
-            for child in look.children:
+def _mark_repeated(visuals: list[Element], collisions: list[Element]) -> None:
+    """Mark a <visual> as read where a <collision> repeats it, so that only its other values are reported."""
+    for visual in visuals:
+        if any(_have_same_shape(visual, collision) for collision in collisions):
+            visual.read = True
+            for child in visual.children:
                 if child.tag in ("origin", "geometry"):
                     child.read_all()
 
 
-def _has_the_shape_of(look: Element, collision: Element) -> bool:
+def _have_same_shape(visual: Element, collision: Element) -> bool:
+    """Return whether both have the same <origin> and <geometry>."""
     for tag in ("origin", "geometry"):
-        mine = [child for child in look.children if child.tag == tag]
-        theirs = [child for child in collision.children if child.tag == tag]
-        if len(mine) != len(theirs):
+        of_visual = [child for child in visual.children if child.tag == tag]
+        of_collision = [child for child in collision.children if child.tag == tag]
+        if len(of_visual) != len(of_collision):
             return False
-        if not all(a.says_the_same_as(b) for a, b in zip(mine, theirs, strict=True)):
+        if not all(a.says_the_same_as(b) for a, b in zip(of_visual, of_collision, strict=True)):
             return False
     return True
 
 
-def _in_a_row(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> Row:
-    """Order the bodies from the tail on. A joint whose parent is in front turns the other way round."""
-    body_of, movable = tree.body_of, tree.movable
-    if tail is not None and tail not in body_of:
-        raise ConfigError(f"--tail {short(tail)}: there is no such link; there are {', '.join(list(body_of)[:8])}")
-    near: dict[str, list[tuple[str, Joint]]] = {name: [] for name in bodies}
-    for parent, child, joint in movable:
-        near[body_of[parent]].append((body_of[child], joint))
-        turned = Joint(joint.element, joint.name, joint.origin, -joint.axis)
-        near[body_of[child]].append((body_of[parent], turned))
-    forks = [name for name, joints in near.items() if len(joints) > 2]
+def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> Row:
+    """Order the bodies from the tail on. Raises ConfigError for what is no chain."""
+    if tail is not None and tail not in tree.body_of:
+        raise ConfigError(f"--tail {short(tail)}: there is no such link; there are {', '.join(list(tree.body_of)[:8])}")
+    neighbors = _find_neighbors(bodies, tree)
+    forks = [name for name, joints in neighbors.items() if len(joints) > 2]
     if forks:
         raise urdf.wrong(f"is no chain: more than two joints meet at link {short(forks[0])!r}")
-    ends = [name for name, joints in near.items() if len(joints) == 1]
-    if len(movable) < 2:
-        raise urdf.wrong(f"has {len(movable)} joints that turn; a snake has 2 or more")
-    first = body_of[tail] if tail is not None else next(iter(body_of))
+    if len(tree.connections) < 2:
+        raise urdf.wrong(f"has {len(tree.connections)} joints that turn; a snake has 2 or more")
+    first = tree.body_of[tail] if tail is not None else next(iter(tree.body_of))
+    ends = [name for name, joints in neighbors.items() if len(joints) == 1]
     if first not in ends:
         choices = " or ".join(f"--tail {short(end)}" for end in ends)
         raise urdf.wrong(f"has the link {short(tail or first)!r} amid the chain; say which end is the tail: {choices}")
-    order, joints = [first], list[Joint]()
-    while ahead := [(name, joint) for name, joint in near[order[-1]] if name not in order[-2:]]:
-        order.append(ahead[0][0])
-        joints.append(ahead[0][1])
-    return Row([bodies[name] for name in order], joints)
+    order = [first]
+    joints: list[Joint] = []
+    while True:
+        passed = order[-2:]
+        ahead = [(name, joint) for name, joint in neighbors[order[-1]] if name not in passed]
+        if not ahead:
+            return Row([bodies[name] for name in order], joints)
+        name, joint = ahead[0]
+        order.append(name)
+        joints.append(joint)
+
+
+def _find_neighbors(bodies: dict[str, Body], tree: _Tree) -> dict[str, list[tuple[str, Joint]]]:
+    """Return the neighbors of each body, and the joints to them, as if the neighbor were in front of the body.
+
+    A joint whose parent is in front turns the other way round, so its axis is negated.
+    """
+    neighbors: dict[str, list[tuple[str, Joint]]] = {name: [] for name in bodies}
+    for connection in tree.connections:
+        parent = tree.body_of[connection.parent]
+        child = tree.body_of[connection.child]
+        joint = connection.joint
+        reversed_joint = Joint(joint.element, joint.name, joint.origin, -joint.axis)
+        neighbors[parent].append((child, joint))
+        neighbors[child].append((parent, reversed_joint))
+    return neighbors

@@ -1,4 +1,4 @@
-"""XML as a tree that records which parts were read, so that everything else can be reported.
+"""Parses XML into a tree that records which parts were read, so that all others can be reported.
 
 Document types are refused, and with them entities and anything fetched from elsewhere. Size, depth and number of
 elements are bounded.
@@ -11,7 +11,8 @@ from xml.parsers import expat
 
 from snakesim_hal.base.errors import ConfigError, short
 
-MAX_ELEMENTS, MAX_DEPTH = 100_000, 32
+MAX_ELEMENTS = 100_000
+MAX_DEPTH = 32
 
 
 @dataclass(frozen=True)
@@ -50,31 +51,39 @@ class Element:
 
     @property
     def place(self) -> str:
-        """Where it is, for a report: its name, if it has one, and its line."""
+        """The place of the element for a report: its name, if it has one, and its line."""
         name = self.attributes.get("name")
         return f"{short(name)} (line {self.line})" if name else f"line {self.line}"
 
     def all(self, tag: str) -> list["Element"]:
-        """Its children of a tag, which count as read."""
-        found = [child for child in self.children if child.tag == tag]
-        for child in found:
+        """Return the children of a tag, and mark them as read."""
+        children = [child for child in self.children if child.tag == tag]
+        for child in children:
             child.read = True
-        return found
+        return children
 
     def first(self, tag: str) -> "Element | None":
-        """Its first child of a tag; the others are left to be reported."""
+        """Return the first child of a tag and mark it as read, or None. Other children of the tag are reported."""
         child = next((child for child in self.children if child.tag == tag), None)
         if child is not None:
             child.read = True
         return child
 
     def optional(self, name: str) -> str | None:
-        """An attribute; None when it is missing, and the caller says what that means."""
+        """Return an attribute, or None. The caller reports what a missing one means."""
         self.read_attributes.add(name)
         return self.attributes.get(name)
 
     def get(self, name: str, default: str | None = None) -> str:
-        """An attribute. A default that is taken is reported. Raises ConfigError when there is none."""
+        """Return an attribute.
+
+        Args:
+            name: Name of the attribute.
+            default: Value of a missing attribute, which is reported as assumed.
+
+        Raises:
+            ConfigError: The attribute is missing and has no default.
+        """
         value = self.optional(name)
         if value is not None:
             return value
@@ -84,15 +93,15 @@ class Element:
         return default
 
     def numbers(self, name: str, count: int, default: str | None = None) -> list[float]:
-        """An attribute of `count` finite numbers. Raises ConfigError."""
-        return self._numbers(self.get(name, default), count, f"`{name}`")
+        """Return the `count` finite numbers of an attribute; `default` as for `get`. Raises ConfigError."""
+        return self._parse_numbers(self.get(name, default), count, f"`{name}`")
 
     def number(self, name: str, default: str | None = None) -> float:
-        """An attribute that is a number. Raises ConfigError."""
+        """Return the number of an attribute; `default` as for `get`. Raises ConfigError."""
         return self.numbers(name, 1, default)[0]
 
     def text_number(self, tag: str, default: float) -> float:
-        """The number in a child, as Gazebo writes them; the default when there is none. Raises ConfigError."""
+        """Return the number in the text of a child, as Gazebo writes them, or the default. Raises ConfigError."""
         child = self.first(tag)
         if child is None:
             self.note_absent(f"<{tag}>", f"{default:g}")
@@ -100,30 +109,32 @@ class Element:
         return child.text_numbers(1)[0]
 
     def text_numbers(self, count: int) -> list[float]:
-        """The numbers between its tags. Raises ConfigError."""
+        """Return the `count` finite numbers in the text of the element. Raises ConfigError."""
         self.read_text = True
-        return self._numbers(self.text, count, "the text")
+        return self._parse_numbers(self.text, count, "the text")
 
     def note_absent(self, what: str, value: str) -> None:
-        """Record that it leaves something out, and which value is assumed."""
+        """Record that the element leaves something out, and which value is assumed."""
         self.absences.append(Absent(f"<{self.tag}> without {what}: {value}", self))
 
-    def _numbers(self, text: str, count: int, what: str) -> list[float]:
+    def _parse_numbers(self, text: str, count: int, what: str) -> list[float]:
         try:
-            found = [float(word) for word in text.split()]
+            numbers = [float(word) for word in text.split()]
         except ValueError:
-            found = []
-        if len(found) != count or not all(math.isfinite(number) for number in found):
+            numbers = []
+        if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
             raise self.wrong(f"{what} = {short(text)!r}; expected {count} finite number{'s' * (count > 1)}")
-        return found
+        return numbers
 
     def wrong(self, why: str) -> ConfigError:
-        """An error about this element."""
-        name = f" name={short(self.attributes['name'])!r}" if "name" in self.attributes else ""
+        """Return an error about this element. why: the rest of a sentence that begins with its tag."""
+        name = ""
+        if "name" in self.attributes:
+            name = f" name={short(self.attributes['name'])!r}"
         return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}")
 
     def read_all(self) -> None:
-        """Mark it and all within it as read."""
+        """Mark the element and everything in it as read."""
         self.read = True
         self.read_text = True
         self.read_attributes.update(self.attributes)
@@ -131,15 +142,18 @@ class Element:
             child.read_all()
 
     def says_the_same_as(self, other: "Element") -> bool:
-        """Whether tag, attributes, text and children are equal, wherever the two stand."""
-        if (self.tag, self.attributes, self.text.strip()) != (other.tag, other.attributes, other.text.strip()):
+        """Return whether tag, attributes, text and children of both are equal, whatever their lines."""
+        if self.tag != other.tag or self.attributes != other.attributes:
             return False
-        if len(self.children) != len(other.children):
+        if self.text.strip() != other.text.strip() or len(self.children) != len(other.children):
             return False
         return all(mine.says_the_same_as(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
 
     def unused(self, path: str = "") -> Iterator[Unused]:
-        """Every value in it and below it that was not read. path: of the tags above this one and of itself."""
+        """Yield every value in the element and below it that was not read.
+
+        path: the tags of the elements above this one and of itself, such as `<link><visual>`.
+        """
         yield from self._unused_here(path, "", 0, everything=False)
         for child in self.children:
             inner = f"{path}<{child.tag}>"
@@ -158,7 +172,7 @@ class Element:
             yield Unused(outermost, outermost_line, own_tag, text, self.line)
 
     def _everything(self, path: str, outermost: str, outermost_line: int) -> Iterator[Unused]:
-        """All values of an element that was not read."""
+        """Yield all values of an element that was not read."""
         if not (self.attributes or self.text.strip() or self.children):
             yield Unused(outermost, outermost_line, path, None, self.line)
         yield from self._unused_here(path, outermost, outermost_line, everything=True)
@@ -167,14 +181,25 @@ class Element:
 
 
 def parse_xml(data: bytes, source: str) -> Element:
-    """The root element. Raises ConfigError: for what is not XML, has a document type, or is too large."""
+    """Parse a file.
+
+    Args:
+        data: Content of the file.
+        source: Name of the file, for error messages.
+
+    Returns:
+        The root element.
+
+    Raises:
+        ConfigError: The file is not XML, has a document type, or is too large.
+    """
     parser = expat.ParserCreate()
     absences: list[Absent] = []
     top = Element("", {}, 0, source, absences)
     open_elements = [top]
     count = 0
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def open_element(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
         count += 1
         line = parser.CurrentLineNumber
@@ -190,21 +215,23 @@ def parse_xml(data: bytes, source: str) -> Element:
         open_elements[-1].children.append(element)
         open_elements.append(element)
 
-    def end(_tag: str) -> None:
+    def close_element(_tag: str) -> None:
         open_elements.pop()
 
-    def characters(text: str) -> None:
+    def add_text(text: str) -> None:
         open_elements[-1].text += text
 
-    def refuse(*_: object) -> None:
+    def refuse_doctype(*_: object) -> None:
         raise ConfigError(f"{source}, line {parser.CurrentLineNumber}: has a <!DOCTYPE>; URDF needs none: remove it")
 
     parser.buffer_text = True
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = characters, refuse
+    parser.StartElementHandler = open_element
+    parser.EndElementHandler = close_element
+    parser.CharacterDataHandler = add_text
+    parser.StartDoctypeDeclHandler = refuse_doctype
     try:
         parser.Parse(data, True)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an encoding that nobody knows
+    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf") from None
