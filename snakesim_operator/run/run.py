@@ -180,7 +180,7 @@ def _conduct(
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
                 say("no control service of its own: a client that takes the lease commands and arms the robot")
-            RunMonitor(config, session, supervisor, ending, say, stay=request.stay, unchecked=request.unchecked).go()
+            RunMonitor(config, session, supervisor, ending, say, stay=request.stay, unchecked=request.unchecked).run()
     except SnakesimError as error:
         ending.because(str(error))
     finally:
@@ -202,7 +202,7 @@ def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Itera
                 session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
                 break
             except NotConnectedError:
-                ended = supervisor.first_ended()
+                ended = supervisor.describe_first_end()
                 if ended is not None:
                     raise NotConnectedError(ended) from None
                 now = time.monotonic()
