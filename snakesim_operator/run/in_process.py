@@ -40,7 +40,7 @@ from snakesim_operator.results.metrics.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.recording_contents import SERVICE_STREAMS
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
+from snakesim_operator.run.conclusion import Outcome, conclude, explain, write_results
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.pinned_process import call_pinned
 from snakesim_operator.run.progress import Progress
@@ -151,7 +151,7 @@ def simulate(
             turn_limit_s=turn_limit_s,
         )
         explain(ending, record_of(run.host), config)
-        record, summary = leave(files, files.folder, ending, outcome, report=out is not None)
+        record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
         # No local variable holds the failure: its traceback holds this function's frame.
         return Result(record, summary, gave_up, ControlFailure.of(run.take_errors().get(CONTROL)))
 
@@ -231,7 +231,7 @@ def _go(
                     run.stop()
     ending.over = True
     for failure in run.failed:
-        ending.because(failure)
+        ending.add_cause(failure)
     lost = [] if recording is None or not recording.failure else [recording.failure]
     outcome = Outcome(record_of(run.host), run.host.description, lost=lost, too_slow=run.too_slow())
     return run, outcome, watch.gave_up

@@ -121,7 +121,7 @@ class RunMonitor:
         timeout = self._describe_timeout(give_up_s)
         if timeout is None:
             return True
-        self._ending.because(timeout)
+        self._ending.add_cause(timeout)
         return False
 
     def _describe_timeout(self, give_up_s: float) -> str | None:
@@ -197,7 +197,7 @@ class RunMonitor:
                 self._say(self._silence)
             self._print_recovery(status)
         elif self._silence is not None:
-            self._ending.because(self._silence)
+            self._ending.add_cause(self._silence)
         else:
             self._note_robot_fault(status)
 
@@ -206,11 +206,11 @@ class RunMonitor:
         fault = next((fault for fault in status.faults if fault.reach == "robot"), None)
         if fault is None:
             return
-        self._ending.because(fault.cause)
+        self._ending.add_cause(fault.cause)
         if fault.what == "lease_expired":
             slow = self._describe_slow_computer(status)
             if slow is not None:
-                self._ending.because(slow, first=True)
+                self._ending.add_cause(slow, first=True)
 
     def _describe_slow_computer(self, status: Status) -> str | None:
         """Return the measurements that show that this computer is too slow for the run; None if there are none."""
@@ -320,4 +320,4 @@ class RunMonitor:
         if status is None or state is None or not state.too_slow:
             return
         if any(fault.what == "lease_expired" for fault in status.faults):
-            self._ending.because(f"control: {state.too_slow}", first=True)
+            self._ending.add_cause(f"control: {state.too_slow}", first=True)

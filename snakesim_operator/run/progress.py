@@ -81,10 +81,7 @@ class Progress(OneLine):
             return  # armed since the last status: only the next status shows for how long
         self._armed = armed
         self._next = now + (TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S)
-        if armed:
-            text = self._describe_run(status, control, now)
-        else:
-            text = f"starting: {status.why}"
+        text = self._describe_run(status, control, now) if armed else f"starting: {status.why}"
         if self.terminal or text != self._last:
             self.put(text)
         self._last = text

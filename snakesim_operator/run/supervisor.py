@@ -231,7 +231,7 @@ class Supervisor:
         if self._stay and self.started_up and part.may_restart:
             self._restart_later(part, how)
             return True
-        self._ending.because(how, first=True)
+        self._ending.add_cause(how, first=True)
         return False
 
     def _continue_without(self, part: Part, how: str) -> None:
@@ -280,14 +280,14 @@ class Supervisor:
             host.child.process.wait(children.STOP_LIMIT_S)
         how = host.child.how_it_ended()
         if how is not None and host.child.process.returncode not in REGULAR_EXIT_CODES:
-            self._ending.because(how)
+            self._ending.add_cause(how)
 
     def _note_early_ends(self) -> None:
         """Note the vital parts that ended before they were stopped: any fault that the host noted is a consequence."""
         for part in self._parts.values():
             how = part.describe_end()
             if part.name != HOST and part.vital and how is not None:
-                self._ending.because(how, first=True)
+                self._ending.add_cause(how, first=True)
 
     def _print_last_output(self) -> None:
         if self._ending.reason is None or self._ending.interrupted:
