@@ -1,8 +1,8 @@
 """The `snakesim` command: its own commands, and those that entry points in the group `snakesim.commands` add.
 
-An entry point names `add_commands(commands)`, beside which `TASK` says where the help lists them, or `main(argv)` of a
-command that parses its own words. They are looked up only for the help, completion, and a command not known here: an
-emergency stop does not wait for them.
+An entry point names `add_commands(commands)`, in whose module `TASK` is the heading for the help, or `main(argv)` of a
+command that parses its own arguments. Entry points are looked up only for the help, completion, and a command that is
+not known here: an emergency stop does not wait for them.
 """
 
 import argparse
@@ -25,71 +25,103 @@ ADDS = "add_commands"  # the name of an entry point's function that adds to the 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 3 an incomplete record, 130 interrupted."""
-    given = list(sys.argv[1:] if argv is None else argv)
+    """Run a command.
+
+    Args:
+        argv: the arguments; None for those of this process, which runs nothing but this command then.
+
+    Returns:
+        The exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 3 an incomplete record, 130 interrupted.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return exit_code("snakesim", lambda: _act(given, owns_process=argv is None))
+        return exit_code("snakesim", lambda: _run_command(words, owns_process=argv is None))
     except ModuleNotFoundError as error:
         from snakesim_operator.base.extras import explained
 
-        if (why := explained(error)) is None:
+        explanation = explained(error)
+        if explanation is None:
             raise
-        report_error(why, "snakesim")
+        report_error(explanation, "snakesim")
         return BAD_INPUT
     except OSError as error:  # such as a full disk under what is printed
         discard(sys.stdout)
-        if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
-            return OK
-        if error.errno == errno.ENOMEM:
-            raise MemoryError from error
-        print_stderr(f"snakesim: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
-        return FAILED
+        return _report_os_error(error)
 
 
-def _act(given: list[str], *, owns_process: bool) -> int:
-    if not given:
+def _report_os_error(error: OSError) -> int:
+    """Print an error of the system in one line. Returns the exit code; raises MemoryError when memory is used up."""
+    if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
+        return OK
+    if error.errno == errno.ENOMEM:
+        raise MemoryError from error
+    file = f"{error.filename}: " if error.filename else ""
+    print_stderr(f"snakesim: {file}{error.strerror or error}")
+    return FAILED
+
+
+def _run_command(words: list[str], *, owns_process: bool) -> int:
+    """Find the command, parse its arguments and run it. Raises ConfigError for wrong input."""
+    if not words:
         parser().print_help()
         return OK
-    name = given[0]
-    for before, word in zip(["", *given], given, strict=False):
-        if not word or (word.startswith("--") and word.endswith("=")):  # as of a variable that is not set
-            raise ConfigError(f"{word.rstrip('=') or before or 'the command'}: empty; give a value, or leave it out")
-    ours = Commands()
+    _refuse_empty_words(words)
+    commands = Commands()
+    name = words[0]
     if name.startswith("-"):
-        ours.add_installed()
-    elif name not in ours.commands.choices:
-        from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
-
-        if name in installed(COMMANDS):
-            found = find_plugin(COMMANDS, name)
-            if getattr(found, "__name__", "") != ADDS:
-                return found(given[1:])
-            found(ours.commands)
-        else:
-            ours.add_installed()
-            meant = did_you_mean(name, [*ours.commands.choices, *installed(COMMANDS)])
-            raise ConfigError(f"no command {short(name)!r}; {meant}`snakesim` alone lists all")
-    arguments, unknown = ours.parse_known_args(given)
+        commands.add_installed()
+    elif name not in commands.commands.choices:
+        own_main = _find_installed_command(commands, name)
+        if own_main is not None:
+            return own_main(words[1:])
+    arguments, unknown = commands.parse_known_args(words)
     if unknown:
-        _refuse(unknown[0], ours.of(given))
-    arguments.owns_process = owns_process  # whether nothing but this command runs in this process
+        _refuse_unknown_word(unknown[0], commands.find_parser(words))
+    arguments.owns_process = owns_process
     return arguments.act(arguments)
 
 
-def _refuse(word: str, parser: argparse.ArgumentParser) -> None:
-    """Raise ConfigError for a word on the command line that means nothing to its command."""
+def _refuse_empty_words(words: list[str]) -> None:
+    """Raise ConfigError for an empty word, or an option without its value, as of a shell variable that is not set."""
+    for previous, word in zip(["", *words], words, strict=False):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            option = word.rstrip("=") or previous or "the command"
+            raise ConfigError(f"{option}: empty; give a value, or leave it out")
+
+
+def _find_installed_command(commands: "Commands", name: str) -> Callable[[list[str]], int] | None:
+    """Find a command of an entry point. Raises ConfigError when there is no such command.
+
+    Returns:
+        Its main function, if it parses its own arguments; None if the command was added to the parser.
+    """
+    from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
+
+    if name not in installed(COMMANDS):
+        commands.add_installed()
+        hint = did_you_mean(name, [*commands.commands.choices, *installed(COMMANDS)])
+        raise ConfigError(f"no command {short(name)!r}; {hint}`snakesim` alone lists all")
+    plugin = find_plugin(COMMANDS, name)
+    if getattr(plugin, "__name__", "") != ADDS:
+        return plugin
+    plugin(commands.commands)
+    return None
+
+
+def _refuse_unknown_word(word: str, parser: argparse.ArgumentParser) -> NoReturn:
+    """Raise ConfigError for an argument that the command does not have."""
     options = [option for action in parser._actions for option in action.option_strings]
-    meant = did_you_mean(word.partition("=")[0], options) if word.startswith("-") else ""
+    hint = did_you_mean(word.partition("=")[0], options) if word.startswith("-") else ""
     raise ConfigError(
-        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}; {meant}see `{parser.prog} --help`"
+        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}; {hint}see `{parser.prog} --help`"
     )
 
 
 class Command(argparse.ArgumentParser):
-    """The arguments of one command."""
+    """The parser of one command."""
 
     def error(self, message: str) -> NoReturn:
-        """End, with one line instead of the whole usage."""
+        """End the process with one line instead of the whole usage."""
         plain = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
         plain = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain)
         print_stderr(f"{self.prog}: {plain}; see `{self.prog} --help`")
@@ -97,7 +129,7 @@ class Command(argparse.ArgumentParser):
 
 
 class Commands(Command):
-    """The command's arguments, without the commands of installed packages; its help lists the commands by task."""
+    """The parser of all commands but those of installed packages; its help lists the commands by task."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -115,26 +147,26 @@ class Commands(Command):
             self._tasks[task] = self.commands._choices_actions[before:]
 
     def add_installed(self) -> None:
-        """Add the commands of entry points. One that cannot be loaded is reported, and keeps no other from its work."""
+        """Add the commands of entry points. A command that cannot be loaded is reported, and the others are added."""
         from importlib.metadata import entry_points
 
         from snakesim_hal.model.plugins import COMMANDS, find_plugin
 
         for entry in sorted(entry_points(group=COMMANDS)):
-            if entry.attr != ADDS or entry.name in self.commands.choices:  # another of the same `add_commands`
+            if entry.attr != ADDS or entry.name in self.commands.choices:  # one `add_commands` may add several
                 continue
             try:
-                found = find_plugin(COMMANDS, entry.name)
+                add = find_plugin(COMMANDS, entry.name)
             except ConfigError as error:
                 report_error(error, "snakesim")
                 continue
             before = len(self.commands._choices_actions)
-            found(self.commands)
-            task = getattr(sys.modules[found.__module__], "TASK", "more")
+            add(self.commands)
+            task = getattr(sys.modules[add.__module__], "TASK", "more")
             self._tasks.setdefault(task, []).extend(self.commands._choices_actions[before:])
 
     def format_help(self) -> str:
-        """The commands by task, and those of installed packages by name."""
+        """Return the help: the commands by task, and those of installed packages by name."""
         from snakesim_hal.model.plugins import COMMANDS, installed
 
         others = [name for name in installed(COMMANDS) if name not in self.commands.choices]
@@ -151,15 +183,15 @@ class Commands(Command):
         formatter.add_text(self.epilog)
         return formatter.format_help()
 
-    def of(self, given: Sequence[str]) -> argparse.ArgumentParser:
-        """The parser of the command, or part of one, that is given."""
-        found: argparse.ArgumentParser = self
-        for word in given:
-            for action in found._actions:
+    def find_parser(self, words: Sequence[str]) -> argparse.ArgumentParser:
+        """Return the parser of the command, or of the part of a command, that the words name."""
+        parser: argparse.ArgumentParser = self
+        for word in words:
+            for action in parser._actions:
                 if isinstance(action, argparse._SubParsersAction) and word in action.choices:
-                    found = action.choices[word]
+                    parser = action.choices[word]
                     break
-        return found
+        return parser
 
 
 class _Version(argparse.Action):
@@ -171,10 +203,10 @@ class _Version(argparse.Action):
 
 
 def parser() -> Commands:
-    """The arguments of all commands, those of entry points among them."""
-    made = Commands()
-    made.add_installed()
-    return made
+    """Return the parser of all commands, with those of entry points."""
+    commands = Commands()
+    commands.add_installed()
+    return commands
 
 
 def _add_completion(commands: Any) -> None:

@@ -21,24 +21,32 @@ SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an ope
 
 
 def number(least: float, most: float, unit: str = "") -> Callable[[str], float]:
-    """A type for argparse: a number within bounds; a whole one, if `least` is. NaN is within no bounds."""
-    whole = isinstance(least, int)
+    """Return a type for argparse: a number within bounds.
+
+    Args:
+        least: the minimum; if it is an int, the number has to be a whole one.
+        most: the maximum.
+        unit: for the error message.
+    """
+    is_whole = isinstance(least, int)
 
     def parse(text: str) -> float:
         try:
-            value = int(text) if whole else float(text)
+            value = int(text) if is_whole else float(text)
         except ValueError:
-            value = float("nan")
+            value = float("nan")  # within no bounds
         if not least <= value <= most:
-            kind, of = "a whole number" if whole else "a number", f" {unit}" if unit else ""
-            raise argparse.ArgumentTypeError(f"{short(text, 40)!r}: give {kind} from {least:.12g} to {most:.12g}{of}")
+            kind = "a whole number" if is_whole else "a number"
+            suffix = f" {unit}" if unit else ""
+            bounds = f"from {least:.12g} to {most:.12g}{suffix}"
+            raise argparse.ArgumentTypeError(f"{short(text, 40)!r}: give {kind} {bounds}")
         return value
 
     return parse
 
 
 def add_scenario(parser: argparse.ArgumentParser) -> None:
-    """A scenario, and flags that change it."""
+    """Add the scenario, and flags that change it."""
     parser.add_argument(
         "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
     )
@@ -64,7 +72,7 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def load_scenario(arguments: argparse.Namespace) -> "Loaded":
-    """The configuration that `add_scenario`'s arguments ask for. Raises ConfigError."""
+    """Load the configuration that the arguments of `add_scenario` name. Raises ConfigError."""
     from snakesim_hal.model.scenario import Override, load, parse_set
 
     flags = {
@@ -82,13 +90,14 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
         if value is not None:
             flag = f"--{key.removesuffix('_s').replace('_', '-')} {short(str(value))}"
             overrides.append(Override(key, value, flag))
-    if faults := getattr(arguments, "fault", None):
+    faults = getattr(arguments, "fault", None)
+    if faults:
         overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
     return load(arguments.scenario, overrides)
 
 
 def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION})") -> None:
-    """How to reach the network. session: what is said of that option's default."""
+    """Add the options that select the network. session: text about the default of `--session`, for the help."""
     parser.add_argument("--endpoint", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})")
     parser.add_argument(
         "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
@@ -103,24 +112,24 @@ def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SE
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
-    """Output for scripts."""
+    """Add the option for output that scripts read."""
     parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
 
 
 def add_insecure(parser: argparse.ArgumentParser) -> None:
-    """Consent to listen without access control."""
+    """Add the option that allows to listen without access control."""
     parser.add_argument(
         "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
     )
 
 
 def add_parent(parser: argparse.ArgumentParser) -> None:
-    """For processes of `snakesim run`."""
+    """Add the hidden option of the processes that `snakesim run` starts."""
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
 
 
 def add_unchecked(parser: argparse.ArgumentParser) -> None:
-    """Of what arms."""
+    """Add the option of commands that arm a robot."""
     parser.add_argument(
         "--unchecked",
         action="store_true",
@@ -129,10 +138,11 @@ def add_unchecked(parser: argparse.ArgumentParser) -> None:
 
 
 def add_host(parser: argparse.ArgumentParser) -> None:
-    """Of a HAL host. Hidden is what a run hands to its host.
+    """Add the arguments of a HAL host.
 
-    --memory: path of an in-memory file for the host's statistics; --channel: inherited socket to the parent process;
-    --stop-port: inherited UDP socket for emergency stops.
+    Three options are hidden, because only a run uses them for its host. --memory: path of an in-memory file for the
+    host's statistics; --channel: inherited socket to the parent process; --stop-port: inherited UDP socket for
+    emergency stops.
     """
     add_scenario(parser)
     add_network(parser, "")
@@ -146,7 +156,7 @@ def add_host(parser: argparse.ArgumentParser) -> None:
 
 
 def add_service(parser: argparse.ArgumentParser) -> None:
-    """Of a service."""
+    """Add the arguments of a service."""
     parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
     add_scenario(parser)
     add_network(parser, "")
@@ -154,7 +164,7 @@ def add_service(parser: argparse.ArgumentParser) -> None:
 
 
 def check_network(arguments: argparse.Namespace) -> None:
-    """The arguments of `add_network` are valid, and do not contradict each other. Raises ConfigError."""
+    """Raise ConfigError unless the arguments of `add_network` are valid and do not contradict each other."""
     for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
         if given is not None:
             check_endpoint(given, flag)
@@ -165,14 +175,18 @@ def check_network(arguments: argparse.Namespace) -> None:
 
 
 def session_given(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
-    """The session file, if one is given. Raises ConfigError.
+    """Read the session file, if one is given. Raises ConfigError.
 
-    or_environment: for operator's tools, that of SNAKESIM_SESSION, unless an endpoint is given. What moves a robot, or
-    pretends to be one, is only where the command line puts it.
+    Args:
+        arguments: those of `add_network`.
+        or_environment: whether SNAKESIM_SESSION counts too, unless an endpoint is given. This is for an operator's
+            tools: a process that moves a robot, or stands for one, connects only as its command line says.
     """
-    path = arguments.session
+    path: Path | None = arguments.session
     if path is None and or_environment and arguments.endpoint is None and arguments.router is None:
-        path = os.environ.get(SESSION) and Path(os.environ[SESSION])
+        from_environment = os.environ.get(SESSION)
+        if from_environment:
+            path = Path(from_environment)
     if not path:
         return None
     from snakesim_hal.network.session_file import read_session
@@ -181,9 +195,12 @@ def session_given(arguments: argparse.Namespace, *, or_environment: bool = False
 
 
 def link_of(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
-    """How a process of a robot joins its network. Raises ConfigError.
+    """Return how a process of a robot joins its network. Raises ConfigError.
 
-    hosts: without a router the others connect to this process, so that it listens.
+    Args:
+        arguments: those of `add_network`.
+        config: configuration of the run.
+        hosts: whether the process is the one that the others connect to if there is no router, so that it listens.
     """
     from snakesim_hal.network.session import Link
     from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES

@@ -1,6 +1,6 @@
 """The HAL host as a program: `snakesim host SCENARIO`; `python -m snakesim_hal.programs.host_program` for a run's own.
 
-It opens the backend, and runs until it is told to stop, or until the run is over whose part it is.
+It opens the backend, and runs until it receives a stop signal, or until the run that it belongs to is over.
 """
 
 import argparse
@@ -69,54 +69,73 @@ def host(given: ProcessOptions) -> int:
 
 
 def _run(given: ProcessOptions, config: RunConfig) -> Host:
-    """Open everything, run the host to its end, close everything."""
-    wanted = given.arguments
+    """Open stop port, backend and network, run the host to its end, and close everything."""
+    arguments = given.arguments
     with contextlib.ExitStack() as opened:
-        if wanted.stop_port is not None:
-            stop_port = socket.socket(fileno=os.dup(wanted.stop_port))  # it stays open for another host
-        else:
-            stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
-            entry = LocalRobot.on(given.link, config.robot.name, config.backend, stop_port)
-            opened.enter_context(registered(entry))
-        opened.callback(stop_port.close)
+        stop_port = _open_stop_port(given, config, opened)
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
-        session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
+        network = open_session(given.link) if given.link.listen else joined(given.link, "host")
+        session = opened.enter_context(network)
         refuse_second_host(session, given.link)
-        described = backend.describe()
-        print_stderr(f"host: {describe_what_moves(described)}")  # a lab's journal has it, too
-        unchecked = ""
-        if config.controller != CHECK:
-            unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
-        folder = robot_folder(described.robot, described.backend, described.hardware)
-        backend, faults = faults_of_host(config, backend, session)
-        options = HostOptions(
-            # The end of the run.
-            max_ticks=round(config.duration_s * config.rate_hz) if wanted.once else None,
-            end_after_fault_s=wanted.end_after_fault,
-            stay=wanted.end_after_fault is None,
-            # What connects the host with its surroundings.
-            latch=EstopLatch(folder),
-            starter=HostEnd.of(wanted.channel),
-            realtime_warnings=realtime_warnings,
-            # The robot.
-            faults=faults,
-            unchecked=unchecked,
-            cables=kept_at(folder, config.robot.joint_table, described),
-        )
-        host = Host(config, backend, session, options)
-        serve_stops(stop_port, given.link.namespace or described.robot, host.request_estop)
+        host = _create_host(arguments, config, backend, session, realtime_warnings)
+        serve_stops(stop_port, given.link.namespace or host.description.robot, host.request_estop)
         on_stop_signal(host.stop)
         tune_garbage_collector()
-        memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
-        with HostRecordWriter(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
-            if config.beside:  # loaded for those who want it: it is not in the production host's way
+        memory = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
+        with HostRecordWriter(host.black_box, host.description, partial(record_of, host), arguments.out, memory):
+            if config.beside:  # imported only for runs with such services
                 from snakesim_hal.programs.in_host_service import Beside
 
                 opened.enter_context(Beside(config, session))
             host.run()
     return host
+
+
+def _open_stop_port(given: ProcessOptions, config: RunConfig, opened: contextlib.ExitStack) -> socket.socket:
+    """Use the stop port that the run has handed to this host, or open one and register the robot on this computer."""
+    inherited = given.arguments.stop_port
+    if inherited is not None:
+        stop_port = socket.socket(fileno=os.dup(inherited))  # the original stays open for another host
+    else:
+        stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
+        robot = LocalRobot.on(given.link, config.robot.name, config.backend, stop_port)
+        opened.enter_context(registered(robot))
+    opened.callback(stop_port.close)
+    return stop_port
+
+
+def _create_host(
+    arguments: argparse.Namespace,
+    config: RunConfig,
+    backend: GuardedBackend,
+    session: Session,
+    realtime_warnings: list[str],
+) -> Host:
+    """Create the host for a backend, with the files that belong to this robot."""
+    described = backend.describe()
+    print_stderr(f"host: {describe_what_moves(described)}")  # for a lab's journal too
+    unchecked = ""
+    if config.controller != CHECK:
+        unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
+    folder = robot_folder(described.robot, described.backend, described.hardware)
+    backend_with_faults, faults = faults_of_host(config, backend, session)
+    options = HostOptions(
+        # The end of the run.
+        max_ticks=round(config.duration_s * config.rate_hz) if arguments.once else None,
+        end_after_fault_s=arguments.end_after_fault,
+        stay=arguments.end_after_fault is None,
+        # What connects the host with its surroundings.
+        latch=EstopLatch(folder),
+        starter=HostEnd.of(arguments.channel),
+        realtime_warnings=realtime_warnings,
+        # The robot.
+        faults=faults,
+        unchecked=unchecked,
+        cables=kept_at(folder, config.robot.joint_table, described),
+    )
+    return Host(config, backend_with_faults, session, options)
 
 
 def refuse_second_host(session: Session, link: Link) -> None:
@@ -142,8 +161,12 @@ def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
 
 
 def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
-    """The host's present statistics. Called from another thread than its loop, which updates each value atomically."""
-    statistics, authority = host.statistics, host.authority
+    """Return the host's present statistics.
+
+    This may be called in another thread than the host's loop, which updates each value atomically.
+    """
+    statistics = host.statistics
+    authority = host.authority
     return HostRecord(
         ticks=host.black_box.ticks,
         wall_s=host.wall_s,

@@ -1,7 +1,7 @@
-"""A service beside the driver: in a thread of the host's process, over the host's own connection to the network.
+"""Runs a service in a thread of the host's process, over the host's own connection to the network.
 
-It speaks as it would from a process of its own: the same client, messages, lease and limiter, published for everybody.
-A command then comes back without a process, a socket or another scheduler in between.
+The service uses the same client, messages, lease and limiter as in a process of its own, and publishes the same.
+A command then reaches the host without another process, a socket or another scheduler in between.
 
 What it costs: service and host share one interpreter. A service that raises, hangs or computes without end in Python
 loses its lease, as anywhere. One that holds the interpreter (compiled code without end) stops the host too, and with it
@@ -24,15 +24,16 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import ServiceLoop
 
-RESTART_S = 1.0  # until a service that ended is begun again
-END_S = 0.5
+RESTART_S = 1.0  # until a service that ended is started again
+END_S = 0.5  # for all threads to end; one that hangs ends with the process
 
 
 class Beside:
-    """The services of a run whose place is the host, from `with` to its end. They wait for the host to speak."""
+    """The services of a run that run inside the host, from `with` to its end. They wait for the host to publish."""
 
     def __init__(self, config: RunConfig, session: Session) -> None:
-        self._config, self._session = config, session
+        self._config = config
+        self._session = session
         self._closing = threading.Event()
         self._threads = [
             threading.Thread(target=self._serve, args=(name,), name=name, daemon=True) for name in config.beside
@@ -47,11 +48,12 @@ class Beside:
 
     def __exit__(self, *_error: object) -> None:
         self._closing.set()
-        until = time.monotonic() + END_S
-        for thread in self._threads:  # one that hangs ends with the process
-            thread.join(max(until - time.monotonic(), 0.0))
+        deadline = time.monotonic() + END_S
+        for thread in self._threads:
+            thread.join(max(deadline - time.monotonic(), 0.0))
 
     def _serve(self, name: str) -> None:
+        """Run a service, and restart it where that is allowed, until the host ends."""
         if self._config.clock_mode == "realtime":
             set_realtime_priority(SERVICE_PRIORITY)
         while not self._closing.is_set():
@@ -60,18 +62,19 @@ class Beside:
                 return
 
     def _serve_once(self, name: str) -> None:
-        """Until it fails, or the host ends. Its token vanishes then, so that the host knows."""
-        config, over = self._config, self._closing.is_set
+        """Run a service until it fails, or the host ends. The host sees the end, because its liveliness token ends."""
         try:
-            with (
-                closing(self._session.part()) as part,
-                closing(ServiceLoop(find_service(config, name), config, part, lambda: not over())) as loop,
-            ):
-                loop.join()
-                loop.run(over)
+            with closing(self._session.part()) as part:
+                service_type = find_service(self._config, name)
+                with closing(ServiceLoop(service_type, self._config, part, self._host_runs)) as loop:
+                    loop.join()
+                    loop.run(self._closing.is_set)
         except SnakesimError as error:
             if not self._closing.is_set():
                 report_error(error, f"snakesim {name}")
-        except Exception:  # noqa: BLE001 - this thread's outermost loop: the host goes on, and stops the robot
+        except Exception:  # noqa: BLE001 - this thread's outermost loop: the host continues, and stops the robot
             if not self._closing.is_set():
                 traceback.print_exc()
+
+    def _host_runs(self) -> bool:
+        return not self._closing.is_set()

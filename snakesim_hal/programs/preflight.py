@@ -1,4 +1,4 @@
-"""Everything that a configuration names is installed, and its settings are valid."""
+"""Checks before a run that all plugins of its configuration are installed, and that their settings are valid."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,53 +14,80 @@ from snakesim_hal.model.scenario import CONTROL, RunConfig, description_of
 from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
-BY_POSE = {GUIDANCE, "navigation"}
-SERVICE_HAS = ("name", "urgent", "too_slow", "configure", "outputs", "silence", "pause")
+POSE_SERVICES = {GUIDANCE, "navigation"}  # of no use without a pose of the robot
+SERVICE_ATTRIBUTES = ("name", "urgent", "too_slow", "configure", "outputs", "silence", "pause")
 
 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
-    """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
+    """Check that everything that a run needs is installed and agrees with its settings.
 
-    Returns the configuration, with a clock mode that the backend can keep: a scenario is written for any backend.
-    run_files: False runs no code of a `./file.py:Class`, so that its settings and its clock mode are not checked.
+    Args:
+        config: configuration of the run.
+        table: the values with their origins, for messages.
+        run_files: False runs no code of a `./file.py:Class`, so that its settings and its clock mode are not checked.
+
+    Returns:
+        The configuration, with a clock mode that the backend supports: a scenario is written for any backend.
+
+    Raises:
+        ConfigError: a plugin is missing, or does not agree with its settings or with the robot.
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
     config = on_backend(config, find(BACKENDS, config.backend))
     controller = find(CONTROLLERS, config.controller)
     if controller is not None:
-        origin = table.origin if table is not None else None
-        settings = plugin_settings(controller, config.control_settings, source, config.control_section, origin)
-        config = _with_what_it_needs(config, controller)
-        if (lacks := what_it_lacks(described(config.robot), controller, config.controller)) is not None:
-            raise ConfigError(f"robot {config.robot.name!r}: {lacks}")
-        if hasattr(controller, "check"):
-            controller.check(description_of(config), settings)
+        config = _check_controller(config, controller, source, table)
     for service in config.own_services:
         find_service(config, service, find)
-    if others := [name for name in config.beside if name != CONTROL]:
-        raise ConfigError(
-            f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
-            'what plans or looks would keep the host from its ticks; leave it at "process"'
-        )
+    _check_in_host_services(config, source)
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
 
 
-def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] = find_plugin) -> Any:
-    """The class of a service: of the scenario, installed, or `./file.py:Class`. Raises ConfigError.
+def _check_controller(config: RunConfig, controller: Any, source: str, table: Table | None) -> RunConfig:
+    """Check a controller's settings and what it needs of the robot. Returns the configuration that it runs in."""
+    origin = table.origin if table is not None else None
+    settings = plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+    config = _without_pose_services(config, controller)
+    problem = what_it_lacks(described(config.robot), controller, config.controller)
+    if problem is not None:
+        raise ConfigError(f"robot {config.robot.name!r}: {problem}")
+    if hasattr(controller, "check"):
+        controller.check(description_of(config), settings)
+    return config
 
-    find: or `find_installed`, which returns None for a file, and runs none of it.
+
+def _check_in_host_services(config: RunConfig, source: str) -> None:
+    """Raise ConfigError when a service other than control is to run inside the host."""
+    others = [name for name in config.beside if name != CONTROL]
+    if others:
+        raise ConfigError(
+            f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
+            'what plans or looks would keep the host from its ticks; leave it at "process"'
+        )
+
+
+def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] = find_plugin) -> Any:
+    """Find the class of a service: of the scenario, installed, or `./file.py:Class`.
+
+    Args:
+        config: configuration of the run.
+        name: of the service.
+        find: or `find_installed`, which returns None for a file, and runs no code of it.
+
+    Raises:
+        ConfigError: the class is not found, or is not that of a service.
     """
     section = config.services.get(name)
     code = (section.code if section is not None else "") or name
     service = find(SERVICES, code)
     if service is None:
         return None
-    lacks = [part for part in SERVICE_HAS if not hasattr(service, part)]
-    if lacks:
+    missing = [attribute for attribute in SERVICE_ATTRIBUTES if not hasattr(service, attribute)]
+    if missing:
         raise ConfigError(
-            f"service {short(code)!r} has no {', '.join(lacks)}; write its class as in snakesim_hal/service.py, "
+            f"service {short(code)!r} has no {', '.join(missing)}; write its class as in snakesim_hal/service.py, "
             "or derive it from Service there"
         )
     if section is not None and service.name != name:
@@ -72,15 +99,24 @@ def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] =
 
 
 def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str) -> str | None:
-    """The first joint, and the capability, that a controller needs and does not find; None: it finds all."""
+    """Return the first joint, with the capability, that a controller needs and the robot does not have.
+
+    Args:
+        joints: of the robot.
+        controller: its class; `MODES` and `MEASURES` name what it needs of every joint.
+        name: of the controller, for the message.
+
+    Returns:
+        A message, or None if the robot has everything.
+    """
     for joint in joints:
         for mode in getattr(controller, "MODES", ()):
             if not joint.has(mode):
-                has = ", ".join(one.name.lower() for one in joint.modes if one is not Mode.PASSIVE)
+                available = [mode.name.lower() for mode in joint.modes if mode is not Mode.PASSIVE]
                 return (
-                    f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has {has}. "
-                    f"Choose another controller; or correct `modes` in [drive] or [joints.{joint.name}] of the robot "
-                    f"file"
+                    f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has "
+                    f"{', '.join(available)}. Choose another controller; or correct `modes` in [drive] or "
+                    f"[joints.{joint.name}] of the robot file"
                 )
         for measured in getattr(controller, "MEASURES", ()):
             if measured not in joint.measures:
@@ -92,44 +128,70 @@ def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str
     return None
 
 
-def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
-    """Where nobody tells the pose, a controller of joints runs alone; for any other guidance reckons it."""
-    alone = GUIDANCE in config.own_services and config.own_services.keys() <= {*BY_POSE, CONTROL}
-    # Nobody has asked for it.
-    reckons = config.dead_reckons(description_of(config)) and config.mission.localization == "pose_sensor"
-    if not (reckons and alone and getattr(controller, "NEEDS", "world") == "joints"):
+def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
+    """Leave guidance and navigation out for a controller of joints, if the robot has no pose sensor.
+
+    They stay if the scenario asks for dead reckoning itself, or has further services.
+    """
+    # A scenario that asks for dead reckoning names it as its localization.
+    dead_reckons = config.dead_reckons(description_of(config))
+    if not dead_reckons or config.mission.localization != "pose_sensor":
         return config
-    left = {name: service for name, service in config.services.items() if name not in BY_POSE}
-    return msgspec.structs.replace(config, services=left)
+    services = config.own_services.keys()
+    if GUIDANCE not in services or not services <= {*POSE_SERVICES, CONTROL}:
+        return config
+    if getattr(controller, "NEEDS", "world") != "joints":
+        return config
+    remaining = {name: service for name, service in config.services.items() if name not in POSE_SERVICES}
+    return msgspec.structs.replace(config, services=remaining)
 
 
 def on_backend(config: RunConfig, backend: Any) -> RunConfig:
-    """With the modes that joints have on a backend: all, unless its class names them in `MODES`, or each joint's."""
+    """Return the configuration with the control modes that the joints have on a backend.
+
+    These are all modes, unless the backend's class names them in `MODES`, or for each joint in `as_driven`.
+    """
     if hasattr(backend, "as_driven"):
         return msgspec.structs.replace(config, robot=backend.as_driven(config.robot))
     modes = getattr(backend, "MODES", None)
-    return config if modes is None else msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
+    if modes is None:
+        return config
+    return msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
 
 
 def backend_settings(config: RunConfig, backend: Any, table: Table | None = None) -> Any:
-    """The scenario's [backends.<name>] section, checked by the backend's own Struct. Raises ConfigError."""
-    source, origin = (f"scenario {config.name!r}", None) if table is None else (table.source, table.origin)
+    """Return the scenario's [backends.<name>] section, checked by the backend's own Struct. Raises ConfigError."""
+    source = f"scenario {config.name!r}" if table is None else table.source
+    origin = None if table is None else table.origin
     return plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
 
 
 def check_backend(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
-    """What of it concerns the backend: enough for a computer with nothing but that. Raises ConfigError."""
-    backend = (find_plugin if run_files else find_installed)(BACKENDS, config.backend)
+    """Check the part of a configuration that concerns the backend: enough for a computer that runs only a host.
+
+    Args:
+        config: configuration of the run.
+        table: the values with their origins, for messages.
+        run_files: False runs no code of a `./file.py:Class`, which is not checked then.
+
+    Returns:
+        The configuration, with a clock mode that the backend supports.
+
+    Raises:
+        ConfigError: the backend is missing, its settings are wrong, or it does not support a requested clock mode.
+    """
+    find = find_plugin if run_files else find_installed
+    backend = find(BACKENDS, config.backend)
     if backend is None:
         return config
     settings = backend_settings(config, backend, table)
     config = on_backend(config, backend)
-    paces = backend.check(config, settings)
-    if config.clock_mode in paces:
+    clock_modes = backend.check(config, settings)
+    if config.clock_mode in clock_modes:
         return config
-    asked_by = table.origin_of("clock_mode") if table is not None else f"scenario {config.name!r}"
-    if asked_by.startswith("--"):
+    origin = table.origin_of("clock_mode") if table is not None else f"scenario {config.name!r}"
+    if origin.startswith("--"):
         raise ConfigError(
-            f"{asked_by}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(paces)}"
+            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}"
         )
-    return msgspec.structs.replace(config, clock_mode=paces[0])
+    return msgspec.structs.replace(config, clock_mode=clock_modes[0])

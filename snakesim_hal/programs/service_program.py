@@ -1,8 +1,8 @@
 """A service as a program: `snakesim service NAME SCENARIO`.
 
 `python -m snakesim_hal.programs.service_program` takes the same arguments.
-It needs only the scenario, and how to reach the network. It waits for the network and for the robot, says so, and meets
-whatever host comes next: so services and hosts start in any order, on any machine, and again at will.
+It needs only the scenario, and how to reach the network. It waits for the network and for the robot, prints that it
+waits, and connects to the next host after a restart: so services and hosts start in any order, on any machine.
 """
 
 import argparse
@@ -30,8 +30,8 @@ from snakesim_hal.programs.arguments import add_service, link_of, load_scenario
 from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
 
-TRY_S = 2.0  # to connect
-TELL_S = 20.0  # between two signs of life
+CONNECT_TIMEOUT_S = 2.0  # for one attempt
+REPORT_PERIOD_S = 20.0  # between two lines that report the wait
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> Pr
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code: 0 told to stop, 1 could not go on, 2 wrong input."""
+    """Run a service. Returns the exit code: 0 stopped by a signal, 1 it could not continue, 2 wrong input."""
     parser = argparse.ArgumentParser(prog="snakesim service", description="Run one service of a robot.")
     add_service(parser)
     return run(parser.parse_args(argv))
@@ -76,8 +76,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def serve(service_type: type[Service], given: ProcessOptions) -> None:
-    """Run a service, as long as this process lives. Raises SnakesimError when it cannot go on."""
-    config, name = given.config, service_type.name
+    """Run a service, as long as this process lives. Raises SnakesimError when it cannot continue."""
+    config = given.config
+    name = service_type.name
     accept_interrupts()
     threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
     if service_type.urgent and config.clock_mode == "realtime":
@@ -85,40 +86,42 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
         drop_priority_after(config.lease_ns * 1e-9)
     with joined(given.link, name) as session:
         waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
-        with closing(ServiceLoop(service_type, config, session, waiting.goes_on)) as loop:
+        with closing(ServiceLoop(service_type, config, session, waiting.keeps_waiting)) as loop:
             loop.join()
             tune_garbage_collector()
             loop.run()
 
 
 class StartupWait:
-    """Waits for something that others start, and says so."""
+    """Limits the wait for something that others start, and reports it on the terminal."""
 
     def __init__(self, name: str, what: str) -> None:
-        self._name, self._what = name, what
-        self._began = time.monotonic()
-        self._shown_at = self._began - TELL_S
+        """Begin to wait. name: the process that waits; what: the thing that it waits for."""
+        self._name = name
+        self._what = what
+        self._began_s = time.monotonic()
+        self._reported_s = self._began_s - REPORT_PERIOD_S
 
-    def goes_on(self) -> bool:
-        """Whether to try again; call it after each try that failed."""
-        now = time.monotonic()
-        if now - self._shown_at >= TELL_S:
-            self._shown_at = now
+    def keeps_waiting(self) -> bool:
+        """Return whether to try again; call it after each attempt that failed."""
+        now_s = time.monotonic()
+        if now_s - self._reported_s >= REPORT_PERIOD_S:
+            self._reported_s = now_s
             print_stderr(f"{self._name}: waiting for {self._what}")
-        return now - self._began < START_LIMIT_S
+        return now_s - self._began_s < START_LIMIT_S
 
 
 @contextmanager
 def joined(link: Link, name: str) -> Iterator[Session]:
-    """A session, as soon as there is a network. Raises NotConnectedError when there is none in time."""
+    """Connect as soon as there is a network. Raises NotConnectedError when there is none within START_LIMIT_S."""
     waiting = StartupWait(name, f"the network: {link.endpoint}")
     with ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(link, connect_timeout_s=TRY_S))
+                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_TIMEOUT_S))
                 break
             except NotConnectedError:
-                if not waiting.goes_on():
+                if not waiting.keeps_waiting():
                     raise
         yield session
 

@@ -1,4 +1,4 @@
-"""The console's port, on loopback only. It is open before there is a page behind it: browsers that come early wait."""
+"""Opens the console's port, on loopback only, before the console starts: browsers that connect early wait."""
 
 import contextlib
 import socket
@@ -10,13 +10,18 @@ DEFAULT_PORT = 8080
 
 
 def open_port(port: int | None) -> socket.socket:
-    """A listening socket. port: None takes 8080, or any free one. Raises NotConnectedError."""
-    for wanted in (DEFAULT_PORT, 0) if port is None else (port,):
+    """Open a listening socket. Raises NotConnectedError when the port is in use.
+
+    port: None takes 8080, or any free port if that is in use.
+    """
+    candidates = (DEFAULT_PORT, 0) if port is None else (port,)
+    for candidate in candidates:
         with contextlib.suppress(OSError):
-            return socket.create_server((LOOPBACK, wanted))
+            return socket.create_server((LOOPBACK, candidate))
     raise NotConnectedError(f"--port {port}: another program listens there; choose another, or leave --port out")
 
 
 def address_of(listening: socket.socket) -> str:
-    """What to type into a browser."""
-    return f"http://{LOOPBACK}:{listening.getsockname()[1]}"
+    """Return the address of the console's page, for a browser."""
+    port = listening.getsockname()[1]
+    return f"http://{LOOPBACK}:{port}"

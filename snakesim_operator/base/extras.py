@@ -1,6 +1,6 @@
-"""What each extra of the package brings, and what to type when it is missing.
+"""Lists the packages of each extra, and prints which command installs a missing extra.
 
-A robot's computer has the core alone; a command that needs more says which `pip install` adds it.
+A robot's computer has only the core packages; a command that needs more prints the `pip install` that adds them.
 """
 
 from importlib.util import find_spec
@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import pip_install
 
-BRINGS = {  # as imported; the first extra that brings a package is the one to name for it
+BRINGS = {  # import names; messages about a package name the first extra with it
     "sim": ("mujoco",),
     "record": ("foxglove_schemas_protobuf", "google", "lz4", "mcap", "zstandard"),
     "report": ("jinja2", "markupsafe"),
@@ -31,22 +31,31 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
 
 
 def has(extra: str) -> bool:
-    """Whether an extra is installed."""
-    return not _lacking(extra)
+    """Return whether an extra is installed."""
+    return not _missing_packages(extra)
 
 
 def check(extra: str, who: str, otherwise: str = "") -> None:
-    """Raise ConfigError when an extra is missing. who: what needs it; otherwise: how to do without."""
-    if lacking := _lacking(extra):
-        raise ConfigError(f"{who} needs {', '.join(lacking)}: {pip_install(extra)}{otherwise}")
+    """Raise ConfigError when an extra is missing.
+
+    Args:
+        extra: its name.
+        who: the command or function that needs it.
+        otherwise: how to continue without it, added to the message.
+    """
+    missing = _missing_packages(extra)
+    if missing:
+        raise ConfigError(f"{who} needs {', '.join(missing)}: {pip_install(extra)}{otherwise}")
 
 
 def explained(error: ModuleNotFoundError) -> ConfigError | None:
-    """What to say of an import that failed; None when no extra brings the package."""
+    """Return an error that names the extra with a package that cannot be imported; None when no extra has it."""
     package = (error.name or "").partition(".")[0]
-    extra = next((extra for extra, packages in BRINGS.items() if package in packages), None)
-    return None if extra is None else ConfigError(f"this command needs {package}: {pip_install(extra)}")
+    for extra, packages in BRINGS.items():
+        if package in packages:
+            return ConfigError(f"this command needs {package}: {pip_install(extra)}")
+    return None
 
 
-def _lacking(extra: str) -> list[str]:
+def _missing_packages(extra: str) -> list[str]:
     return [package for package in BRINGS[extra] if find_spec(package) is None]

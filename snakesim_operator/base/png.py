@@ -1,21 +1,41 @@
-"""PNG without a library for pictures: lossless, by zlib alone. Source: W3C, Portable Network Graphics (PNG)."""
+"""Writes PNG images with zlib alone, lossless. Source: W3C, Portable Network Graphics (PNG) Specification."""
 
 import struct
 import zlib
 
-QUICK = 1  # zlib's level: a picture of a second ago is of no use
+COMPRESSION_LEVEL = 1  # the fastest: images are shown live
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY, RGB = 0, 2  # color types
+NO_FILTER = b"\0"  # precedes each row
 
 
 def png(width: int, height: int, pixels: bytes, *, bits: int, color: bool) -> bytes:
-    """A picture of rows without padding, from the top; bits: of a channel, 8 or 16, the latter big endian."""
-    stride = width * (3 if color else 1) * bits // 8
-    rows = b"".join(b"\0" + pixels[i * stride : (i + 1) * stride] for i in range(height))  # 0: not filtered
-    header = struct.pack(">IIBBBBB", width, height, bits, RGB if color else GREY, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows, QUICK)), (b"IEND", b""))
-    return SIGNATURE + b"".join(_chunk(name, data) for name, data in chunks)
+    """Encode an image as PNG.
+
+    Args:
+        width: in pixels.
+        height: in pixels.
+        pixels: rows without padding, from the top.
+        bits: of a channel, 8 or 16; 16 is big endian.
+        color: whether a pixel has the channels red, green and blue; otherwise it has one, gray.
+    """
+    channels = 3 if color else 1
+    row_bytes = width * channels * bits // 8
+    rows = [pixels[i * row_bytes : (i + 1) * row_bytes] for i in range(height)]
+    filtered = b"".join(NO_FILTER + row for row in rows)
+    compression = filtering = interlacing = 0  # the only standard methods; not interlaced
+    header = struct.pack(">IIBBBBB", width, height, bits, RGB if color else GREY, compression, filtering, interlacing)
+    return b"".join(
+        [
+            SIGNATURE,
+            _chunk(b"IHDR", header),
+            _chunk(b"IDAT", zlib.compress(filtered, COMPRESSION_LEVEL)),
+            _chunk(b"IEND", b""),
+        ]
+    )
 
 
 def _chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    """Return a chunk: length, name, data and checksum."""
+    checksum = zlib.crc32(name + data)
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", checksum)

@@ -1,4 +1,4 @@
-"""The network options of a command. Imports nothing of the network: an emergency stop needs them first of all."""
+"""Reads the network options of a command. It does not import the network: an emergency stop reads these first."""
 
 import argparse
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class RobotSelection:
     session: "SessionFile | None" = None  # how to connect to `endpoint`, which is its first one then
 
     def local(self) -> list[LocalRobot]:
-        """Addressed robots on this computer."""
+        """Return the addressed robots that run on this computer."""
         return [
             robot
             for robot in local_robots()
@@ -32,21 +32,23 @@ class RobotSelection:
         ]
 
     def endpoints(self) -> list[str]:
-        """Endpoints of all networks to search."""
+        """Return the endpoints of all networks to search."""
         return [link.endpoint for link in self.networks()]
 
     def networks(self) -> "list[Link]":
-        """Every network to search, for the addressed namespace."""
+        """Return every network to search, for the addressed namespace."""
         from snakesim_hal.network.session import Link
 
         if self.endpoint is not None:
             return [Link(self.endpoint, self.namespace, session=self.session)]
-        found = {robot.endpoint: _link_to(robot, self.namespace) for robot in self.local()}
-        return list({**found, DEFAULT_ENDPOINT: found.get(DEFAULT_ENDPOINT, Link(namespace=self.namespace))}.values())
+        links = {robot.endpoint: _link_to(robot, self.namespace) for robot in self.local()}
+        if DEFAULT_ENDPOINT not in links:
+            links[DEFAULT_ENDPOINT] = Link(namespace=self.namespace)
+        return list(links.values())
 
 
 def selection_of(arguments: argparse.Namespace) -> RobotSelection:
-    """What `add_network`'s arguments address. Raises ConfigError."""
+    """Return the robots that the arguments of `add_network` address. Raises ConfigError."""
     check_network(arguments)
     session = session_given(arguments, or_environment=True)
     if session is not None:
@@ -55,7 +57,7 @@ def selection_of(arguments: argparse.Namespace) -> RobotSelection:
 
 
 def _link_to(robot: LocalRobot, namespace: str | None) -> "Link":
-    """How a robot on this computer has joined its network, if this user may read that file."""
+    """Return how to reach a robot on this computer: by its session file, if this user may read that."""
     from snakesim_hal.network.session import Link
     from snakesim_hal.network.session_file import read_session
 

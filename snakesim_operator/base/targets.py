@@ -24,33 +24,35 @@ def flags_of(link: Link, robot: str | None) -> str:
 
 
 def robots_on(session: Session) -> list[str]:
-    """The namespaces of all robots whose HAL is alive on a network."""
+    """Return the namespaces of all robots whose HAL is alive on a network."""
     return [namespace_of(key) for key in session.present(HAL_EVERYWHERE, SEARCH_S)]
 
 
 def namespace_of(key: str) -> str:
-    """The namespace of a full key."""
-    split = keys.split_namespace(key)
-    return key if split is None else split[0]
+    """Return the namespace of a full key, or the key itself if it has none."""
+    namespace_and_key = keys.split_namespace(key)
+    if namespace_and_key is None:
+        return key
+    return namespace_and_key[0]
 
 
 def find_robots(where: RobotSelection) -> list[Link]:
-    """Every addressed robot that can be reached."""
+    """Return every addressed robot that can be reached."""
     found: list[Link] = []
     for link in where.networks():
         try:
             with open_session(link, SEARCH_S) as session:
-                if link.namespace is not None:
-                    found += [link] if session.present(keys.alive("hal"), SEARCH_S) else []
-                else:
+                if link.namespace is None:
                     found += [replace(link, namespace=name) for name in robots_on(session)]
+                elif session.present(keys.alive("hal"), SEARCH_S):
+                    found.append(link)
         except NotConnectedError:
             continue
     return found
 
 
 def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tuple[Link, Session]]:
-    """One on every network that answers, for whatever is published there. Raises NotConnectedError."""
+    """Open a session on every network that answers, for messages of any size. Raises NotConnectedError without one."""
     found: list[tuple[Link, Session]] = []
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
@@ -64,7 +66,7 @@ def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tup
 
 
 def only_robot(where: RobotSelection, command: str) -> Link:
-    """The single addressed robot. Raises NotConnectedError when there is none, RefusedError when there are more."""
+    """Return the single addressed robot. Raises NotConnectedError for none, RefusedError for more than one."""
     found = find_robots(where)
     if not found:
         named = "" if where.namespace is None else f" named {where.namespace}"

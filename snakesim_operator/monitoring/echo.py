@@ -6,7 +6,7 @@ import json
 import statistics
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from queue import Empty
 from typing import Any
 
@@ -15,7 +15,7 @@ import msgspec
 from snakesim_hal.base.errors import ConfigError, WireError, did_you_mean, short
 from snakesim_hal.base.terminal import print_stderr, say
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, intersects, key_expression
+from snakesim_hal.network.session import Arrival, Session, intersects, key_expression
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import OwnSample
 from snakesim_operator.base.targets import RobotSelection, sessions_on
@@ -26,45 +26,72 @@ MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower tha
 
 
 def echo(key: str | None, where: RobotSelection, *, rate_only: bool, count: int | None) -> int:
-    """Print messages on a key, from every addressed robot. Raises NotConnectedError, ConfigError.
+    """Print messages on a key, from every addressed robot.
 
-    key: relative to the robot, wildcards allowed; None: list the keys. count: after which it ends; None: never.
+    Args:
+        key: relative to the robot, wildcards allowed; None: print the list of keys.
+        where: selects the robots.
+        rate_only: whether to print the rate instead of the messages.
+        count: of messages or rates after which the command ends; None: it does not end.
+
+    Raises:
+        NotConnectedError: no robot is reachable.
+        ConfigError: there is no such key.
     """
     if key is None:
         for line in _key_lines():
             say(line)
         print_stderr("`snakesim echo KEY` prints the messages, --hz their rate; `snakesim top` shows all rates at once")
         return 0
-    relative = key_expression(key.strip("/"))
-    rows = [row for row in _echoed() if intersects(relative, row.key)]
+    relative_key = key_expression(key.strip("/"))
+    rows = [row for row in _published_rows() if intersects(relative_key, row.key)]
     if not rows:
-        meant = did_you_mean(key, [row.key for row in _echoed()]).strip()
-        lines = [*_key_lines(), meant] if meant else _key_lines()
+        hint = did_you_mean(key, [row.key for row in _published_rows()]).strip()
+        lines = [*_key_lines(), hint] if hint else _key_lines()
         raise ConfigError(f"there is no key {short(key)!r}; available keys:", *lines)
-    latched = tuple(row.key for row in rows if row.kind == "latched")
-    within = "" if where.namespace is not None else "**/"
-    pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{one}" for one in latched)
-    waiting = OutputQueue()
+    prefix = "" if where.namespace is not None else "**/"
+    queue = OutputQueue()
     with contextlib.ExitStack() as stack:
         for _, session in sessions_on(where, stack):
-            # A latched value is older than the streams: a subscriber to both would drop it as too old.
-            for one in latched_keys:
-                session.on_latched_arrival(one, waiting.only(lambda found: intersects(pattern, found)))
-            if len(latched) < len(rows):
-                session.on_arrival(
-                    pattern, waiting.only(lambda found: not any(intersects(one, found) for one in latched_keys))
-                )
-        (_print_rates if rate_only else _print_messages)(waiting, count)
+            _subscribe(session, queue, key_expression(f"{prefix}{relative_key}"), prefix, rows)
+        if rate_only:
+            _print_rates(queue, count)
+        else:
+            _print_messages(queue, count)
     return 0
 
 
-def _echoed() -> list[keys.Row]:
+def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.Row]) -> None:
+    """Subscribe to the latched keys and to the streams separately.
+
+    A latched value is older than the streams: a subscriber to both would drop it as too old.
+
+    Args:
+        session: of one network.
+        queue: gets the messages.
+        pattern: the requested keys, with wildcards.
+        prefix: of every key on this network.
+        rows: of the key space that the pattern matches.
+    """
+    latched_keys = [f"{prefix}{row.key}" for row in rows if row.kind == "latched"]
+    for latched_key in latched_keys:
+        session.on_latched_arrival(latched_key, queue.filtered_put(lambda key: intersects(pattern, key)))
+    if len(latched_keys) < len(rows):
+        session.on_arrival(
+            pattern,
+            queue.filtered_put(lambda key: not any(intersects(latched_key, key) for latched_key in latched_keys)),
+        )
+
+
+def _published_rows() -> list[keys.Row]:
+    """Return the rows of the key space whose messages are published."""
     return [row for row in keys.SPACE if row.kind in ("stream", "latched")]
 
 
 def _key_lines() -> list[str]:
-    width = max(len(row.key) for row in _echoed())
-    return [f"  {row.key:<{width}}  {row.about}" for row in _echoed()]
+    rows = _published_rows()
+    width = max(len(row.key) for row in rows)
+    return [f"  {row.key:<{width}}  {row.about}" for row in rows]
 
 
 class OutputQueue:
@@ -77,7 +104,7 @@ class OutputQueue:
         self._dropped = 0
 
     def put(self, arrival: Arrival) -> None:
-        """Add one; in Zenoh's threads."""
+        """Add a sample. This runs in Zenoh's threads."""
         with self._lock:
             if self._bytes + len(arrival.payload) > MAX_WAITING_BYTES:
                 self._dropped += 1
@@ -85,17 +112,17 @@ class OutputQueue:
             self._bytes += len(arrival.payload)
         self._arrivals.put(arrival)
 
-    def only(self, wanted: Callable[[str], bool]) -> Callable[[Arrival], None]:
-        """Adds samples at keys for which `wanted` is true."""
+    def filtered_put(self, is_wanted: Callable[[str], bool]) -> Callable[[Arrival], None]:
+        """Return a function that adds a sample if `is_wanted` is true for its key."""
 
         def put(arrival: Arrival) -> None:
-            if wanted(arrival.key):
+            if is_wanted(arrival.key):
                 self.put(arrival)
 
         return put
 
     def get(self, timeout: float | None = None) -> Arrival:
-        """The oldest one. Raises queue.Empty."""
+        """Return the oldest sample. Raises queue.Empty after `timeout` in s; None waits without a limit."""
         if self._dropped and self._arrivals.empty():
             print_stderr(f"{self._dropped} messages were dropped: they came faster than they could be printed")
             self._dropped = 0
@@ -105,45 +132,66 @@ class OutputQueue:
         return arrival
 
 
-def _print_messages(waiting: OutputQueue, count: int | None) -> None:
-    for _ in itertools.count() if count is None else range(count):
-        arrival = waiting.get()
-        content = {"key": arrival.key, **_content(arrival)}
+def _print_messages(queue: OutputQueue, count: int | None) -> None:
+    for _ in _repeat(count):
+        arrival = queue.get()
+        content = {"key": arrival.key, **_decode_content(arrival)}
         say(json.dumps(content, ensure_ascii=False, separators=(",", ":")))
 
 
-def _content(arrival: Arrival) -> dict[str, Any]:
+def _repeat(count: int | None) -> Iterable[int]:
+    """Return a range of this length, or an endless one."""
+    return itertools.count() if count is None else range(count)
+
+
+def _decode_content(arrival: Arrival) -> dict[str, Any]:
+    """Return the message, or the error that prevents its decoding, for JSON."""
     message = keys.message_at(arrival.key)
-    if message is None and (split := keys.split_namespace(arrival.key)) is not None:
-        message = keys.message_at(split[1])
+    if message is None:
+        namespace_and_key = keys.split_namespace(arrival.key)
+        if namespace_and_key is not None:
+            message = keys.message_at(namespace_and_key[1])
     if message is None:
         return {"error": "no message is known on this key"}
     try:
         decoded = decoder_of(message).decode(arrival.payload, arrival.encoding)
-        if message is OwnSample:  # with the fields that only its robot describes, as they were sent
-            return {"message": msgspec.msgpack.decode(arrival.payload)}
-        return {"message": msgspec.to_builtins(decoded)}
     except WireError as error:
         return {"error": str(error)}
+    if message is OwnSample:  # as it was sent, because only its robot describes some of the fields
+        return {"message": msgspec.msgpack.decode(arrival.payload)}
+    return {"message": msgspec.to_builtins(decoded)}
 
 
-def _print_rates(waiting: OutputQueue, count: int | None) -> None:
-    for _ in itertools.count() if count is None else range(count):
-        stamps: dict[str, list[int]] = {}
-        until = time.monotonic() + RATE_PERIOD_S
-        while (left := until - time.monotonic()) > 0:
-            try:
-                arrival = waiting.get(timeout=left)
-            except Empty:
-                break
-            stamps.setdefault(arrival.key, []).append(arrival.monotonic_ns)
-        for key, times in sorted(stamps.items()):
-            gaps_ms = [(b - a) / 1e6 for a, b in itertools.pairwise(times)]
-            if gaps_ms:
-                spread = statistics.pstdev(gaps_ms)
-                say(
-                    f"{key}: {1000 / statistics.fmean(gaps_ms):.1f} Hz  gap {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms"
-                    f"  deviation {spread:.2f} ms  over {len(times)}"
-                )
-        if not stamps:
+def _print_rates(queue: OutputQueue, count: int | None) -> None:
+    """Print the rate of each key once in RATE_PERIOD_S."""
+    for _ in _repeat(count):
+        times_ns = _collect_times(queue)
+        for key, key_times_ns in sorted(times_ns.items()):
+            _print_rate(key, key_times_ns)
+        if not times_ns:
             say("nothing arrives")
+
+
+def _collect_times(queue: OutputQueue) -> dict[str, list[int]]:
+    """Return the arrival times of each key's messages within RATE_PERIOD_S."""
+    times_ns: dict[str, list[int]] = {}
+    deadline = time.monotonic() + RATE_PERIOD_S
+    while (left_s := deadline - time.monotonic()) > 0:
+        try:
+            arrival = queue.get(timeout=left_s)
+        except Empty:
+            break
+        times_ns.setdefault(arrival.key, []).append(arrival.monotonic_ns)
+    return times_ns
+
+
+def _print_rate(key: str, times_ns: list[int]) -> None:
+    gaps_ms = [(later - earlier) / 1e6 for earlier, later in itertools.pairwise(times_ns)]
+    if not gaps_ms:
+        return
+    rate_hz = 1000 / statistics.fmean(gaps_ms)
+    deviation_ms = statistics.pstdev(gaps_ms)
+    say(
+        f"{key}: {rate_hz:.1f} Hz  gap {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms"
+        f"  deviation {deviation_ms:.2f} ms  over {len(times_ns)}"
+    )

@@ -1,10 +1,9 @@
 """`snakesim preview`: small, compressed copies of a robot's images, for viewers behind a slow link.
 
-It runs on the robot's machine, beside the host, and reads the full images there. A viewer far away subscribes to
-`preview/**` instead of `sensor/depth/*`: nothing changes for those who read the full images. A program, and no part of
-the host, because compressing takes CPU time that must not come from a control tick. An image is fetched and compressed
-only while somebody looks at its preview, so there is no old picture for later viewers: the first one comes within
-1/hz seconds.
+It runs on the robot's computer and reads the full images there. A distant viewer subscribes to `preview/**` instead of
+`sensor/depth/*`: nothing changes for subscribers to the full images. This is a program of its own, because compressing
+takes CPU time that must not come from a control tick. An image is read and compressed only while its preview has a
+subscriber. So a new viewer gets no old picture: the first one arrives within 1/hz seconds.
 """
 
 import io
@@ -25,83 +24,102 @@ from snakesim_hal.wire.quantities import MAX_PREVIEW_BYTES
 from snakesim_operator.base import extras
 from snakesim_operator.base.targets import RobotSelection, only_robot
 
+MIN_HZ = 0.01
 MAX_HZ = 10.0
-WIDEST, NARROWEST = 640, 16  # pixels
+MIN_WIDTH_PX = 16
+MAX_WIDTH_PX = 640
 JPEG_QUALITY = 70
-DESCRIBED_S = 5.0
-KEPT = 4  # images: a few of noise do not displace the valid one
+DESCRIPTION_TIMEOUT_S = 5.0
+QUEUED_IMAGES = 4  # a few invalid images do not displace the valid one
 
 
 def preview(where: RobotSelection, hz: float, width: int) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
     extras.check("preview", "`snakesim preview`")
-    if not 0.01 <= hz <= MAX_HZ:
-        raise ConfigError(f"--hz {hz:g}: give from 0.01 to {MAX_HZ:g} Hz")
-    if not NARROWEST <= width <= WIDEST:
-        raise ConfigError(f"--width {width}: give from {NARROWEST} to {WIDEST} pixels")
+    if not MIN_HZ <= hz <= MAX_HZ:
+        raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz")
+    if not MIN_WIDTH_PX <= width <= MAX_WIDTH_PX:
+        raise ConfigError(f"--width {width}: give from {MIN_WIDTH_PX} to {MAX_WIDTH_PX} pixels")
     link = only_robot(where, "preview")
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
+        robot = session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
         if robot is None:
-            raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIBED_S:g} s")
+            raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s")
         cameras = cameras_of(session, robot, width)
         if not cameras:
             raise ConfigError(f"{link.namespace} has no camera: nothing at {keys.DEPTH_ALL} or {keys.COLOUR_ALL}")
         say(f"{link.namespace}: previews of {', '.join(camera.key for camera in cameras)}; Ctrl-C ends it")
         while True:
             for camera in cameras:
-                if (why := camera.turn()) is not None:
-                    say(why)
+                problem = camera.publish_preview()
+                if problem is not None:
+                    say(problem)
             time.sleep(1.0 / hz)
 
 
 def cameras_of(session: Session, robot: Description, width: int) -> list["Camera"]:
-    """One for each stream of images."""
-    kinds = {sensor.key: keys.message_at(sensor.key) for sensor in robot.sensors}
-    return [Camera(session, robot, key, kind, width) for key, kind in kinds.items() if kind in (DepthImage, ColorImage)]
+    """Return a camera for each stream of images that the robot publishes."""
+    cameras: dict[str, Camera] = {}
+    for sensor in robot.sensors:
+        message = keys.message_at(sensor.key)
+        if message in (DepthImage, ColorImage) and sensor.key not in cameras:
+            cameras[sensor.key] = Camera(session, robot, sensor.key, message, width)
+    return list(cameras.values())
 
 
 class Camera:
-    """The images of one key, and their previews."""
+    """Reads the images of one key, and publishes their previews."""
 
     def __init__(self, session: Session, robot: Description, key: str, kind: type[Any], width: int) -> None:
-        self._session, self._robot, self._kind, self._width = session, robot, kind, width
+        """Publish previews, not read images yet. kind: the message of the images; width: the maximum in pixels."""
         self.key = key
+        self._session = session
+        self._robot = robot
+        self._kind = kind
+        self._width = width
         self._publisher: Publisher[Preview] = session.publisher(keys.preview(key), Preview)
         self._reader: Reader[Any] | None = None
 
-    def turn(self) -> str | None:
-        """Publish a preview of the newest image, if anybody looks at it. Returns why it was left out."""
+    def publish_preview(self) -> str | None:
+        """Publish a preview of the newest image, if there is a subscriber.
+
+        Returns:
+            Why the image was left out, or None.
+        """
         if not self._publisher.heard():
             if self._reader is not None:
                 self._session.stop_reading(self._reader)
                 self._reader = None
             return None
         if self._reader is None:
-            self._reader = self._session.reader(self.key, self._kind, depth=KEPT)
+            self._reader = self._session.reader(self.key, self._kind, depth=QUEUED_IMAGES)
         image = self._reader.newest(lambda image: mismatch(image, self._robot) is None)
         if image is None:
             return None
-        made = preview_of(image, self._width)
-        if len(made.data) > MAX_PREVIEW_BYTES:
-            return f"{self.key}: the preview has {len(made.data)} bytes, at most {MAX_PREVIEW_BYTES}; give less --width"
-        self._publisher.put(made)
+        preview = preview_of(image, self._width)
+        if len(preview.data) > MAX_PREVIEW_BYTES:
+            size = len(preview.data)
+            return f"{self.key}: the preview has {size} bytes, at most {MAX_PREVIEW_BYTES}; give less --width"
+        self._publisher.put(preview)
         return None
 
 
 def preview_of(image: DepthImage | ColorImage, width: int) -> Preview:
-    """A copy of at most this width. Depth: every n-th pixel as it is, since a mean of near and far is neither."""
+    """Return a compressed copy that is at most `width` pixels wide.
+
+    A depth image keeps every n-th pixel unchanged, because the mean of a near and a far point is neither.
+    """
     import PIL.Image
 
-    step = -(-image.width // width)
+    step = -(-image.width // width)  # rounded up
     file = io.BytesIO()
     if isinstance(image, DepthImage):
-        counts = np.frombuffer(image.depth, dtype="<u2").reshape(image.height, image.width)[::step, ::step]
-        small = PIL.Image.fromarray(np.ascontiguousarray(counts))
+        counts = np.frombuffer(image.depth, dtype="<u2").reshape(image.height, image.width)
+        small = PIL.Image.fromarray(np.ascontiguousarray(counts[::step, ::step]))
         small.save(file, "PNG")
     else:
-        small = PIL.Image.frombytes("RGB", (image.width, image.height), image.rgb)
-        small = small.reduce(step)
+        full = PIL.Image.frombytes("RGB", (image.width, image.height), image.rgb)
+        small = full.reduce(step)
         small.save(file, "JPEG", quality=JPEG_QUALITY)
     return Preview(
         tick=image.tick,

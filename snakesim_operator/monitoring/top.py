@@ -67,15 +67,15 @@ def _listen(namespace: str | None, session: Session) -> Traffic:
 
     def take_strange(arrival: Arrival) -> None:
         if not traffic.is_known(arrival.key):
-            traffic.take(arrival)
+            traffic.add(arrival)
 
     # Key by key, because a lab's router may grant no wildcard; the last value of those that are latched, too.
     for row in keys.SPACE:
         key = row.key if namespace is not None else f"**/{row.key}"
         if row.kind == "latched":
-            session.on_latched_arrival(key, traffic.take)
+            session.on_latched_arrival(key, traffic.add)
         elif row.kind == "stream":
-            session.on_arrival(key, traffic.take)
+            session.on_arrival(key, traffic.add)
     session.on_arrival("**", take_strange)
     return traffic
 

@@ -1,4 +1,7 @@
-"""What arrives on a network, key by key: rate, jitter, size and age, and how long commands take. Of bounded size."""
+"""Measures what arrives on a network: rate, jitter, size and age for each key, and the latency of commands.
+
+The memory is bounded: only the newest arrivals of each key are kept.
+"""
 
 import itertools
 import statistics
@@ -24,15 +27,16 @@ from snakesim_hal.wire.messages import (
     Timing,
 )
 
-MAX_KEYS = 512  # a stranger may invent more; they are only counted
+MAX_KEYS = 512  # an unknown client may invent more; arrivals on those are only counted
 KEPT = 256  # newest arrivals of a key
-WINDOW_NS = 5_000_000_000
+WINDOW_NS = 5_000_000_000  # rates are computed over this duration
 TIMED: dict[str, type[Message]] = {
     keys.JOINTS: JointState,
     keys.JOINT_COMMAND: JointCommand,
     keys.APPLIED: AppliedCommand,
 }
-TIMED_KEPT, TIMED_BYTES = 1024, 16384  # states and commands for the latency; a command of 256 joints has 4 kB
+TIMED_KEPT = 1024  # newest states and commands, from which the latency is computed
+TIMED_BYTES = 16384  # larger ones are not kept; a command of 256 joints has 4 kB
 
 decoder_of = cache(Decoder)
 
@@ -49,156 +53,215 @@ class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
     gap_max_ms: float | None
     bytes: int  # of the newest message
     heard_ago_s: float
-    age_ms: float | None  # of the newest data, by its stamp and the robot's clock
+    age_ms: float | None  # of the newest data, by its timestamp and the robot's clock
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
-    """From a joint state to the command that answers it, and to the motors. A busy computer delays what is heard."""
+    """Time from a joint state to the command that answers it, and to the motors.
+
+    A busy computer delays the arrivals that are measured here.
+    """
 
     robot: str
     heard_median_ms: float  # from the state's arrival here to the command's
     heard_p99_ms: float
-    motors_median_ms: float | None  # from the state's stamp to the first tick that applied the command; robot time
+    motors_median_ms: float | None  # from the state's timestamp to the first tick that applied the command; robot time
     motors_p99_ms: float | None
     count: int
 
 
 class Traffic:
-    """Collects arrivals, from any thread; `lines` and `latencies` evaluate them."""
+    """Collects arrivals, from any thread; the other methods evaluate them."""
 
     def __init__(self, namespace: str | None = None) -> None:
-        """namespace: of the only robot; None when keys begin with one."""
+        """Begin without arrivals. namespace: of the only robot; None when keys begin with a namespace."""
+        self.keys_left_out = 0  # arrivals on keys beyond MAX_KEYS
         self._namespace = namespace
         self._lock = threading.Lock()
-        self._newest: dict[str, Arrival] = {}
-        self._times: dict[str, deque[int]] = {}
-        self._timed: dict[tuple[str, type[Message]], deque[Arrival]] = {}
-        self.keys_left_out = 0  # arrivals on keys beyond MAX_KEYS
+        self._newest: dict[str, Arrival] = {}  # by key
+        self._times_ns: dict[str, deque[int]] = {}  # by key
+        self._timed: dict[tuple[str, type[Message]], deque[Arrival]] = {}  # by prefix of the key and message
 
-    def take(self, arrival: Arrival) -> None:
-        """Count one; in Zenoh's threads, so that nothing is decoded here."""
+    def add(self, arrival: Arrival) -> None:
+        """Add an arrival. This runs in Zenoh's threads, so no message is decoded here."""
         with self._lock:
             if arrival.key not in self._newest and len(self._newest) >= MAX_KEYS:
                 self.keys_left_out += 1
                 return
             self._newest[arrival.key] = arrival
-            self._times.setdefault(arrival.key, deque(maxlen=KEPT)).append(arrival.monotonic_ns)
-            for suffix, message in TIMED.items():
-                if f"/{arrival.key}".endswith(f"/{suffix}") and len(arrival.payload) <= TIMED_BYTES:
-                    at = (arrival.key.removesuffix(suffix), message)
-                    self._timed.setdefault(at, deque(maxlen=TIMED_KEPT)).append(arrival)
+            self._times_ns.setdefault(arrival.key, deque(maxlen=KEPT)).append(arrival.monotonic_ns)
+            if len(arrival.payload) <= TIMED_BYTES:
+                self._add_timed(arrival)
+
+    def _add_timed(self, arrival: Arrival) -> None:
+        """Keep a state or a command, from which the latency is computed."""
+        for suffix, message in TIMED.items():
+            if f"/{arrival.key}".endswith(f"/{suffix}"):
+                prefix = arrival.key.removesuffix(suffix)
+                self._timed.setdefault((prefix, message), deque(maxlen=TIMED_KEPT)).append(arrival)
 
     def lines(self, now_ns: int) -> list[KeyTraffic]:
-        """Every key, sorted by robot and key."""
+        """Return the traffic of every key, sorted by robot and key. now_ns: of the monotonic clock."""
         with self._lock:
             newest = dict(self._newest)
-            times = {key: [t for t in stamps if now_ns - t <= WINDOW_NS] for key, stamps in self._times.items()}
-        content = {key: _decoded(self._split(key)[1], arrival) for key, arrival in newest.items()}
-        robot_ns = {self._split(key)[0]: said.timestamp_ns for key, said in content.items() if isinstance(said, Clock)}
-        holders = {self._split(key)[0]: said.lease_holder for key, said in content.items() if isinstance(said, Status)}
-        found: list[KeyTraffic] = []
+            recent_ns: dict[str, list[int]] = {}
+            for key, times_ns in self._times_ns.items():
+                recent_ns[key] = [time_ns for time_ns in times_ns if now_ns - time_ns <= WINDOW_NS]
+        contents = {key: _decode(self._split(key)[1], arrival) for key, arrival in newest.items()}
+        clocks_ns = self._robot_clocks(contents)
+        holders = self._lease_holders(contents)
+        lines: list[KeyTraffic] = []
         for key, arrival in newest.items():
             robot, relative = self._split(key)
-            row, said = keys.row_at(relative), content[key]
-            writer = None if row is None else row.writer
-            if writer is not None and writer.startswith("each "):
-                writer = keys.service_of(relative)
-            if relative == keys.JOINT_COMMAND and holders.get(robot):
-                writer = f"{holders[robot]} (lease)"
-            timestamp_ns, clock_ns = getattr(said, "timestamp_ns", None), robot_ns.get(robot)
-            found.append(
+            content = contents[key]
+            lines.append(
                 KeyTraffic(
                     robot=robot,
                     key=relative,
-                    writer=writer,
-                    failure=said if isinstance(said, str) else "",
-                    **_rhythm(times[key]),
+                    writer=_find_writer(relative, holders.get(robot)),
+                    failure=content if isinstance(content, str) else "",
+                    **_measure_rhythm(recent_ns[key]),
                     bytes=len(arrival.payload),
                     heard_ago_s=max(now_ns - arrival.monotonic_ns, 0) * 1e-9,
-                    age_ms=None if timestamp_ns is None or clock_ns is None else max(clock_ns - timestamp_ns, 0) * 1e-6,
+                    age_ms=_age_ms(content, clocks_ns.get(robot)),
                 )
             )
-        return sorted(found, key=lambda line: (line.robot, line.writer is None, line.key))
+        return sorted(lines, key=lambda line: (line.robot, line.writer is None, line.key))
+
+    def _robot_clocks(self, contents: dict[str, Any]) -> dict[str, int]:
+        """Return the newest time in ns that each robot published."""
+        return {self._split(key)[0]: clock.timestamp_ns for key, clock in contents.items() if isinstance(clock, Clock)}
+
+    def _lease_holders(self, contents: dict[str, Any]) -> dict[str, str | None]:
+        """Return the holder of each robot's lease; None if the lease is not held."""
+        return {
+            self._split(key)[0]: status.lease_holder for key, status in contents.items() if isinstance(status, Status)
+        }
 
     def latencies(self) -> list[Latency]:
-        """Of every robot that is commanded."""
+        """Return the latency of every robot that is commanded."""
         with self._lock:
-            timed = {at: list(arrivals) for at, arrivals in self._timed.items()}
-        found: list[Latency] = []
-        for (prefix, message), commands in sorted(timed.items(), key=lambda item: item[0][0]):
-            if message is not JointCommand:
+            timed = {prefix_and_message: list(arrivals) for prefix_and_message, arrivals in self._timed.items()}
+        latencies: list[Latency] = []
+        for prefix in sorted(prefix for prefix, message in timed if message is JointCommand):
+            latency = self._measure_latency(
+                prefix,
+                states=_decode_all(timed.get((prefix, JointState), []), JointState),
+                commands=_decode_all(timed[prefix, JointCommand], JointCommand),
+                applied=_decode_all(timed.get((prefix, AppliedCommand), []), AppliedCommand),
+            )
+            if latency is not None:
+                latencies.append(latency)
+        return latencies
+
+    def _measure_latency(
+        self,
+        prefix: str,
+        states: list[tuple[Any, int]],
+        commands: list[tuple[Any, int]],
+        applied: list[tuple[Any, int]],
+    ) -> Latency | None:
+        """Match each command with the state that it answers, and with the tick that applied it first.
+
+        Args:
+            prefix: of the robot's keys.
+            states: joint states with the time of their arrival in ns, as the other two.
+            commands: joint commands.
+            applied: commands that the host has applied.
+
+        Returns:
+            The latency; None when no command answers a known state.
+        """
+        state_by_tick = {state.tick: (state, arrival_ns) for state, arrival_ns in states}
+        applied_ns: dict[int, int] = {}  # robot time by sequence number of the command
+        for command, _ in applied:
+            applied_ns.setdefault(command.sequence, command.timestamp_ns)
+        arrival_ms: list[float] = []
+        motors_ms: list[float] = []
+        for command, command_arrival_ns in commands:
+            if command.tick not in state_by_tick:
                 continue
-            states = {said.tick: (said, at) for said, at in _read(timed.get((prefix, JointState), []), JointState)}
-            answers = [(said, at) for said, at in _read(commands, message) if said.tick in states]
-            heard_ms = [(at - states[said.tick][1]) * 1e-6 for said, at in answers]
-            acted: dict[int, int] = {}  # sequence -> robot time
-            for said, _ in _read(timed.get((prefix, AppliedCommand), []), AppliedCommand):
-                acted.setdefault(said.sequence, said.timestamp_ns)
-            motors_ms = [
-                (acted[said.sequence] - states[said.tick][0].timestamp_ns) * 1e-6
-                for said, _ in answers
-                if said.sequence in acted
-            ]
-            if heard_ms:
-                heard, motors = _middle_and_most(heard_ms), _middle_and_most(motors_ms)
-                found.append(
-                    Latency(
-                        robot=self._namespace or prefix.rstrip("/"),
-                        heard_median_ms=heard[0] or 0.0,
-                        heard_p99_ms=heard[1] or 0.0,
-                        motors_median_ms=motors[0],
-                        motors_p99_ms=motors[1],
-                        count=len(heard_ms),
-                    )
-                )
-        return found
+            state, state_arrival_ns = state_by_tick[command.tick]
+            arrival_ms.append((command_arrival_ns - state_arrival_ns) * 1e-6)
+            if command.sequence in applied_ns:
+                motors_ms.append((applied_ns[command.sequence] - state.timestamp_ns) * 1e-6)
+        if not arrival_ms:
+            return None
+        arrival_median_ms, arrival_p99_ms = _median_and_p99(arrival_ms)
+        motors_median_ms, motors_p99_ms = _median_and_p99(motors_ms)
+        return Latency(
+            robot=self._namespace or prefix.rstrip("/"),
+            heard_median_ms=arrival_median_ms or 0.0,
+            heard_p99_ms=arrival_p99_ms or 0.0,
+            motors_median_ms=motors_median_ms,
+            motors_p99_ms=motors_p99_ms,
+            count=len(arrival_ms),
+        )
 
     def tick_times(self) -> dict[str, dict[str, Timing]]:
-        """Of every robot, as its newest status says; empty for one that was not armed yet."""
-        with self._lock:
-            newest = dict(self._newest)
-        said = {
-            robot: _decoded(keys.STATUS, arrival)
-            for key, arrival in newest.items()
-            for robot, relative in (self._split(key),)
-            if relative == keys.STATUS
-        }
-        return {robot: status.tick_times for robot, status in said.items() if isinstance(status, Status)}
+        """Return the tick times of every robot from its newest status; empty for one that was not armed yet."""
+        statuses = self._decode_newest(keys.STATUS)
+        return {robot: status.tick_times for robot, status in statuses.items() if isinstance(status, Status)}
 
     def descriptions(self) -> dict[str, Description]:
-        """Of every robot that has described itself."""
+        """Return the newest description of every robot that publishes one."""
+        contents = self._decode_newest(keys.DESCRIPTION)
+        return {robot: content for robot, content in contents.items() if isinstance(content, Description)}
+
+    def _decode_newest(self, relative_key: str) -> dict[str, Any]:
+        """Return each robot's newest message at a key, or why it cannot be read."""
         with self._lock:
             newest = dict(self._newest)
-        found: dict[str, Description] = {}
+        contents: dict[str, Any] = {}
         for key, arrival in newest.items():
             robot, relative = self._split(key)
-            if relative == keys.DESCRIPTION:
-                description = _decoded(relative, arrival)
-                if isinstance(description, Description):
-                    found[robot] = description
-        return found
+            if relative == relative_key:
+                contents[robot] = _decode(relative, arrival)
+        return contents
 
     def is_known(self, key: str) -> bool:
-        """Whether a key is one of a robot's that are published."""
+        """Return whether a robot publishes at this key, by the key space."""
         row = keys.row_at(self._split(key)[1])
         return row is not None and row.kind in ("stream", "latched")
 
     def _split(self, key: str) -> tuple[str, str]:
-        """Robot and key relative to it; for keys that belong to none, an empty name."""
+        """Return a key's robot, and the key relative to it; the name is empty for a key that belongs to no robot."""
         if self._namespace is not None:
             return self._namespace, key
         return keys.split_namespace(key) or ("", key)
 
 
-def _middle_and_most(values: list[float]) -> tuple[float | None, float | None]:
-    """Median and 99th percentile; None without values."""
+def _find_writer(relative_key: str, lease_holder: str | None) -> str | None:
+    """Return the process that writes at a key; None for a key that is not in the key space."""
+    if relative_key == keys.JOINT_COMMAND and lease_holder:
+        return f"{lease_holder} (lease)"
+    row = keys.row_at(relative_key)
+    if row is None:
+        return None
+    if row.writer.startswith("each "):
+        return keys.service_of(relative_key)
+    return row.writer
+
+
+def _age_ms(content: Any, clock_ns: int | None) -> float | None:
+    """Return the age of a message by the robot's clock; None when the message or the clock has no time."""
+    timestamp_ns = getattr(content, "timestamp_ns", None)
+    if timestamp_ns is None or clock_ns is None:
+        return None
+    return max(clock_ns - timestamp_ns, 0) * 1e-6
+
+
+def _median_and_p99(values: list[float]) -> tuple[float | None, float | None]:
+    """Return the median and the 99th percentile; None without values."""
     if not values:
         return None, None
-    return statistics.median(values), sorted(values)[min(int(0.99 * len(values)), len(values) - 1)]
+    index = min(int(0.99 * len(values)), len(values) - 1)
+    return statistics.median(values), sorted(values)[index]
 
 
-def _rhythm(times: list[int]) -> dict[str, float | None]:
-    gaps_ms = [(b - a) * 1e-6 for a, b in itertools.pairwise(times)]
+def _measure_rhythm(times_ns: list[int]) -> dict[str, float | None]:
+    """Return rate, jitter and the longest gap of arrivals; None for fewer than two."""
+    gaps_ms = [(later - earlier) * 1e-6 for earlier, later in itertools.pairwise(times_ns)]
     if not gaps_ms or sum(gaps_ms) == 0:
         return {"rate_hz": None, "jitter_ms": None, "gap_max_ms": None}
     return {
@@ -208,9 +271,9 @@ def _rhythm(times: list[int]) -> dict[str, float | None]:
     }
 
 
-def _decoded(relative: str, arrival: Arrival) -> Any:
-    """The message; or why there is none."""
-    message = keys.message_at(relative)
+def _decode(relative_key: str, arrival: Arrival) -> Any:
+    """Return the message; or, as text, why it cannot be read."""
+    message = keys.message_at(relative_key)
     if message is None:
         return "not in the key space"
     try:
@@ -219,11 +282,13 @@ def _decoded(relative: str, arrival: Arrival) -> Any:
         return error.reason
 
 
-def _read(arrivals: list[Arrival], message: type[Message]) -> list[tuple[Any, int]]:
-    found: list[tuple[Any, int]] = []
+def _decode_all(arrivals: list[Arrival], message: type[Message]) -> list[tuple[Any, int]]:
+    """Return the messages that can be read, with the time of their arrival in ns."""
+    decoded: list[tuple[Any, int]] = []
     for arrival in arrivals:
         try:
-            found.append((decoder_of(message).decode(arrival.payload, arrival.encoding), arrival.monotonic_ns))
+            content = decoder_of(message).decode(arrival.payload, arrival.encoding)
         except WireError:
             continue
-    return found
+        decoded.append((content, arrival.monotonic_ns))
+    return decoded

@@ -25,21 +25,29 @@ DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "cha
 
 
 def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unchecked: bool = False) -> int:
-    """Arm a robot, if robot and backend match. unchecked: also without a check of its joints. Raises RefusedError."""
+    """Arm a robot, if its name and its backend are those that the operator has given.
+
+    Args:
+        robot: name of the robot.
+        backend: its backend.
+        where: selects the robot's network.
+        say: prints a line for the operator.
+        unchecked: whether to arm also without a check of the joints.
+
+    Raises:
+        RefusedError: another robot or backend is there, or the host refuses.
+    """
     link = only_robot(where, f"arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
-        description = _description(session, link)
-        wrong = [
-            f"{what} here is {there!r}, not {named!r}"
-            for what, there, named in (
-                ("the robot", description.robot, robot),
-                ("the backend", description.backend, backend),
-            )
-            if there != named
-        ]
-        if wrong:
+        description = _read_description(session, link)
+        mismatches: list[str] = []
+        if description.robot != robot:
+            mismatches.append(f"the robot here is {description.robot!r}, not {robot!r}")
+        if description.backend != backend:
+            mismatches.append(f"the backend here is {description.backend!r}, not {backend!r}")
+        if mismatches:
             raise RefusedError(
-                f"not armed: {'; '.join(wrong)}. To arm, name robot and backend: "
+                f"not armed: {'; '.join(mismatches)}. To arm, name robot and backend: "
                 f"`snakesim arm {description.robot} {description.backend}`"
             )
         request = request_to_arm(description, user_name(), unchecked=unchecked)
@@ -49,7 +57,7 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unch
 def disarm(where: RobotSelection, say: Say = say) -> int:
     """Make the joints passive; later commands do not move them."""
     request = LifecycleRequest(action="disarm", who=user_name())
-    return _ask_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
+    return _request_from_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
 
 
 def clear(where: RobotSelection, say: Say = say) -> int:
@@ -66,16 +74,16 @@ def clear(where: RobotSelection, say: Say = say) -> int:
         for path in kept:
             say(f"{path.parent.name}: {forget_stop(path)}; cleared by {user_name()}. No robot of that name runs here")
         return 0
-    return _ask_robot(link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", say)
+    return _request_from_robot(link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", say)
 
 
 def simulator(order: SimulatorOrder, where: RobotSelection, say: Say = say) -> int:
-    """Pause, step, speed and reset of a simulator; a robot that moves something real refuses, with its reason."""
+    """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses."""
     request = SimulatorRequest(action=order.action, who=order.who or user_name(), ticks=order.ticks, speed=order.speed)
-    return _ask_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
+    return _request_from_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
 
 
-def _ask_robot(link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: Say) -> int:
+def _request_from_robot(link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: Say) -> int:
     with open_session(link, CONNECT_S) as session:
         return ask_host(session, key, request, done, link, say)
 
@@ -105,21 +113,28 @@ def ask_host(
 def ask_meanwhile(
     session: Session, request: LifecycleRequest, done: str, link: Link, turn: Callable[[], object]
 ) -> None:
-    """Query the host, as `ask_host`; commands go on meanwhile, without which an armed robot would be in a fault."""
-    with ThreadPoolExecutor(1) as beside:
-        answer = beside.submit(ask_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
+    """Query the host, as `ask_host`, and call `turn` meanwhile: without commands an armed robot would get a fault."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(ask_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
         while not answer.done():
             turn()
         answer.result()
 
 
 def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
-    """Check answers: (why not confirmed, the newest status). None: one host answered, and its status confirms it."""
+    """Check the answers of hosts by the robot's status.
+
+    Returns:
+        Why the answers are not confirmed, or None if one host answered and its status confirms it; and the newest
+        status.
+    """
     if len(answers) > 1:
-        return f"{len(answers)} answered in its name; at least one is an impostor", _newest(statuses, None)
+        return f"{len(answers)} answered in its name; at least one is an impostor", _wait_for_status(statuses, None)
     wanted = answers[0].lifecycle if answers else None
-    shown = _newest(statuses, wanted)
-    hosts = {status.host for status in (shown,) if status is not None} | {answer.host for answer in answers}
+    shown = _wait_for_status(statuses, wanted)
+    hosts = {answer.host for answer in answers}
+    if shown is not None:
+        hosts.add(shown.host)
     if len(hosts) > 1:
         return "the answer is not from the host that publishes its status; one of them is an impostor", shown
     if shown is None or shown.lifecycle != wanted:
@@ -127,30 +142,33 @@ def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | No
     return None, shown
 
 
-def _newest(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
-    """The newest status, once it shows a state, or after the timeout."""
+def _wait_for_status(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
+    """Return the newest status, as soon as it shows a lifecycle state, or after SHOWN_S. None: any state counts."""
     shown: Status | None = None
     deadline = time.monotonic() + SHOWN_S
     while time.monotonic() < deadline:
-        shown = (statuses.drain() or [shown])[-1]
+        new_statuses = statuses.drain()
+        if new_statuses:
+            shown = new_statuses[-1]
         if shown is not None and lifecycle in (None, shown.lifecycle):
             break
         time.sleep(0.01)
     return shown
 
 
-def _description(session: Session, link: Link) -> Description:
-    """The robot's description. Raises RefusedError when two hosts publish one."""
+def _read_description(session: Session, link: Link) -> Description:
+    """Read the robot's description. Raises NotConnectedError without one, RefusedError when two hosts publish one."""
     reader = session.latched_reader(keys.DESCRIPTION, Description)
     deadline = time.monotonic() + DESCRIPTION_S
-    found: list[Description] = []
-    while not found and time.monotonic() < deadline:
+    descriptions: list[Description] = []
+    while not descriptions and time.monotonic() < deadline:
         time.sleep(0.05)
-        found = reader.drain()
-    if not found:
+        descriptions = reader.drain()
+    if not descriptions:
         raise NotConnectedError(
             f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?"
         )
-    if len({description.host for description in found}) > 1:
-        raise RefusedError(f"{link.namespace}: {len(found)} hosts describe it; at least one is an impostor. Not armed")
-    return found[-1]
+    if len({description.host for description in descriptions}) > 1:
+        count = len(descriptions)
+        raise RefusedError(f"{link.namespace}: {count} hosts describe it; at least one is an impostor. Not armed")
+    return descriptions[-1]

@@ -26,16 +26,17 @@ from snakesim_operator.robot_commands.command import ANSWER_S, SHOWN_S
 
 PREFIX = "control."
 MAX_PARAMETERS = 100
-LONGEST_NAME, LONGEST_ABOUT = 40, 200
-PUBLISHED_S = 3.0
-GONE_S = 1.0  # without settings in force, after a controller that published them has been asked
-GOES_ON_S = 0.3  # until the next report of a controller that goes on, in real time; time may stand
+MAX_NAME_CHARACTERS = 40
+MAX_DESCRIPTION_CHARACTERS = 200
+PUBLISHED_S = 3.0  # a controller publishes its settings within this time
+GONE_S = 1.0  # no settings for so long after a change mean that the controller has ended
+GOES_ON_S = 0.3  # real time until the next report of a controller that continues; robot time may be paused
 LOOK_S = 0.01
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One setting, and what its schema says of it."""
+    """One setting, with its unit and range from the JSON Schema."""
 
     name: str
     value: Any
@@ -44,91 +45,116 @@ class Parameter:
     choices: tuple[str, ...] = ()
     least: float | None = None
     most: float | None = None
-    above_least: bool = False  # `least` itself is too little
+    above_least: bool = False  # `least` itself is not allowed
 
     @property
     def range(self) -> str:
-        """What values it may have, in words."""
+        """The values that are allowed, in words."""
         if self.choices:
             return " or ".join(self.choices)
         if isinstance(self.value, str):
             return "a text"
-        sign = ">" if self.above_least else ">="
-        low = "" if self.least is None else f"{sign} {self.least:g}"
-        high = "" if self.most is None else f"<= {self.most:g}"
-        return ", ".join(filter(None, (low, high)))
+        limits: list[str] = []
+        if self.least is not None:
+            sign = ">" if self.above_least else ">="
+            limits.append(f"{sign} {self.least:g}")
+        if self.most is not None:
+            limits.append(f"<= {self.most:g}")
+        return ", ".join(limits)
 
     @property
     def shown(self) -> str:
-        """Its value as TOML would have it, with its unit."""
-        return f"{in_text(self.value)} {self.unit}".strip() if self.unit != "1" else in_text(self.value)
+        """The value as TOML has it, with its unit."""
+        if self.unit == "1":
+            return in_text(self.value)
+        return f"{in_text(self.value)} {self.unit}".strip()
 
 
 def in_text(value: Any) -> str:
-    """A value as `param set` takes it."""
+    """Format a value as `param set` takes it."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def parameters_of(settings: ControlSettings) -> list[Parameter]:
-    """The parameters in force, without those that a schema does not say enough of to be read."""
+    """Return the parameters in force; none if their schema cannot be read."""
     try:
-        schema, values = json.loads(settings.schema), msgspec.json.decode(settings.settings, type=dict[str, Any])
-        properties = _resolved(schema, schema)["properties"]
-        found = [(name, _resolved(schema, properties.get(name, {})), value) for name, value in values.items()]
-        return [_parameter(name, of, value) for name, of, value in found[:MAX_PARAMETERS]]
+        schema = json.loads(settings.schema)
+        values = msgspec.json.decode(settings.settings, type=dict[str, Any])
+        properties = _resolve_reference(schema, schema)["properties"]
+        parameters: list[Parameter] = []
+        for name, value in values.items():
+            description = _resolve_reference(schema, properties.get(name, {}))
+            if len(parameters) < MAX_PARAMETERS:
+                parameters.append(_read_parameter(name, description, value))
+        return parameters
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, msgspec.DecodeError):
         return []
 
 
-def _resolved(schema: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
+def _resolve_reference(schema: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
+    """Return the definition that a part of the schema refers to, or the part itself."""
     reference = part.get("$ref")
-    return part if reference is None else schema["$defs"][reference.rpartition("/")[2]]
+    if reference is None:
+        return part
+    return schema["$defs"][reference.rpartition("/")[2]]
 
 
-def _parameter(name: str, of: dict[str, Any], value: Any) -> Parameter:
-    choices = of.get("enum")
+def _read_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter:
+    """Return a parameter, with texts shortened, because they come from the network."""
+    choices = schema.get("enum")
     return Parameter(
-        name[:LONGEST_NAME],
+        name[:MAX_NAME_CHARACTERS],
         value,
-        unit=str(of.get("unit", ""))[:LONGEST_NAME],
-        about=str(of.get("description", ""))[:LONGEST_ABOUT],
+        unit=str(schema.get("unit", ""))[:MAX_NAME_CHARACTERS],
+        about=str(schema.get("description", ""))[:MAX_DESCRIPTION_CHARACTERS],
         choices=tuple(str(choice) for choice in choices) if isinstance(choices, list) else (),
-        least=_number(of, "minimum", "exclusiveMinimum"),
-        most=_number(of, "maximum", "exclusiveMaximum"),
-        above_least="exclusiveMinimum" in of,
+        least=_find_number(schema, "minimum", "exclusiveMinimum"),
+        most=_find_number(schema, "maximum", "exclusiveMaximum"),
+        above_least="exclusiveMinimum" in schema,
     )
 
 
-def _number(of: dict[str, Any], *names: str) -> float | None:
-    found = (float(of[name]) for name in names if isinstance(of.get(name), int | float))
-    return next((number for number in found if math.isfinite(number)), None)
+def _find_number(schema: dict[str, Any], *names: str) -> float | None:
+    """Return the first of these entries that is a finite number; None without one."""
+    for name in names:
+        entry = schema.get(name)
+        if isinstance(entry, int | float) and math.isfinite(float(entry)):
+            return float(entry)
+    return None
 
 
 def differing(before: ControlSettings, now: ControlSettings) -> list[tuple[Parameter, Parameter]]:
-    """Those that have another value, before and now."""
-    old = {one.name: one for one in parameters_of(before)}
-    pairs = [(old[one.name], one) for one in parameters_of(now) if one.name in old]
-    return [(was, one) for was, one in pairs if was.value != one.value]
+    """Return the parameters whose values differ, each as it was before and as it is now."""
+    old_parameters = {parameter.name: parameter for parameter in parameters_of(before)}
+    pairs: list[tuple[Parameter, Parameter]] = []
+    for new in parameters_of(now):
+        old = old_parameters.get(new.name)
+        if old is not None and old.value != new.value:
+            pairs.append((old, new))
+    return pairs
 
 
 def in_force(session: Session) -> ControlSettings:
-    """The settings of the running controller. Raises NotConnectedError when none publishes any."""
-    found = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, PUBLISHED_S)
-    if found is None:
+    """Return the settings of the running controller. Raises NotConnectedError when no controller publishes any."""
+    settings = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, PUBLISHED_S)
+    if settings is None:
         raise NotConnectedError(
             f"no controller publishes its settings within {PUBLISHED_S:g} s: control does not run here, or is a client "
             "of another kind"
         )
-    return found
+    return settings
 
 
 def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[ControlSettings, ControlSettings]:
-    """Have the controller go on with other values, all of them or none. Returns what was in force, and what is now.
+    """Change parameters of the running controller, all of them or none.
 
     Args:
         session: A session on the robot's network.
         changes: Values by name, such as `control.speed_kp_s`.
-        who: Who asks.
+        who: The name of the requester.
+
+    Returns:
+        The settings in force before and after the change.
 
     Raises:
         ConfigError: There is no such parameter.
@@ -138,16 +164,17 @@ def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[Cont
     """
     before = in_force(session)
     values = msgspec.json.decode(before.settings, type=dict[str, Any])
-    wanted = {known_name(name, before): value for name, value in changes.items()}
-    settings = msgspec.json.encode({**values, **wanted}).decode()
+    for name, value in changes.items():
+        values[known_name(name, before)] = value
+    settings = msgspec.json.encode(values).decode()
     request = SettingsRequest(who=who, controller=before.controller, settings=settings)
     states = session.reader(keys.CONTROL_STATE, ControlState)
     try:
         answer = session.ask(keys.SETTINGS, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)
-        now = _shown(session, before)
-        _check_it_goes_on(states, now, changes)
+        now = _wait_for_change(session, before)
+        _check_controller_continues(states, now, changes)
     finally:
         session.stop_reading(states)
     if now is None:
@@ -155,8 +182,8 @@ def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[Cont
     return before, now
 
 
-def _shown(session: Session, before: ControlSettings) -> ControlSettings | None:
-    """Return the settings that are in force after others; None when none are published in time."""
+def _wait_for_change(session: Session, before: ControlSettings) -> ControlSettings | None:
+    """Return the settings in force after a change; None when none are published in time."""
     deadline = time.monotonic() + SHOWN_S
     while time.monotonic() < deadline:
         now = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, GONE_S)
@@ -165,7 +192,9 @@ def _shown(session: Session, before: ControlSettings) -> ControlSettings | None:
     return None
 
 
-def _check_it_goes_on(states: Reader[ControlState], now: ControlSettings | None, changes: Mapping[str, Any]) -> None:
+def _check_controller_continues(
+    states: Reader[ControlState], now: ControlSettings | None, changes: Mapping[str, Any]
+) -> None:
     """Raise ControllerError if the controller cannot go on with these changes.
 
     While the robot is armed, control reports its state 20 times a second. Otherwise nothing shows it before the arming.
@@ -191,7 +220,7 @@ def _check_it_goes_on(states: Reader[ControlState], now: ControlSettings | None,
 
 
 def known_name(name: str, settings: ControlSettings) -> str:
-    """The field that `control.NAME` stands for. Raises ConfigError."""
+    """Return the field that `control.NAME` refers to. Raises ConfigError if there is no such parameter."""
     known = [PREFIX + parameter.name for parameter in parameters_of(settings)]
     if name not in known:
         raise ConfigError(
@@ -202,40 +231,53 @@ def known_name(name: str, settings: ControlSettings) -> str:
 
 
 def list_parameters(where: RobotSelection) -> int:
-    """`snakesim param list`."""
+    """Print all parameters for `snakesim param list`."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
         settings = in_force(session)
     parameters = parameters_of(settings)
-    by = (
-        "from its configuration"
-        if settings.who is None
-        else f"set by {settings.who} at {settings.timestamp_ns * 1e-9:g} s"
-    )
-    say(f"controller {settings.controller}, {len(parameters)} parameters, {by}")
-    rows = [(PREFIX + one.name, one.shown, one.range, one.about) for one in parameters]
+    if settings.who is None:
+        origin = "from its configuration"
+    else:
+        origin = f"set by {settings.who} at {settings.timestamp_ns * 1e-9:g} s"
+    say(f"controller {settings.controller}, {len(parameters)} parameters, {origin}")
+    rows = [(PREFIX + parameter.name, parameter.shown, parameter.range) for parameter in parameters]
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
-    for row in rows:
-        say("  " + "  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]]).rstrip())
+    for row, parameter in zip(rows, parameters, strict=True):
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        line = "  ".join([*cells, parameter.about])
+        say("  " + line.rstrip())
     return 0
 
 
 def get_parameter(name: str, where: RobotSelection) -> int:
-    """`snakesim param get`: the value alone, for scripts."""
+    """Print one value alone, for scripts that use `snakesim param get`."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
         settings = in_force(session)
     field = known_name(name, settings)
-    say(next(in_text(one.value) for one in parameters_of(settings) if one.name == field))
+    value = next(parameter.value for parameter in parameters_of(settings) if parameter.name == field)
+    say(in_text(value))
     return 0
 
 
 def set_parameters(texts: list[str], where: RobotSelection) -> int:
-    """`snakesim param set`. Raises ConfigError, RefusedError, ControllerError."""
-    changes = {override.key: override.value for override in map(parse_set, texts)}
+    """Change parameters for `snakesim param set`, and print what has changed.
+
+    Args:
+        texts: assignments, such as `control.speed_kp_s=0.3`.
+        where: selects the robot.
+
+    Raises:
+        ConfigError: a text or a name is wrong.
+        RefusedError: control refuses a value.
+        ControllerError: the controller has ended because of the change.
+    """
+    overrides = [parse_set(text) for text in texts]
+    changes = {override.key: override.value for override in overrides}
     with open_session(only_robot(where, "param set"), CONNECT_S) as session:
         before, now = change(session, changes, user_name())
     changed = differing(before, now)
-    for was, one in changed:
-        say(f"{PREFIX}{one.name}: {in_text(was.value)} -> {one.shown}, by {now.who}, tick {now.tick}")
+    for old, new in changed:
+        say(f"{PREFIX}{new.name}: {in_text(old.value)} -> {new.shown}, by {now.who}, tick {now.tick}")
     if not changed:
         say(f"controller {now.controller} has these values already")
     return 0

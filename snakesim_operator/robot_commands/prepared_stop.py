@@ -1,8 +1,8 @@
-"""An emergency stop of one robot whose means exist before they are needed, and which tests itself.
+"""Stops one robot with sockets and threads that were opened in advance, and tests them regularly.
 
-A program that opens sockets, files or a session only when it is to stop a robot cannot stop it once its file table is
-full. Here the datagram socket to the robot's stop port, the network session, three threads and all modules are there
-from the start. A stop opens nothing; only when both prepared ways fail, `snakesim estop`'s own search is tried as well.
+A program that opens sockets, files or a session only when it has to stop a robot cannot stop it once its file table is
+full. Here the datagram socket to the robot's stop port, the network session, three threads and all modules exist from
+the start. A stop opens no file; only if both prepared ways fail, the search of `snakesim estop` is tried as well.
 """
 
 import threading
@@ -64,7 +64,9 @@ class _Test:
         if self.problem:
             return self.problem
         age_s = now_s - self.at_s
-        return f"the last self-test that succeeded was {age_s:.0f} s ago" if age_s > TEST_VALID_S else ""
+        if age_s > TEST_VALID_S:
+            return f"the last self-test that succeeded was {age_s:.0f} s ago"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ class PreparedStop:
             link: How this process connects to the robot.
             on_result: Called with the requesters of a stop and its result in words, from another thread.
         """
-        self._where, self._link, self._on_result = where, link, on_result
+        self._where = where
+        self._link = link
+        self._on_result = on_result
         self._user = user_name()  # looked up in a file
         # Threads.
         self._coordinator = Worker("stop")
@@ -144,7 +148,8 @@ class PreparedStop:
 
     def readiness(self) -> StopReadiness:
         """Return whether a stop would reach the robot, by the newest self-test."""
-        now_s, began_s = time.monotonic(), self._began_s
+        now_s = time.monotonic()
+        began_s = self._began_s
         if began_s is not None:
             stuck = now_s - began_s > STUCK_S
             return StopReadiness(not stuck, f"a stop has been under way for {now_s - began_s:.0f} s")
@@ -163,13 +168,14 @@ class PreparedStop:
         return self._local | self._elsewhere
 
     def _test_ports(self) -> None:
-        """In the thread of the datagrams: find the stop port, keep a socket for it, and send it what does nothing."""
+        """Find the stop port, keep a socket for it, and send it a test. This runs in the thread of the datagrams."""
         problem = ""
         try:
             local = local_stop_ports(self._where)
             elsewhere = stop_ports_elsewhere(self._where, local)
             self._requester.prepare([*local, *elsewhere])
-            self._local, self._elsewhere = local, elsewhere
+            self._local = local
+            self._elsewhere = elsewhere
         except OSError as error:  # no file is left: the addresses and sockets of before stay
             problem = "" if self._ports() else f"the stop port is not known: {error.strerror}"
         try:
@@ -180,7 +186,7 @@ class PreparedStop:
         self._port_test = _Test(time.monotonic(), problem)
 
     def _test_network(self) -> None:
-        """In the thread of the network: a round trip to the robot's host over the session that a stop takes."""
+        """Test a round trip to the robot's host over the session that a stop uses. This runs in the network thread."""
         session = self._session
         if session is None:
             return
@@ -194,7 +200,7 @@ class PreparedStop:
     # --- the stop
 
     def _stop(self) -> str:
-        """In the coordinator: stop for everybody who has asked since the present stop began."""
+        """Stop the robot for all requests since the last stop began. This runs in the coordinator's thread."""
         with self._lock:
             requesters = ", ".join(dict.fromkeys(self._requesters))
             self._requesters.clear()

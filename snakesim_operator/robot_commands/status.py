@@ -1,4 +1,4 @@
-"""`snakesim status`: the state of running robots."""
+"""`snakesim status`: prints the state of running robots."""
 
 import contextlib
 import time
@@ -6,25 +6,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from queue import Empty
+from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError, WireError
 from snakesim_hal.base.terminal import say, say_json
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, differences
-from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description, Process, Status
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, flags_of, namespace_of
 from snakesim_operator.results import last_run
 
-STATUS_WAIT_S = 1.0
+STATUS_WAIT_S = 1.0  # for the messages of a network
 
 
 @dataclass(frozen=True)
 class _Robot:
-    """What a robot on the network says of itself."""
+    """What a robot on the network has published."""
 
     link: Link
     statuses: list[Status]  # the newest of each of its hosts
@@ -33,92 +34,117 @@ class _Robot:
 
     @property
     def status(self) -> Status:
-        """The one that is shown."""
+        """The status that is shown."""
         return self.statuses[-1]
 
     @property
     def is_impostor(self) -> bool:
-        """Whether more than one host has its name."""
+        """Whether more than one host has the robot's name."""
         return len({status.host for status in self.statuses}) > 1
 
 
 def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
-    found: list[_Robot] = []
+    robots: list[_Robot] = []
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            found += _robots(link)
-    silent = [
-        robot
-        for robot in where.local()
-        if not any(shown.link.endpoint == robot.endpoint and shown.link.namespace == robot.namespace for shown in found)
-    ]
-    well = bool(found) and all(robot.status.lifecycle in ("armed", "disarmed") for robot in found)
+            robots += _find_robots(link)
+    reachable = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
+    silent = [robot for robot in where.local() if (robot.endpoint, robot.namespace) not in reachable]
+    without_faults = bool(robots) and all(robot.status.lifecycle in ("armed", "disarmed") for robot in robots)
+    exit_code = 0 if without_faults and not silent else 1
     if as_json:
-        say_json({"robots": [_for_scripts(robot) for robot in found], "silent": silent})
-        return 0 if well and not silent else 1
+        say_json({"robots": [_as_json(robot) for robot in robots], "silent": silent})
+        return exit_code
     for robot in silent:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
-    if not found and not silent:
-        noted = last_run.recall()
-        last = f"; the last run on this computer ended so: {noted.ended} ({noted.folder})" if noted is not None else ""
-        say(f"no robot answers on {', '.join(where.endpoints())}{last}")
-        say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
-        return 1
-    for robot in found:
-        lines = [*_in_words(robot), *processes_in_words(robot.processes)]
-        if robot.is_impostor:
-            lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
-        for line in [*lines, *_what_to_type(robot.link, robot.status)]:
-            say(line)
-    return 0 if well and not silent else 1
+    if not robots and not silent:
+        _print_no_robot(where)
+    for robot in robots:
+        _print_robot(robot)
+    return exit_code
 
 
-def _robots(link: Link) -> list[_Robot]:
-    """Those on a network."""
-    arrivals: Mailbox[Arrival] = Mailbox()
-    decoders = {
-        keys.STATUS: Decoder(Status),
-        keys.PROCESS_ALL: Decoder(Process),
-        keys.DESCRIPTION: Decoder(Description),
-    }
-    found: dict[str, dict[str | None, Status]] = {}
-    descriptions: dict[tuple[str, str | None], Description] = {}  # by robot and host
-    processes: dict[str, list[Process]] = {}
-    prefix = "" if link.namespace is not None else "**/"
-    with open_session(link, CONNECT_S) as session:
-        for key in decoders:
+def _print_no_robot(where: RobotSelection) -> None:
+    """Print how the last run on this computer ended, and how to start another."""
+    last = last_run.recall()
+    ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
+    say(f"no robot answers on {', '.join(where.endpoints())}{ending}")
+    say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
+
+
+def _print_robot(robot: _Robot) -> None:
+    lines = [*_describe_robot(robot), *processes_in_words(robot.processes)]
+    if robot.is_impostor:
+        lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
+    lines += _next_commands(robot.link, robot.status)
+    for line in lines:
+        say(line)
+
+
+class _NetworkMessages:
+    """Collects the messages of all robots on one network."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._decoders = {
+            keys.STATUS: Decoder(Status),
+            keys.PROCESS_ALL: Decoder(Process),
+            keys.DESCRIPTION: Decoder(Description),
+        }
+        self.statuses: dict[str, dict[str | None, Status]] = {}  # by robot, then by host
+        self.descriptions: dict[tuple[str, str | None], Description] = {}  # by robot and host
+        self.processes: dict[str, list[Process]] = {}  # by robot
+
+    def read(self, session: Session) -> None:
+        """Subscribe, and collect messages for STATUS_WAIT_S."""
+        arrivals: Mailbox[Arrival] = Mailbox()
+        prefix = "" if self._link.namespace is not None else "**/"
+        for key in self._decoders:
             session.on_latched_arrival(f"{prefix}{key}", arrivals.put)
         live = set(session.present(f"{prefix}{keys.PROCESS_ALL}"))
-        until = time.monotonic() + STATUS_WAIT_S
-        while (left := until - time.monotonic()) > 0:
+        deadline = time.monotonic() + STATUS_WAIT_S
+        while (left_s := deadline - time.monotonic()) > 0:
             try:
-                arrival = arrivals.get(timeout=left)
-                row = next((key for key in (keys.STATUS, keys.DESCRIPTION) if arrival.key.endswith(key)), None)
-                message = decoders[row or keys.PROCESS_ALL].decode(arrival.payload, arrival.encoding)
+                arrival = arrivals.get(timeout=left_s)
             except Empty:
                 break
-            except WireError:
-                continue
-            name = link.namespace or namespace_of(arrival.key)
-            match message:
-                case Status():
-                    found.setdefault(name, {})[message.host] = message
-                case Description():
-                    descriptions[name, message.host] = message
-                case _:
-                    if arrival.key in live:
-                        processes.setdefault(name, []).append(message)
+            with contextlib.suppress(WireError):
+                self._add(arrival, live)
+
+    def _add(self, arrival: Arrival, live: set[str]) -> None:
+        """Decode a message and keep it. live: keys of the processes that run. Raises WireError."""
+        decoder = self._decoders[keys.PROCESS_ALL]
+        for key in (keys.STATUS, keys.DESCRIPTION):
+            if arrival.key.endswith(key):
+                decoder = self._decoders[key]
+        message = decoder.decode(arrival.payload, arrival.encoding)
+        name = self._link.namespace or namespace_of(arrival.key)
+        match message:
+            case Status():
+                self.statuses.setdefault(name, {})[message.host] = message
+            case Description():
+                self.descriptions[name, message.host] = message
+            case Process():
+                if arrival.key in live:
+                    self.processes.setdefault(name, []).append(message)
+
+
+def _find_robots(link: Link) -> list[_Robot]:
+    """Return the robots on a network, sorted by name. Raises NotConnectedError."""
+    messages = _NetworkMessages(link)
+    with open_session(link, CONNECT_S) as session:
+        messages.read(session)
     robots: list[_Robot] = []
-    for name, of_host in sorted(found.items()):
-        statuses = list(of_host.values())
-        description = descriptions.get((name, statuses[-1].host))
-        robots.append(_Robot(replace(link, namespace=name), statuses, processes.get(name, []), description))
+    for name, status_by_host in sorted(messages.statuses.items()):
+        statuses = list(status_by_host.values())
+        description = messages.descriptions.get((name, statuses[-1].host))
+        processes = messages.processes.get(name, [])
+        robots.append(_Robot(replace(link, namespace=name), statuses, processes, description))
     return robots
 
 
-def _for_scripts(robot: _Robot):
-    """One robot, as JSON."""
+def _as_json(robot: _Robot) -> dict[str, Any]:
     return {
         "namespace": robot.link.namespace,
         "endpoint": robot.link.endpoint,
@@ -130,69 +156,88 @@ def _for_scripts(robot: _Robot):
 
 
 def processes_in_words(processes: Sequence[Process]) -> list[str]:
-    """One line for each process: machine, version, age, and what is set up differently from the host."""
+    """Return lines for each process: machine, version, age, and how its configuration differs from the host's."""
     host = next((entry for entry in processes if entry.name == HOST), None)
     lines: list[str] = []
     for entry in sorted(processes, key=lambda entry: (entry.name != HOST, entry.name, entry.machine, entry.pid)):
         age_s = time.time() - entry.started_unix_s
-        since = f"for {timedelta(seconds=round(age_s))}" if age_s >= 0 else "its clock is ahead of this one's"
+        age = f"for {timedelta(seconds=round(age_s))}" if age_s >= 0 else "its clock is ahead of this one's"
         lines.append(
-            f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {since}"
+            f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {age}"
         )
-        lines += [f"    DIFFERS: {what}" for what in (differences(entry, host) if host is not None else [])]
+        if host is not None:
+            lines += [f"    DIFFERS: {difference}" for difference in differences(entry, host)]
     return lines
 
 
-def _in_words(robot: _Robot) -> list[str]:
-    link, status = robot.link, robot.status
-
-    def counts(numbers: dict[str, int]) -> str:
-        return ", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none"
-
-    lines = [
+def _describe_robot(robot: _Robot) -> list[str]:
+    link = robot.link
+    status = robot.status
+    return [
         f"{link.namespace}: {status.lifecycle} - {status.why}",
         f"  {describe_what_moves(robot.description)}",
-        f"  robot {status.robot}, backend {status.backend}, "
-        f"{status.clock_mode} at {status.rate_hz:g} Hz, tick {status.tick}"
-        f", on {link.endpoint}",
+        f"  robot {status.robot}, backend {status.backend}, {status.clock_mode} at {status.rate_hz:g} Hz, "
+        f"tick {status.tick}, on {link.endpoint}",
         f"  lease: {status.lease_holder or 'free'} (epoch {status.lease_epoch})",
         f"  alive: {', '.join(status.alive) or 'none'}",
         f"  commands: {status.commands_accepted} accepted, {status.commands_standby} while disarmed, rejected: "
-        f"{counts(status.commands_rejected)}; joint targets limited: {counts(status.commands_limited)}",
+        f"{_format_counts(status.commands_rejected)}; "
+        f"joint targets limited: {_format_counts(status.commands_limited)}",
+        *_describe_limits(status),
+        *_describe_faults(status),
     ]
+
+
+def _format_counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{word} {count}" for word, count in sorted(counts.items())) or "none"
+
+
+def _describe_limits(status: Status) -> list[str]:
+    """Return what keeps the robot from its full performance; empty if there is nothing."""
+    lines: list[str] = []
     if status.paused_by is not None:
         lines.append(f"  PAUSED by {status.paused_by}; `snakesim sim resume` or `step` go on")
     elif status.speed != 1.0:
         lines.append(f"  speed {status.speed:g} is wanted")
-    for joint, share in sorted(status.derated.items()):
-        lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
+    for joint, fraction in sorted(status.derated.items()):
+        lines.append(f"  derated: {joint} has {100 * fraction:.0f} % of its torque left")
     if status.isolated:
         lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
-    lines += [f"  real time: {what}" for what in status.realtime_warnings]
-    lines += [f"  not checked: {what}" for what in filter(None, [status.unchecked])]
-    lines += [f"  injected fault: {what}" for what in status.injected]
+    lines += [f"  real time: {warning}" for warning in status.realtime_warnings]
+    if status.unchecked:
+        lines.append(f"  not checked: {status.unchecked}")
+    lines += [f"  injected fault: {fault}" for fault in status.injected]
     if status.waiting_for:
         lines.append(f"  waiting for: {', '.join(status.waiting_for)}")
+    return lines
+
+
+def _describe_faults(status: Status) -> list[str]:
+    """Return a line for each kind of fault, with its first tick and its count."""
     ticks: dict[tuple[str, str, str], list[int]] = {}
     for fault in status.faults:
-        ticks.setdefault((fault.what, f" at {fault.joint}" if fault.joint else "", fault.cause), []).append(fault.tick)
-    for (what, where, cause), at in ticks.items():
-        more = f" and {len(at) - 1} times more" if len(at) > 1 else ""
-        lines.append(f"  fault {what}{where} at tick {at[0]}{more}: {cause}")
+        place = f" at {fault.joint}" if fault.joint else ""
+        ticks.setdefault((fault.what, place, fault.cause), []).append(fault.tick)
+    lines: list[str] = []
+    for (what, place, cause), fault_ticks in ticks.items():
+        more = f" and {len(fault_ticks) - 1} times more" if len(fault_ticks) > 1 else ""
+        lines.append(f"  fault {what}{place} at tick {fault_ticks[0]}{more}: {cause}")
     if status.faults_left_out:
         lines.append(f"  and {status.faults_left_out} more faults, between the first and the newest of these")
     return lines
 
 
-def _what_to_type(link: Link, status: Status) -> list[str]:
-    """The next commands for a person."""
+def _next_commands(link: Link, status: Status) -> list[str]:
+    """Return the commands that the operator may type next."""
     where = flags_of(link, status.robot)
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
         return [f"  next: `snakesim clear{where}`, then {arm}"]
     if status.isolated and status.lifecycle == "disarmed":
-        back = f"`snakesim clear{where}`, to end the isolation of {', '.join(status.isolated)}"
-        return [f"  next: {back}", *([f"  or, without: {arm}"] if status.ready_to_arm else [])]
+        lines = [f"  next: `snakesim clear{where}`, to end the isolation of {', '.join(status.isolated)}"]
+        if status.ready_to_arm:
+            lines.append(f"  or, without: {arm}")
+        return lines
     if status.lifecycle == "armed":
         return [f"  next: `snakesim console{where}` to watch, `snakesim disarm{where}` or `snakesim estop` to stop it"]
     if status.ready_to_arm:

@@ -1,12 +1,12 @@
-"""`snakesim estop`: stop a robot now, or without a name every reachable one.
+"""`snakesim estop`: stops a robot now, or without a name every reachable robot.
 
-Two ways at once, until one is answered or five seconds have passed: each robot's stop port, which floods and full
-sessions do not block, and the network, for robots behind a lab's router. The datagrams leave before anything of the
-network is even imported, which takes seconds on a machine that is busy.
+It uses two ways at once, until one is answered or five seconds have passed: each robot's stop port, which floods and
+full sessions do not block, and the network, for robots behind a lab's router. The datagrams to the stop ports are sent
+before the network modules are even imported, which takes seconds on a busy machine.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 from snakesim_hal.base.errors import NotConnectedError
@@ -22,52 +22,70 @@ AskPort = Callable[[Address], Stopped | None]  # raises NotConnectedError when t
 
 
 def estop(where: RobotSelection, say: Say = say) -> int:
-    """Stop them. Returns 0 when every known robot has confirmed that it is stopped."""
+    """Stop the addressed robots. Returns 0 when every known robot has confirmed that it is stopped, else 1."""
     local = local_stop_ports(where)
     elsewhere = stop_ports_elsewhere(where, local)
 
     def ask(address: Address) -> Stopped | None:
         return ask_to_stop(*address, user_name(), LIMIT_S)
 
-    with ThreadPoolExecutor(2 * len(local) + len(elsewhere) + 1) as side_by_side:
-        asked_here = [side_by_side.submit(stop_at_port, ask, address, robot) for address, robot in local.items()]
-        asked_there = [side_by_side.submit(stop_at_port, ask, address, robot) for address, robot in elsewhere.items()]
-        from snakesim_operator.robot_commands.stop_by_query import (
-            ask_network,  # only now: the datagrams are on their way
-        )
+    with ThreadPoolExecutor(2 * len(local) + len(elsewhere) + 1) as pool:
+        local_futures = [pool.submit(stop_at_port, ask, address, robot) for address, robot in local.items()]
+        remote_futures = [pool.submit(stop_at_port, ask, address, robot) for address, robot in elsewhere.items()]
+        # Imported only now: the datagrams are sent meanwhile.
+        from snakesim_operator.robot_commands.stop_by_query import ask_network
 
-        asked_all = [side_by_side.submit(ask_network, link, LIMIT_S) for link in where.networks()]
-        here = [result for future in asked_here if (result := future.result()) is not None]
-        there = [result for future in asked_there if (result := future.result()) is not None]
-        shown = [result for future in asked_all for result in future.result()]
+        network_futures = [pool.submit(ask_network, link, LIMIT_S) for link in where.networks()]
+        here = _collect(local_futures)
+        there = _collect(remote_futures)
+        shown = [result for future in network_futures for result in future.result()]
     results = combine_results(here, there, shown)
     for line in describe_results(results, here, shown):
         say(line)
     if not results:
         say(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")
     if where.namespace is not None and not any(robot.stopped for robot in results):
-        from snakesim_operator.base.targets import find_robots
-
-        for link in find_robots(replace(where, namespace=None)):
-            say(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
+        _print_other_robots(where, say)
     return 0 if all_stopped(results) else 1
+
+
+def _collect(futures: Sequence[Future[StopResult | None]]) -> list[StopResult]:
+    """Wait for the answers of stop ports; closed ports are left out."""
+    results = [future.result() for future in futures]
+    return [result for result in results if result is not None]
+
+
+def _print_other_robots(where: RobotSelection, say: Say) -> None:
+    """Print which robots there are, because the operator may have given a wrong name."""
+    from snakesim_operator.base.targets import find_robots
+
+    for link in find_robots(replace(where, namespace=None)):
+        say(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
 
 
 def local_stop_ports(where: RobotSelection) -> dict[Address, Named]:
     """Return the stop ports of the addressed robots that run on this computer, as the registry has them."""
-    return {(robot.stop_host, robot.stop_port): (robot.endpoint, robot.namespace) for robot in where.local()}
+    ports: dict[Address, Named] = {}
+    for robot in where.local():
+        ports[robot.stop_host, robot.stop_port] = (robot.endpoint, robot.namespace)
+    return ports
 
 
 def stop_ports_elsewhere(where: RobotSelection, local: dict[Address, Named]) -> dict[Address, Named]:
-    """Return the stop port beside the given endpoint, when no robot of this computer is meant by it."""
-    if where.endpoint is None or where.session is not None or local:  # at a session's endpoint is a router
+    """Return the stop port beside the given endpoint, if the endpoint is not that of a robot of this computer."""
+    if where.endpoint is None or local:
+        return {}
+    if where.session is not None:  # a router listens at a session's endpoint
         return {}
     address = stop_address(where.endpoint, listens=True)
-    return {address: (where.endpoint, where.namespace)} if address[1] else {}
+    _, port = address
+    if not port:
+        return {}
+    return {address: (where.endpoint, where.namespace)}
 
 
 def stop_at_port(ask: AskPort, address: Address, robot: Named) -> StopResult | None:
-    """Send a stop to a stop port; None when the port is closed."""
+    """Send a stop to a stop port, and wait for the answer. Returns None when the port is closed."""
     endpoint, namespace = robot
     try:
         answer = ask(address)
@@ -89,44 +107,48 @@ def combine_results(
         there: Results of stop ports of other computers, which count once the robot's network confirms them.
         shown: Results of the network.
     """
-    only_shown = [result for result in shown if not any(_same(result, other) for other in (*here, *there))]
-    return [*here, *_confirmed(there, shown), *only_shown]
+    by_ports = (*here, *there)
+    only_shown = [result for result in shown if not any(_is_same_robot(result, other) for other in by_ports)]
+    return [*here, *_check_remote_ports(there, shown), *only_shown]
 
 
 def describe_results(
     results: Sequence[StopResult], here: Sequence[StopResult], shown: Sequence[StopResult]
 ) -> list[str]:
-    """Return a line for each robot, and one for each that an impostor may answer for on the network."""
-    lines = [
-        f"{robot.name}: {'stopped' if robot.stopped else 'NOT STOPPED'}: {robot.text} ({robot.endpoint})"
-        for robot in results
-    ]
-    doubtful = [robot for robot in shown if robot.in_doubt and any(_same(robot, other) for other in here)]
-    return lines + [f"{robot.name}: WARNING: {robot.text} ({robot.endpoint})" for robot in doubtful]
+    """Return a line for each robot, and a warning for each robot for which an impostor may answer on the network."""
+    lines: list[str] = []
+    for robot in results:
+        state = "stopped" if robot.stopped else "NOT STOPPED"
+        lines.append(f"{robot.name}: {state}: {robot.text} ({robot.endpoint})")
+    for robot in shown:
+        if robot.in_doubt and any(_is_same_robot(robot, other) for other in here):
+            lines.append(f"{robot.name}: WARNING: {robot.text} ({robot.endpoint})")
+    return lines
 
 
 def all_stopped(results: Sequence[StopResult]) -> bool:
-    """Whether there are robots, and every one has confirmed that it is stopped."""
+    """Return whether there are robots, and every one has confirmed that it is stopped."""
     return bool(results) and all(robot.stopped for robot in results)
 
 
-def _confirmed(there: Sequence[StopResult], shown: Sequence[StopResult]) -> list[StopResult]:
-    """Answers of stop ports of other computers, once the robot's network confirms them: such a port may be forged.
+def _check_remote_ports(there: Sequence[StopResult], shown: Sequence[StopResult]) -> list[StopResult]:
+    """Return the answers of stop ports of other computers, checked by those of the network: such a port may be forged.
 
-    A silent port counts for nothing when the network confirms the stop: at a router's address there may be none.
+    A port that reports a stop counts only when the network confirms it. A port that does not answer is left out when
+    the network confirms the stop, because a router's address may have no stop port.
     """
-    return [
-        result
-        if not result.stopped or any(_same(result, other) and other.stopped for other in shown)
-        else replace(
-            result,
-            stopped=False,
-            text=f"its stop port reports it, but nothing on its network confirms it: {result.text}",
-        )
-        for result in there
-        if result.stopped or not any(_same(result, other) and other.stopped for other in shown)
-    ]
+    checked: list[StopResult] = []
+    for result in there:
+        is_confirmed = any(_is_same_robot(result, other) and other.stopped for other in shown)
+        if result.stopped and is_confirmed:
+            checked.append(result)
+        elif result.stopped:
+            text = f"its stop port reports it, but nothing on its network confirms it: {result.text}"
+            checked.append(replace(result, stopped=False, text=text))
+        elif not is_confirmed:
+            checked.append(result)
+    return checked
 
 
-def _same(a: StopResult, b: StopResult) -> bool:
+def _is_same_robot(a: StopResult, b: StopResult) -> bool:
     return (a.endpoint, a.name) == (b.endpoint, b.name)

@@ -1,11 +1,11 @@
-"""What a stop came to, whichever way it was asked for."""
+"""The result of an emergency stop, by the stop port or by the network."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class StopResult:
-    """The result for one robot."""
+    """The result of an emergency stop for one robot."""
 
     name: str
     endpoint: str

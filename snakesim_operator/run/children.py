@@ -1,4 +1,4 @@
-"""The child processes of a run: started together, monitored, ended by id, and never left behind."""
+"""Starts the child processes of a run, reads their output, and ends them by process id."""
 
 import contextlib
 import fcntl
@@ -14,30 +14,35 @@ from snakesim_hal.base import arithmetic
 from snakesim_hal.base.process import child_environment, python_command
 from snakesim_hal.base.workers import start_worker
 
-STOP_LIMIT_S = 5.0
-LINES_SHOWN, LAST_BYTES = 15, 16384
-PIPE_BYTES = 2**20  # of output, while this process is frozen
+STOP_LIMIT_S = 5.0  # a child that has not ended by then is killed
+LINES_SHOWN = 15  # of the output of a child that failed
+OUTPUT_TAIL_BYTES = 16384  # kept in memory, more than LINES_SHOWN usually take
+PIPE_BYTES = 2**20  # holds a child's output while this process is frozen
+READ_BYTES = 65536
 
 
 class ProcessOutput:
-    """The output of a process: read from a pipe at once, so that it never waits for a disk, and passed on."""
+    """Reads the output of a process from a pipe at once, so that the process never waits for a disk."""
 
     def __init__(self, pipe: int, keep: Callable[[bytes], object]) -> None:
-        self._pipe, self._keep = pipe, keep
-        self._last = b""
-        self._thread = start_worker("words", self._listen)
+        """Start to read `pipe`, a file descriptor. `keep` gets each piece of output, in another thread."""
+        self._pipe = pipe
+        self._keep = keep
+        self._tail = b""
+        self._thread = start_worker("words", self._read_pipe)
 
     def last(self) -> list[str]:
-        """The last lines of its stdout and stderr, once it has ended."""
+        """Return the last lines of stdout and stderr, once the process has ended."""
         self._thread.join(1.0)
-        return self._last.decode(errors="replace").strip().splitlines()[-LINES_SHOWN:]
+        text = self._tail.decode(errors="replace").strip()
+        return text.splitlines()[-LINES_SHOWN:]
 
-    def _listen(self) -> None:
-        with contextlib.suppress(OSError):  # a larger pipe than the default
+    def _read_pipe(self) -> None:
+        with contextlib.suppress(OSError):  # the kernel may not allow a larger pipe than the default
             fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        while words := os.read(self._pipe, 65536):
-            self._last = (self._last + words)[-LAST_BYTES:]
-            self._keep(words)
+        while output := os.read(self._pipe, READ_BYTES):
+            self._tail = (self._tail + output)[-OUTPUT_TAIL_BYTES:]
+            self._keep(output)
         os.close(self._pipe)
 
 
@@ -50,15 +55,18 @@ class Child:
     words: ProcessOutput
 
     def how_it_ended(self) -> str | None:
-        """Its exit as text; None while it runs."""
+        """Return the exit of the process as text, with its last error message; None while it runs."""
         code = self.process.poll()
         if code is None:
             return None
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}"
-        why = (self.words.last() or [""])[-1]
-        said = f"snakesim {self.name}: "
-        return f"{self.name} ended with exit code {code}" + (f": {why[len(said) :]}" if why.startswith(said) else "")
+        text = f"{self.name} ended with exit code {code}"
+        lines = self.words.last()
+        error_prefix = f"snakesim {self.name}: "
+        if lines and lines[-1].startswith(error_prefix):
+            text += f": {lines[-1].removeprefix(error_prefix)}"
+        return text
 
 
 def start(
@@ -71,37 +79,41 @@ def start(
 ) -> Child:
     """Start a Python module as a child that dies with this process.
 
-    keep: gets its output, from another thread; inherits: file descriptors that stay open in it; more: environment
-    variables.
+    The child gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in
+    order. A SIGINT that arrives while the child's interpreter starts waits until the child has a handler.
 
-    It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
-    A SIGINT that comes while its interpreter starts waits until it has a handler.
+    Args:
+        name: of the child, for messages.
+        arguments: the module's name and its command line.
+        keep: gets the child's output, in another thread.
+        inherits: file descriptors that stay open in the child.
+        more: environment variables.
     """
     reproducible = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
     environment = child_environment(arithmetic.environment(), arithmetic.ONE_THREAD, reproducible, more)
-    ours, theirs = os.pipe()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
+    read_end, write_end = os.pipe()
+    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits the blocked signal
     try:
         process = subprocess.Popen(
             python_command("-m", *arguments, "--parent", str(os.getpid())),
             stdin=subprocess.DEVNULL,
-            stdout=theirs,
+            stdout=write_end,
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
             pass_fds=inherits,
         )
     except OSError:
-        os.close(ours)
+        os.close(read_end)
         raise
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        os.close(theirs)
-    return Child(name, process, ProcessOutput(ours, keep))
+        signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
+        os.close(write_end)
+    return Child(name, process, ProcessOutput(read_end, keep))
 
 
-def ask_to_end(child: Child) -> None:
-    """Terminate a child in order; a frozen one must be continued first."""
+def request_end(child: Child) -> None:
+    """Send SIGTERM to a child that runs, and SIGCONT, because a frozen child would not receive it otherwise."""
     if child.process.poll() is None:
         child.process.send_signal(signal.SIGTERM)
         child.process.send_signal(signal.SIGCONT)
@@ -110,12 +122,12 @@ def ask_to_end(child: Child) -> None:
 def stop_all(children: Sequence[Child]) -> None:
     """Terminate every child, wait, then kill. Returns when all have ended."""
     for child in children:
-        ask_to_end(child)
+        request_end(child)
     deadline = time.monotonic() + STOP_LIMIT_S
     for child in children:
         try:
             child.process.wait(max(deadline - time.monotonic(), 0.05))
         except subprocess.TimeoutExpired:
             child.process.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # blocked by a disk that hangs
+            with contextlib.suppress(subprocess.TimeoutExpired):  # a disk that hangs may block even a killed process
                 child.process.wait(STOP_LIMIT_S)

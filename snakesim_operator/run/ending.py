@@ -1,4 +1,4 @@
-"""How a run ends: the reason, and who requested it."""
+"""Collects the reasons for which a run ends, and turns signals into an end in order."""
 
 import contextlib
 import signal
@@ -23,29 +23,34 @@ class Ending:
         """All causes, before their consequences; None when there are none."""
         return "; ".join(self.causes) or None
 
-    def because(self, cause: str, *, first: bool = False) -> None:
-        """Note a cause. first: the causes noted before are consequences of it."""
-        if cause not in self.causes:
-            self.causes.insert(0 if first else len(self.causes), cause)
+    def add_cause(self, cause: str, *, first: bool = False) -> None:
+        """Add a cause, once. first: the causes that were added before are consequences of it."""
+        if cause in self.causes:
+            return
+        if first:
+            self.causes.insert(0, cause)
+        else:
+            self.causes.append(cause)
 
 
 @contextlib.contextmanager
 def interruptible(ending: Ending) -> Iterator[None]:
-    """Ctrl-C, SIGTERM and a closed terminal end the run in order.
+    """Let Ctrl-C, SIGTERM and a closed terminal end the run in order, for as long as the context lives.
 
-    A signal that comes while the record and the report of a finished run are written does not stop that. A second
-    Ctrl-C or SIGTERM is left to the default; SIGHUP comes twice of itself, from the kernel and the shell.
+    A signal that arrives while the record and the report of a finished run are written does not stop that. A second
+    Ctrl-C or SIGTERM has its default effect. A second SIGHUP has none, because the kernel and the shell both send one.
     """
 
-    def handle(number: int, _frame: FrameType | None) -> None:
+    def on_signal(number: int, _frame: FrameType | None) -> None:
         if not ending.over:
             ending.interrupted = True
             ending.on_interrupt()
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        next_handler = signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL
+        signal.signal(number, next_handler)
 
-    old = {number: signal.signal(number, handle) for number in stop_signals()}
+    old_handlers = {number: signal.signal(number, on_signal) for number in stop_signals()}
     try:
         yield
     finally:
-        for number, handler in old.items():
+        for number, handler in old_handlers.items():
             signal.signal(number, handler)

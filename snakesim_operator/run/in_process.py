@@ -40,7 +40,7 @@ from snakesim_operator.results.metrics.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.recording_contents import SERVICE_STREAMS
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
+from snakesim_operator.run.conclusion import Outcome, conclude, explain, write_results
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.pinned_process import call_pinned
 from snakesim_operator.run.progress import Progress
@@ -50,8 +50,8 @@ from snakesim_operator.run.run_files import RunFiles
 if TYPE_CHECKING:
     from snakesim_operator.recording.recording import Recording
 
-WORDS = "run.log"  # what the parts of the run say
-TAKEN_EVERY = 50  # turns
+WORDS = "run.log"  # gets what the parts of the run print to stderr
+POLL_TICKS = 50  # between two looks at the progress, the goal and the recording
 
 
 class ChildTracebackError(Exception):
@@ -70,10 +70,12 @@ class ControlFailure:
 
     @staticmethod
     def of(error: SnakesimError | None) -> "ControlFailure | None":
-        """Return the failure of an error that has ended control."""
+        """Return the failure that belongs to the error that ended control; None without an error."""
         if error is None:
             return None
-        return ControlFailure(str(error), error.__cause__ if isinstance(error, ControllerError) else error)
+        if isinstance(error, ControllerError):
+            return ControlFailure(str(error), error.__cause__)
+        return ControlFailure(str(error), error)
 
     def __reduce__(self) -> Any:
         """Pickle the traceback as text: frames stay in their process."""
@@ -85,11 +87,11 @@ class ControlFailure:
 
 @dataclass(frozen=True)
 class Result:
-    """A run that is over; `summary.ended` says how."""
+    """A run that is over; `summary.ended` says how it ended."""
 
     record: RunRecord  # every tick, and what control and guidance reported
     summary: RunSummary
-    gave_up: bool = False  # it was ended because it was stuck
+    gave_up: bool = False  # the run was ended because the robot was stuck
     control_failure: ControlFailure | None = None  # None: control went on to the end
 
 
@@ -101,23 +103,32 @@ def simulate(
     give_up_s: float | None = None,
     turn_limit_s: float | None = None,
 ) -> Result:
-    """Run a configuration. out: folder for what a run leaves, the report too; None keeps nothing.
-
-    until_goal: a run whose mission has a goal is complete soon after that is reached; give_up_s: and after so much
-    robot time without 3 cm of advance towards it. turn_limit_s: wall time that a part of the run may take in one tick,
-    60 s by default, or `start_limit_s` if that is longer.
-    Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
+    """Run a configuration in this process, and return what was recorded.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
     the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before
     the first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest
     may be its computer's own (`summary.own_arithmetic`).
+
+    Args:
+        config: configuration of the run.
+        out: folder for the files of the run, with the report; None keeps no files.
+        until_goal: whether a run whose mission has a goal is complete soon after the goal is reached.
+        give_up_s: robot time without 3 cm of advance towards the goal after which the run ends; None: never.
+        turn_limit_s: wall time that a part of the run may take in one tick, 60 s by default, or `start_limit_s` if
+            that is longer.
+
+    Returns:
+        The record and the summary, also for a run that ended early.
+
+    Raises:
+        SnakesimError: the run cannot begin.
     """
     if not isinstance(config, RunConfig):
         raise ConfigError(
             f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path"
         )
-    if not is_pinned() and not anything_offered():  # what this program offers, a child would not have
+    if not is_pinned() and not anything_offered():  # a child would not have the plugins that this program offers
         return call_pinned(
             simulate,
             config=config,
@@ -127,7 +138,8 @@ def simulate(
             turn_limit_s=turn_limit_s,
         )
     extras.check("record", "`simulate`, whose results are read from a recording,")
-    config, ending = check_plugins(config), Ending()
+    config = check_plugins(config)
+    ending = Ending()
     with contextlib.ExitStack() as opened:
         if out is None:
             folder = Path(opened.enter_context(TemporaryDirectory(prefix="snakesim-")))
@@ -138,20 +150,20 @@ def simulate(
         if files.folder is None:
             raise ConfigError(f"{out} cannot be written to; choose another folder")
         opened.callback(files.close)
-        recorded = SERVICE_STREAMS if out is None else [row.key for row in keys.SPACE]
-        run, outcome, gave_up = _go(
+        recorded_keys = SERVICE_STREAMS if out is None else _all_keys()
+        run, outcome, gave_up = _run_to_end(
             config,
             files,
             ending,
             None,
-            recorded,
+            recorded_keys,
             until_goal=until_goal,
             give_up_s=give_up_s,
             raw_only=out is None,
             turn_limit_s=turn_limit_s,
         )
         explain(ending, record_of(run.host), config)
-        record, summary = leave(files, files.folder, ending, outcome, report=out is not None)
+        record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
         # No local variable holds the failure: its traceback holds this function's frame.
         return Result(record, summary, gave_up, ControlFailure.of(run.take_errors().get(CONTROL)))
 
@@ -166,9 +178,19 @@ def run_in_process(
     raw_only: bool = False,
     pulse: Pulse | None = None,
 ) -> int:
-    """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal, give_up_s: as of `simulate`.
+    """Run a configuration for `snakesim run --in-process`, with progress and results on the terminal.
 
-    raw_only: the recording is without topics for viewers. pulse: shows another process whether the run goes on.
+    Args:
+        config: configuration of the run.
+        out: folder for the files of the run; None for the default one.
+        until_goal: as for `simulate`.
+        give_up_s: as for `simulate`.
+        record: whether to record all messages.
+        raw_only: whether the recording is without topics for viewers.
+        pulse: shows another process whether the run makes progress.
+
+    Returns:
+        The exit code, as of a run in processes.
     """
     check(config)
     check_recorder(record=record)
@@ -177,13 +199,12 @@ def run_in_process(
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
         with interruptible(ending):
             with Progress(config) as progress:
-                recorded = [row.key for row in keys.SPACE] if record else []
-                _, outcome, _ = _go(
+                _, outcome, _ = _run_to_end(
                     config,
                     files,
                     ending,
                     progress,
-                    recorded,
+                    _all_keys() if record else [],
                     until_goal=until_goal,
                     give_up_s=give_up_s,
                     raw_only=raw_only,
@@ -192,12 +213,16 @@ def run_in_process(
             return conclude(config, files, ending, outcome)
 
 
-def _go(
+def _all_keys() -> list[str]:
+    return [row.key for row in keys.SPACE]
+
+
+def _run_to_end(
     config: RunConfig,
     files: RunFiles,
     ending: Ending,
     progress: Progress | None,
-    recorded: Iterable[str],
+    recorded_keys: Iterable[str],
     *,
     until_goal: bool,
     give_up_s: float | None,
@@ -205,50 +230,70 @@ def _go(
     pulse: Pulse | None = None,
     turn_limit_s: float | None = None,
 ) -> tuple[InProcessRun, Outcome, bool]:
-    """recorded: keys, which may have wildcards. Also returns whether it was given up."""
-    words = _LogWriter(files)
+    """Run a configuration until it is over, with its record and its recording.
+
+    Args:
+        config: configuration of the run.
+        files: writes into the run's folder.
+        ending: collects the reasons for which the run ends, and is set when it is interrupted.
+        progress: shows the run on the terminal; None shows nothing.
+        recorded_keys: may have wildcards; empty for no recording.
+        until_goal: as for `simulate`.
+        give_up_s: as for `simulate`.
+        raw_only: whether the recording is without topics for viewers.
+        pulse: shows another process whether the run makes progress.
+        turn_limit_s: as for `simulate`.
+
+    Returns:
+        The run, what is known of it, and whether it was ended because the robot was stuck.
+    """
     run = InProcessRun(config, pulse, turn_limit_s)
     ending.on_interrupt = run.hurry
-    with contextlib.redirect_stderr(words), run:
-        host, session = run.host, run.network.session()
+    with contextlib.redirect_stderr(_LogWriter(files)), run:
+        host = run.host
+        session = run.network.session()
         if progress is not None:
             say(describe_what_moves(host.description))
-        control = session.reader(keys.CONTROL_STATE, ControlState)
-        watch = GoalWatch(config, host.description, give_up_s)
+        control_states = session.reader(keys.CONTROL_STATE, ControlState)
+        goal_watch = GoalWatch(config, host.description, give_up_s)
+        ends_at_goal = until_goal or config.mission.until_goal
         with (
             HostRecordWriter(host.black_box, host.description, partial(record_of, host), files.folder),
-            _recording(session, files, recorded, None if raw_only else config.robot.name) as recording,
+            _recording(session, files, recorded_keys, None if raw_only else config.robot.name) as recording,
         ):
             for turn, _ in enumerate(run.iterate_ticks()):
-                if turn % TAKEN_EVERY == 0:
+                if turn % POLL_TICKS == 0:
                     if recording is not None:
                         recording.flush_when_due()
-                    if progress is not None and host.authority.arm_session:  # before that there is nothing to wait for
-                        progress.show(host.status(), control.newest(lambda _state: True), armed=True)
-                    if (until_goal or config.mission.until_goal) and watch.over(host.black_box):
+                    if progress is not None and host.authority.arm_session:  # before the arming nothing changes
+                        progress.show(host.status(), control_states.newest(lambda _state: True), armed=True)
+                    if ends_at_goal and goal_watch.over(host.black_box):
                         host.complete()
                 if ending.interrupted:
                     run.stop()
     ending.over = True
     for failure in run.failed:
-        ending.because(failure)
-    lost = [] if recording is None or not recording.failure else [recording.failure]
+        ending.add_cause(failure)
+    lost = [recording.failure] if recording is not None and recording.failure else []
     outcome = Outcome(record_of(run.host), run.host.description, lost=lost, too_slow=run.too_slow())
-    return run, outcome, watch.gave_up
+    return run, outcome, goal_watch.gave_up
 
 
 @contextlib.contextmanager
 def _recording(
-    session: Session, files: RunFiles, recorded: Iterable[str], shown_as: str | None
+    session: Session, files: RunFiles, recorded_keys: Iterable[str], shown_as: str | None
 ) -> "Iterator[Recording | None]":
-    """Record what is published at these keys; None when there are none, or no file can be made."""
+    """Record the messages at these keys for as long as the context lives.
+
+    Yields None when there are no keys, or when no file can be created.
+    """
     recording = None
     try:
-        if files.folder is not None and recorded:
+        if files.folder is not None and recorded_keys:
             from snakesim_operator.recording.recording import Recording  # needs the extra `record`
 
             recording = Recording(files.folder / RECORDING, shown_as)
-            for key in recorded:
+            for key in recorded_keys:
                 session.on_latched_arrival(key, recording.take)
     except OSError as error:
         files.warn(f"{files.folder}: {error.strerror}")
@@ -256,18 +301,18 @@ def _recording(
         yield recording
     finally:
         if recording is not None:
-            recording.close({"version": version("snakesim"), "dropped": {}, "keys": list(recorded)})
+            recording.close({"version": version("snakesim"), "dropped": {}, "keys": list(recorded_keys)})
             if recording.failure:
                 files.warn(recording.failure)
 
 
 class _LogWriter(io.TextIOBase):
-    """Takes what is printed to stderr into the run's folder."""
+    """Writes the text that is printed to stderr into the run's folder."""
 
     def __init__(self, files: RunFiles) -> None:
         self._files = files
 
     def write(self, text: str) -> int:
-        """From any thread."""
+        """Append a text to the log. May be called from any thread."""
         self._files.append(WORDS, text.encode(errors="replace"))
         return len(text)

@@ -20,16 +20,16 @@ from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import Progress
 from snakesim_operator.run.supervisor import HOST, Supervisor
 
-AFTER_FAULT_S = 1.5
+AFTER_FAULT_S = 1.5  # the host goes on for so long after a fault, so that the safe stop is in the record
 POLL_S = 0.05
-ARM_LIMIT_S = 10.0
+ARM_LIMIT_S = 10.0  # for the host's answer to the request to arm
 RECORDER_LIMIT_S = 20.0  # once everything else is ready
 WHO = "snakesim run"
-AT_WORK = ("host", "control")  # between them a lease expires
-KEEPS_UP = 0.95  # share of real time
-SILENT_S = 10.0  # of the host, which says five times a second how it is
-SILENCES = {"T": "was stopped by a signal", "R": "computes", "S": "waits in a call", "D": "waits for a device"}
-LATE_TICKS = 10  # a process that was stopped for a while makes few of them
+LEASE_PROCESSES = ("host", "control")  # the lease expires if one of these two waits too long for a processor
+MIN_REAL_TIME_FACTOR = 0.95  # below it, the computer does not keep up
+MIN_LATE_TICKS = 10  # a process that was only stopped for a while causes fewer late ticks
+MAX_SILENCE_S = 10.0  # the host sends its status five times a second
+PROCESS_STATES = {"T": "was stopped by a signal", "R": "computes", "S": "waits in a call", "D": "waits for a device"}
 
 
 class RunMonitor:
@@ -46,83 +46,137 @@ class RunMonitor:
         stay: bool,
         unchecked: bool = False,
     ) -> None:
-        """stay: a fault does not end the run; a person clears it and arms again.
+        """Subscribe to what the run publishes.
 
-        unchecked: arm also without a check of its joints.
+        Args:
+            config: configuration of the run.
+            session: connected to the run's network.
+            supervisor: of the run's processes, already started.
+            ending: collects the reasons for which the run ends.
+            say: prints a line for the operator.
+            stay: whether a fault does not end the run; a person clears it and arms again.
+            unchecked: whether to arm also without a check of the joints.
         """
+        # Collaborators.
+        self._session = session
+        self._supervisor = supervisor
+        self._ending = ending
+        self._say = say
+        self._stay = stay
         self._unchecked = unchecked
-        self._session, self._supervisor = session, supervisor
-        self._ending, self._say, self._stay = ending, say, stay
-        self._control = session.reader(keys.CONTROL_STATE, ControlState)
-        self._trajectory = session.reader(keys.TRAJECTORY, Trajectory) if config.mission.until_goal else None
-        self._state: ControlState | None = None
-        self._recorder_is_there = RECORDER not in supervisor.names
-        self._recorder_due_s: float | None = None
-        session.on_alive(self._recorder_came, keys.alive(RECORDER))
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
-        self._patience = StartupTimeout(config.services, config.start_limit_s)
-        self._waits = ProcessorWaits(config.lease_ns * 1e-9)
-        self._status: Status | None = None
-        self._silent_polls = 0  # since the last status: a run that was stopped itself does not count
-        self._robot: Description | None = None
-        self._armed = False  # once, by this run or by a person
-        self._may_arm = config.has_own_control  # until the first fault: then a person does
-        self._own_services = frozenset(config.own_services)
-        self._hosts = supervisor.hosts
-        self._asked_at: float | None = None
-        self._last_latched: str | None = None
-        self._silent = ""  # how, if it is
+        self._startup_timeout = StartupTimeout(config.services, config.start_limit_s)
+        self._processor_waits = ProcessorWaits(config.lease_ns * 1e-9)
 
-    def go(self) -> None:
-        """Until the run is over. Raises SnakesimError when it cannot go on."""
-        give_up = time.monotonic() + START_LIMIT_S
+        # What control and navigation published.
+        self._control_states = session.reader(keys.CONTROL_STATE, ControlState)
+        self._control_state: ControlState | None = None
+        self._trajectory = session.reader(keys.TRAJECTORY, Trajectory) if config.mission.until_goal else None
+
+        # The recorder.
+        self._recorder_is_ready = RECORDER not in supervisor.names
+        self._recorder_due_s: float | None = None
+        session.on_alive(self._on_recorder_alive, keys.alive(RECORDER))
+
+        # What the host published.
+        self._status: Status | None = None
+        self._robot: Description | None = None
+        self._hosts = supervisor.hosts
+        self._polls_without_status = 0  # polls, not time: while the run itself was stopped, the host was not silent
+        self._silence: str | None = None  # a sentence, if the host is silent
+        self._last_latched: str | None = None  # the fault or emergency stop that was printed last
+
+        # Arming.
+        self._armed = False  # True after the first arming, by this run or by a person
+        self._may_arm = config.has_own_control  # until the first fault; afterwards only a person arms
+        self._own_services = frozenset(config.own_services)
+        self._arm_request_time_s: float | None = None
+
+    def run(self) -> None:
+        """Monitor the run until it is over. Raises SnakesimError when it cannot continue."""
+        give_up_s = time.monotonic() + START_LIMIT_S
         with self._progress:
             try:
-                while self._supervisor.goes_on() and not self._ending.interrupted:
-                    self._take_in()
-                    self._see_to_faults()
-                    if self._ending.reason is not None and (self._over_before_it_began() or self._silent):
-                        break
-                    self._arm_once()
-                    self._finish_at_goal()
-                    if not self._armed and self._may_arm and (tired := self._tired(give_up)):
-                        self._ending.because(tired)
+                while self._supervisor.restart_ended_parts() and not self._ending.interrupted:
+                    if not self._poll(give_up_s):
                         break
                     time.sleep(POLL_S)
                 if self._ending.reason is not None and self._armed and not self._ending.interrupted:
-                    self._let_it_settle()
+                    self._wait_for_safe_stop()
             finally:
                 self._faults.undo()
 
-    def _tired(self, give_up: float) -> str | None:
-        """Why the run no longer waits to be armed; None: it does."""
-        now, why = time.monotonic(), self._status.why if self._status else "no status"
-        if self._patience.ends(self._status, now):
-            limit_s = self._patience.limit_s
-            return f"not ready to arm within {limit_s:g} s (start_limit_s) with every service there: {why}"
-        return f"not ready to arm within {START_LIMIT_S:.0f} s: {why}" if now > give_up else None
+    def _poll(self, give_up_s: float) -> bool:
+        """Read messages, handle faults, and arm when the robot is ready. Returns whether the run continues."""
+        self._read_messages()
+        self._handle_faults()
+        failed_before_arming = not self._armed and not self._may_arm
+        if self._ending.reason is not None and (failed_before_arming or self._silence is not None):
+            return False
+        self._arm_once()
+        self._finish_at_goal()
+        if self._armed or not self._may_arm:
+            return True
+        timeout = self._describe_timeout(give_up_s)
+        if timeout is None:
+            return True
+        self._ending.add_cause(timeout)
+        return False
 
-    def _take_in(self) -> None:
-        """Process arrived messages."""
-        self._supervisor.take_in()
+    def _describe_timeout(self, give_up_s: float) -> str | None:
+        """Return why the run stops waiting to arm the robot; None while it waits."""
+        now = time.monotonic()
+        reason = self._status.why if self._status else "no status"
+        if self._startup_timeout.ends(self._status, now):
+            limit_s = self._startup_timeout.limit_s
+            return f"not ready to arm within {limit_s:g} s (start_limit_s) with every service there: {reason}"
+        if now > give_up_s:
+            return f"not ready to arm within {START_LIMIT_S:.0f} s: {reason}"
+        return None
+
+    def _read_messages(self) -> None:
+        """Process the messages that have arrived, and update the progress line."""
+        self._supervisor.read_host_messages()
         if self._ending.reason is None:
-            self._waits.look({name: pid for name, pid in self._supervisor.pids().items() if name in AT_WORK})
+            self._sample_processor_waits()
         if self._hosts != self._supervisor.hosts:
-            self._hosts = self._supervisor.hosts
-            self._may_arm = False
-            self._progress.start_over()
-            self._asked_at = None
-        host, before = self._supervisor.host, self._status
-        described_before = self._robot
-        self._status, self._robot = (None, None) if host is None else (host.status, host.description)
-        if self._robot is not None and described_before is None:
-            self._say(describe_what_moves(self._robot))
-        self._silent_polls = self._silent_polls + 1 if self._status is not None and self._status is before else 0
-        self._state = self._control.newest(lambda _state: True) or self._state
-        self._progress.show(self._status, self._state, armed=self._armed)
+            self._on_new_host()
+        self._read_host()
+        newest_state = self._control_states.newest(lambda _state: True)
+        self._control_state = newest_state or self._control_state
+        self._progress.show(self._status, self._control_state, armed=self._armed)
 
-    def _see_to_faults(self) -> None:
+    def _sample_processor_waits(self) -> None:
+        pids = self._supervisor.pids()
+        self._processor_waits.sample({name: pids[name] for name in pids if name in LEASE_PROCESSES})
+
+    def _on_new_host(self) -> None:
+        """Begin anew with a host that was restarted or reset. It boots disarmed, and a person arms it."""
+        self._hosts = self._supervisor.hosts
+        self._may_arm = False
+        self._progress.start_over()
+        self._arm_request_time_s = None
+
+    def _read_host(self) -> None:
+        """Update status and description from the private channel, and count polls without a new status."""
+        status_before = self._status
+        robot_before = self._robot
+        host = self._supervisor.host
+        if host is None:
+            self._status = None
+            self._robot = None
+        else:
+            self._status = host.status
+            self._robot = host.description
+        if self._robot is not None and robot_before is None:
+            self._say(describe_what_moves(self._robot))
+        if self._status is not None and self._status is status_before:
+            self._polls_without_status += 1
+        else:
+            self._polls_without_status = 0
+
+    def _handle_faults(self) -> None:
         """Carry out injected faults, and detect real ones."""
         status = self._status
         if self._robot is not None and not self._armed:
@@ -134,63 +188,80 @@ class RunMonitor:
             return
         if status.lifecycle in ("fault", "estop"):
             self._may_arm = False
-        self._armed |= status.lifecycle == "armed"
-        before, self._silent = self._silent, self._silence(status)
+        if status.lifecycle == "armed":
+            self._armed = True
+        silence_before = self._silence
+        self._silence = self._describe_silence(status)
         if self._stay:
-            if self._silent and not before:
-                self._say(self._silent)
-            self._tell(status)
-        elif self._silent:
-            self._ending.because(self._silent)
-        elif stopping := [fault for fault in status.faults if fault.reach == "robot"]:
-            self._ending.because(stopping[0].cause)
-            if stopping[0].what == "lease_expired" and (slow := self._too_slow(status)):
-                self._ending.because(slow, first=True)
+            if self._silence is not None and silence_before is None:
+                self._say(self._silence)
+            self._print_recovery(status)
+        elif self._silence is not None:
+            self._ending.add_cause(self._silence)
+        else:
+            self._note_robot_fault(status)
 
-    def _too_slow(self, status: Status) -> str | None:
-        """That this computer is too slow for the run, by what was measured; None: it is not, or nothing shows it."""
-        shown: list[str] = []
-        if (wait := self._waits.longest()) is not None:
-            name, waited_s, lasted_s = wait
-            shown.append(f"{name} waited for a processor for {1e3 * waited_s:.0f} of {1e3 * lasted_s:.0f} ms")
+    def _note_robot_fault(self, status: Status) -> None:
+        """Note the first fault that stops the whole robot as the reason for the end of the run."""
+        fault = next((fault for fault in status.faults if fault.reach == "robot"), None)
+        if fault is None:
+            return
+        self._ending.add_cause(fault.cause)
+        if fault.what == "lease_expired":
+            slow = self._describe_slow_computer(status)
+            if slow is not None:
+                self._ending.add_cause(slow, first=True)
+
+    def _describe_slow_computer(self, status: Status) -> str | None:
+        """Return the measurements that show that this computer is too slow for the run; None if there are none."""
+        evidence: list[str] = []
+        wait = self._processor_waits.find_longest()
+        if wait is not None:
+            name, waited_s, window_s = wait
+            evidence.append(f"{name} waited for a processor for {1e3 * waited_s:.0f} of {1e3 * window_s:.0f} ms")
         factor = status.real_time_factor
-        if status.overruns >= LATE_TICKS and status.speed == 1.0 and factor is not None and factor < KEEPS_UP:
-            shown.append(f"{status.overruns} ticks were late, and robot time passed at {factor:.2f} of real time")
-        return f"this computer is too slow: {', '.join(shown)}" if shown else None
+        many_late_ticks = status.overruns >= MIN_LATE_TICKS and status.speed == 1.0
+        if many_late_ticks and factor is not None and factor < MIN_REAL_TIME_FACTOR:
+            evidence.append(f"{status.overruns} ticks were late, and robot time passed at {factor:.2f} of real time")
+        if not evidence:
+            return None
+        return f"this computer is too slow: {', '.join(evidence)}"
 
-    def _silence(self, status: Status) -> str:
-        """That the host's process lives and says nothing; empty: it speaks, or has ended."""
-        if self._silent_polls * POLL_S < SILENT_S or not self._supervisor.host_runs():
-            return ""
+    def _describe_silence(self, status: Status) -> str | None:
+        """Return a sentence if the host's process runs and sends no status; None if it sends, or has ended."""
+        if self._polls_without_status * POLL_S < MAX_SILENCE_S or not self._supervisor.host_runs():
+            return None
         stat = Path(f"/proc/{self._supervisor.pids()[HOST]}/stat").read_text()
-        how = SILENCES.get(stat.rpartition(")")[2].split()[0], "is there")
-        return f"the host has said nothing for {SILENT_S:g} s, since tick {status.tick}; its process {how}"
+        state = stat.rpartition(")")[2].split()[0]
+        activity = PROCESS_STATES.get(state, "is there")
+        return f"the host has said nothing for {MAX_SILENCE_S:g} s, since tick {status.tick}; its process {activity}"
 
-    def _over_before_it_began(self) -> bool:
-        return not self._armed and not self._may_arm
-
-    def _tell(self, status: Status) -> None:
+    def _print_recovery(self, status: Status) -> None:
         """Print once how to recover from a fault."""
-        latched = f"{status.lifecycle}: {status.why}" if status.lifecycle in ("fault", "estop") else None
-        if latched is not None and latched != self._last_latched:
+        if status.lifecycle not in ("fault", "estop"):
+            self._last_latched = None
+            return
+        latched = f"{status.lifecycle}: {status.why}"
+        if latched != self._last_latched:
             self._say(latched)
             self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
         self._last_latched = latched
 
     def _arm_once(self) -> None:
+        """Arm the robot as soon as it is ready and the recorder is, if it has not been armed before."""
         status = self._status
         if status is None:
             return
         if self._own_services.isdisjoint(status.waiting_for):
-            self._supervisor.came_up = True
+            self._supervisor.started_up = True
         if self._armed or not self._may_arm or not status.ready_to_arm or self._robot is None:
             return
         if self._waits_for_recorder():
             return
-        self._ask_to_arm(self._robot)
+        self._request_arming(self._robot)
 
     def _finish_at_goal(self) -> None:
-        """Ask once, when navigation says that the goal of a run that lasts until then is reached."""
+        """Send one request to finish, when the mission ends at its goal and navigation reports that it is reached."""
         host = self._supervisor.host
         if self._trajectory is None or not self._armed or host is None:
             return
@@ -199,47 +270,54 @@ class RunMonitor:
             self._trajectory = None
 
     def _waits_for_recorder(self) -> bool:
-        """A recording has every tick, unless the recorder does not come."""
-        if self._recorder_is_there or RECORDER in self._supervisor.lost:
+        """Return whether arming waits for the recorder, so that the recording has every tick.
+
+        A recorder that does not connect within RECORDER_LIMIT_S is not waited for.
+        """
+        if self._recorder_is_ready or RECORDER in self._supervisor.lost:
             return False
-        self._recorder_due_s = self._recorder_due_s or time.monotonic() + RECORDER_LIMIT_S
-        if time.monotonic() < self._recorder_due_s:
+        now = time.monotonic()
+        if self._recorder_due_s is None:
+            self._recorder_due_s = now + RECORDER_LIMIT_S
+        if now < self._recorder_due_s:
             return True
         self._say(f"warning: no recorder within {RECORDER_LIMIT_S:.0f} s; the run goes on without")
-        self._recorder_is_there = True
+        self._recorder_is_ready = True
         return False
 
-    def _recorder_came(self, _key: str, present: bool) -> None:
-        """In Zenoh's thread: it misses nothing from now on."""
-        self._recorder_is_there |= present
+    def _on_recorder_alive(self, _key: str, present: bool) -> None:
+        """Note in Zenoh's thread that the recorder has subscribed, and misses no message from now on."""
+        self._recorder_is_ready |= present
 
-    def _ask_to_arm(self, robot: Description) -> None:
-        """Over the private channel, which reaches only the host that this run has started."""
+    def _request_arming(self, robot: Description) -> None:
+        """Request arming over the private channel, which reaches only the host that this run has started."""
         host = self._supervisor.host
         assert host is not None
-        if self._asked_at is None:
+        if self._arm_request_time_s is None:
             host.ask(request_to_arm(robot, WHO, unchecked=self._unchecked))
-            self._asked_at = time.monotonic()
+            self._arm_request_time_s = time.monotonic()
         elif host.answers:
-            answer, self._asked_at = host.answers.pop(0), None
+            answer = host.answers.pop(0)
+            self._arm_request_time_s = None
             if not answer.ok and answer.refusal != "not_ready":
                 raise RefusedError(answer.reason)
             self._armed = answer.ok
-        elif time.monotonic() - self._asked_at > ARM_LIMIT_S:
+        elif time.monotonic() - self._arm_request_time_s > ARM_LIMIT_S:
             raise NotConnectedError(f"the host does not answer within {ARM_LIMIT_S:.0f} s; see host.log")
 
-    def _let_it_settle(self) -> None:
-        """After a failure keep the host running briefly, so that the safe stop is in the record and in `status`."""
+    def _wait_for_safe_stop(self) -> None:
+        """Keep the host running briefly after a failure, so that the safe stop is in the record and in `status`."""
         deadline = time.monotonic() + 2 * AFTER_FAULT_S
         while self._supervisor.host_runs() and time.monotonic() < deadline and not self._ending.interrupted:
-            self._take_in()
+            self._read_messages()
             time.sleep(POLL_S)
-        self._blame_slow_controller()
+        self._note_slow_controller()
 
-    def _blame_slow_controller(self) -> None:
-        """Name the controller as the cause of an expired lease. Its own message comes after the fault."""
-        status, state = self._status, self._state
+    def _note_slow_controller(self) -> None:
+        """Note the controller as the cause of an expired lease. Its own message arrives after the fault."""
+        status = self._status
+        state = self._control_state
         if status is None or state is None or not state.too_slow:
             return
         if any(fault.what == "lease_expired" for fault in status.faults):
-            self._ending.because(f"control: {state.too_slow}", first=True)
+            self._ending.add_cause(f"control: {state.too_slow}", first=True)

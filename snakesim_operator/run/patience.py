@@ -4,35 +4,49 @@ from collections.abc import Collection
 
 from snakesim_hal.wire.messages import Status
 
-MOST_AT_ONCE_S = 1.0  # while a status does not come, the host or this process is slow: nobody waits for the robot
+# No status for longer than this means that the host or this process is slow, so the robot did not use that time.
+MAX_STEP_S = 1.0
 
 
 class StartupTimeout:
-    """Counts robot time; where that stands still, as in lockstep before the arming, time in which the host is heard.
+    """Counts the time in which the robot could have become ready, and did not.
 
-    It starts again with whatever comes, so that a slow computer has the whole time for each part.
+    This is robot time. Where robot time is paused, as in lockstep before the arming, it is the time in which the host
+    sends its status. The count starts again with each service that starts, so that a slow computer has the whole time
+    for each part.
     """
 
     def __init__(self, services: Collection[str], limit_s: float) -> None:
-        self._services, self.limit_s = frozenset(services), limit_s
-        self._last: Status | None = None
-        self._heard_s = self._waited_s = 0.0
+        """Begin to count. services: all that the robot needs; limit_s: the time allowed."""
+        self.limit_s = limit_s
+        self._services = frozenset(services)
+        self._last_status: Status | None = None
+        self._last_arrival_s = 0.0
+        self._waited_s = 0.0
 
     def ends(self, status: Status | None, now_s: float) -> bool:
-        """Whether it is over. status: the newest one; now_s: time of a steady clock."""
-        last = self._last
+        """Return whether the time is over.
+
+        Args:
+            status: the newest one; None before the first.
+            now_s: time of a monotonic clock.
+        """
+        last = self._last_status
         if status is None or status is last:
             return False
-        heard_s, self._last, self._heard_s = self._heard_s, status, now_s
-        if (
-            last is None
-            or status.ready_to_arm
-            or self._services.difference(status.alive)
-            or (status.alive, status.waiting_for) != (last.alive, last.waiting_for)
-        ):
+        since_arrival_s = now_s - self._last_arrival_s
+        self._last_status = status
+        self._last_arrival_s = now_s
+        if last is None or self._starts_again(last, status):
             self._waited_s = 0.0
         elif status.tick > last.tick:
             self._waited_s += (status.timestamp_ns - last.timestamp_ns) * 1e-9
         else:
-            self._waited_s += min(now_s - heard_s, MOST_AT_ONCE_S)
+            self._waited_s += min(since_arrival_s, MAX_STEP_S)
         return self._waited_s > self.limit_s
+
+    def _starts_again(self, last: Status, status: Status) -> bool:
+        """Return whether the robot is ready, a service is missing, or something has changed since the last status."""
+        if status.ready_to_arm or self._services.difference(status.alive):
+            return True
+        return (status.alive, status.waiting_for) != (last.alive, last.waiting_for)

@@ -1,6 +1,6 @@
-"""A function in a child process, which computes in the common arithmetic (`snakesim_hal/base/arithmetic.py`).
+"""Calls a function in a child process, which computes in the common arithmetic (`snakesim_hal/base/arithmetic.py`).
 
-For programs that imported NumPy before it could be told which processor code to choose.
+Programs need this that imported NumPy before its processor code could be chosen.
 """
 
 import contextlib
@@ -19,14 +19,15 @@ from snakesim_hal.base.arithmetic import environment
 from snakesim_hal.base.process import child_environment, die_with_parent, python_command
 
 ResultT = TypeVar("ResultT")
-ASKED, ANSWER = "asked", "answer"
-LOOK_S = 1.0  # Python code runs again after so long, so that an exception can be raised into the caller's thread
+CALL_FILE = "asked"  # holds the function and its arguments
+ANSWER_FILE = "answer"
+POLL_S = 1.0  # Python code runs again after so long, so that an exception can be raised in the caller's thread
 
 
-def call_pinned(function: Callable[..., ResultT], **asked: Any) -> ResultT:
-    """Call a function of a module with these arguments in a process of its own. Raises as it does."""
+def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
+    """Call a function of a module in a process of its own. Raises the SnakesimError that it raises there."""
     with TemporaryDirectory(prefix="snakesim-") as folder:  # also for the child's own, which Ctrl-C kills
-        (Path(folder) / ASKED).write_bytes(pickle.dumps((function, asked)))
+        (Path(folder) / CALL_FILE).write_bytes(pickle.dumps((function, arguments)))
         process = subprocess.Popen(
             python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
             env=child_environment(environment(), {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}),
@@ -35,30 +36,32 @@ def call_pinned(function: Callable[..., ResultT], **asked: Any) -> ResultT:
         try:
             while process.poll() is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(LOOK_S)
+                    process.wait(POLL_S)
         finally:
             process.kill()
             process.wait()
         if process.returncode:
             raise errors.SnakesimError(f"the process of the run ended with exit code {process.returncode}; see above")
-        answer = pickle.loads((Path(folder) / ANSWER).read_bytes())
+        answer = pickle.loads((Path(folder) / ANSWER_FILE).read_bytes())
     if isinstance(answer, tuple):
-        kind, lines = answer
-        raise getattr(errors, kind, errors.SnakesimError)(*lines)
+        error_name, lines = answer
+        error_type = getattr(errors, error_name, errors.SnakesimError)
+        raise error_type(*lines)
     return answer
 
 
 def main() -> int:
-    """The child: the arguments are the folder and the parent's process id."""
-    folder, parent = Path(sys.argv[1]), int(sys.argv[2])
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches both; the parent tells of it
-    die_with_parent(parent)
-    function, asked = pickle.loads((folder / ASKED).read_bytes())
+    """Run the child process. Its arguments are the folder and the parent's process id."""
+    folder = Path(sys.argv[1])
+    parent_pid = int(sys.argv[2])
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches both processes; the parent reports it
+    die_with_parent(parent_pid)
+    function, arguments = pickle.loads((folder / CALL_FILE).read_bytes())
     try:
-        answer: Any = function(**asked)
+        answer: Any = function(**arguments)
     except errors.SnakesimError as error:
         answer = type(error).__name__, error.lines
-    (folder / ANSWER).write_bytes(pickle.dumps(answer))
+    (folder / ANSWER_FILE).write_bytes(pickle.dumps(answer))
     return 0
 
 

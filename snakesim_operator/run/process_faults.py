@@ -1,7 +1,7 @@
-"""Injected faults that only the supervisor can carry out: a process is killed, stopped or frozen; the clock steps.
+"""Carries out the injected faults that only the supervisor can: processes are killed or frozen, the clock is stepped.
 
 They begin at robot time since the first arming. The duration of a freeze is wall-clock time:
-while the host is frozen, or waits for a frozen service, robot time stands still.
+while the host is frozen, or waits for a frozen service, robot time is paused.
 """
 
 import signal
@@ -22,11 +22,12 @@ from snakesim_hal.wire.messages import Answer, Clock, Description, FaultRequest,
 from snakesim_operator.run.supervisor import Supervisor
 
 MEETING_POINTS = ("host", "router")
+MAX_REASON_CHARACTERS = 500
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGTERM, "freeze": signal.SIGSTOP}
 
 
 class RobotTime:
-    """Robot time since the first arming, through restarts of the host. Between two clocks it stands still."""
+    """Counts robot time since the first arming, also when the host restarts. It is paused between clock messages."""
 
     def __init__(self, session: Session) -> None:
         self._clocks = session.reader(keys.CLOCK, Clock)
@@ -34,14 +35,17 @@ class RobotTime:
         self._elapsed_ns = 0
 
     def seconds(self) -> float | None:
-        """None before the first arming."""
+        """Return the time in s; None before the first arming."""
         for clock in self._clocks.drain():
             if self._last_ns is None:
-                self._last_ns = clock.timestamp_ns if clock.arm_session else None
+                if clock.arm_session:
+                    self._last_ns = clock.timestamp_ns
                 continue
             self._elapsed_ns += max(clock.timestamp_ns - self._last_ns, 0)
             self._last_ns = clock.timestamp_ns
-        return None if self._last_ns is None else self._elapsed_ns * 1e-9
+        if self._last_ns is None:
+            return None
+        return self._elapsed_ns * 1e-9
 
 
 class ProcessFaults:
@@ -52,35 +56,46 @@ class ProcessFaults:
         self._supervisor = supervisor
         self._say = say
         self._plan = Plan(injection for injection in planned(config) if injection.part == RUN)
-        self._time = None if self._plan.next_s() == inf else RobotTime(session)  # every clock wakes this process
+        self._time = RobotTime(session) if self._has_plan() else None  # each clock message wakes this process
         self._frozen: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
-        self._asked: list[Injection] = []
+        self._requested: list[Injection] = []  # begin at the next `carry_out`
         self._stepped_s = 0.0
         self._decoder = Decoder(FaultRequest)
         self._questions: SimpleQueue[Question] = SimpleQueue()
         session.on_question(keys.fault(RUN), self._questions.put)
 
     def refusal(self, robot: Description) -> str | None:
-        """Why the scenario's faults are not allowed on this robot; None if they are, or if there are none."""
-        return self._forbidden(robot) if self._plan.next_s() != inf else None
+        """Return why the scenario's faults are not allowed on this robot; None if they are, or if there are none."""
+        if not self._has_plan():
+            return None
+        return self._describe_prohibition(robot)
+
+    def _has_plan(self) -> bool:
+        return self._plan.next_s() != inf
 
     def carry_out(self, robot: Description | None, lifecycle: LifecycleState) -> None:
         """Carry out due faults, and answer requests. robot: None while it is unknown.
 
         Raises RefusedError when a planned fault is not permitted.
         """
-        now_s = None if self._time is None else self._time.seconds()
-        if now_s is not None:
-            for change in self._plan.until(now_s):
-                if change.begins:
-                    self._begin(change.injection)
-        while self._asked:
-            self._begin(self._asked.pop(0))
-        for name in [name for name, until in self._frozen.items() if until <= time.monotonic()]:
-            self._thaw(name)
+        self._begin_planned()
+        while self._requested:
+            self._begin(self._requested.pop(0))
+        for name, thaw_time_s in list(self._frozen.items()):
+            if thaw_time_s <= time.monotonic():
+                self._thaw(name)
         for _ in range(self._questions.qsize()):
             question = self._questions.get()
             question.reply(self._answer(question, robot, lifecycle))
+
+    def _begin_planned(self) -> None:
+        """Begin the planned faults that are due in robot time."""
+        now_s = None if self._time is None else self._time.seconds()
+        if now_s is None:
+            return
+        for change in self._plan.until(now_s):
+            if change.begins:
+                self._begin(change.injection)
 
     def undo(self) -> None:
         """Undo all changes to the computer."""
@@ -90,12 +105,14 @@ class ProcessFaults:
             step_wall_clock(-self._stepped_s)
 
     def _answer(self, question: Question, robot: Description | None, lifecycle: LifecycleState) -> Answer:
-        def no(reason: str, refusal: str) -> Answer:
-            return Answer(ok=False, reason=reason[:500], refusal=refusal, lifecycle=lifecycle)
+        """Check a request, begin or end its fault if that is allowed, and return the answer."""
 
-        forbidden = "the robot is not known yet" if robot is None else self._forbidden(robot)
-        if forbidden is not None:
-            return no(forbidden, "not_allowed")
+        def refuse(reason: str, refusal: str) -> Answer:
+            return Answer(ok=False, reason=reason[:MAX_REASON_CHARACTERS], refusal=refusal, lifecycle=lifecycle)
+
+        prohibition = "the robot is not known yet" if robot is None else self._describe_prohibition(robot)
+        if prohibition is not None:
+            return refuse(prohibition, "not_allowed")
         try:
             request = self._decoder.decode(question.payload, question.encoding)
             injection = checked(Injection(request.kind, request.target, 0.0, request.for_s or inf, request.amount))
@@ -104,27 +121,28 @@ class ProcessFaults:
                 return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)
             self._check(injection)
             if injection.target_type == "process":
-                self._asked.append(injection)  # when the answer is on its way: it may pass through that process
+                self._requested.append(injection)  # not now: the answer may pass through that process
             else:
                 self._begin(injection)
         except WireError as error:
-            return no(str(error), error.reason)
+            return refuse(str(error), error.reason)
         except ConfigError as error:
-            return no(str(error), "unknown_fault")
+            return refuse(str(error), "unknown_fault")
         except RefusedError as error:
-            return no(str(error), "not_permitted")
+            return refuse(str(error), "not_permitted")
         return Answer(ok=True, reason=f"begins: {injection.kind}:{injection.target}", lifecycle=lifecycle)
 
-    def _forbidden(self, robot: Description) -> str | None:
+    def _describe_prohibition(self, robot: Description) -> str | None:
+        """Return why faults may not be injected into this robot; None if they may."""
         if robot.emulated or self._allowed:
             return None
         return (
             f"{robot.robot} on backend {robot.backend} is real: fault injection needs "
-            "`allow_fault_injection = true` in the "
-            f"scenario, or --set allow_fault_injection=true"
+            "`allow_fault_injection = true` in the scenario, or --set allow_fault_injection=true"
         )
 
     def _check(self, injection: Injection) -> None:
+        """Raise ConfigError for a requested fault that this run cannot carry out, or could not end."""
         if injection.part != RUN:
             raise ConfigError(f"{injection.kind}:{injection.target} is carried out at {keys.fault(injection.part)}")
         if injection.target_type == "process" and injection.target not in self._supervisor.names:

@@ -1,7 +1,8 @@
-"""How long processes wait for a processor: it tells a computer that is too slow from a service that is silent.
+"""Measures how long processes wait for a processor: this distinguishes a slow computer from a service that is silent.
 
-The kernel counts how long a thread could have run and did not, each wait as it ends; one that goes on shows in a thread
-that is ready to run, and does not. The waits of all threads of a process add up: its threads wait for one another.
+The kernel counts how long each thread was ready to run and did not run; it adds a wait when the wait ends. A wait that
+still lasts shows in a thread that is ready to run and whose counters do not change. The waits of all threads of a
+process are added, because its threads wait for one another.
 """
 
 import contextlib
@@ -11,72 +12,108 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-KEPT_S = 1.0
-SLOW_SHARE = 0.5  # of a lease: who waits for more of it within about two cannot answer in time
+HISTORY_S = 1.0
+# A process that waits for more than this fraction of a lease, within about two leases, cannot answer in time.
+SLOW_FRACTION = 0.5
 
 
 class Usage(NamedTuple):
-    """What the kernel tells of a thread."""
+    """The kernel's counters of one thread."""
 
     ran_s: float
     waited_s: float
     ready: bool  # to run, or running
 
 
-def usages(pid: int) -> dict[int, Usage]:
-    """Of each thread of a process, so far; empty when the kernel does not tell."""
-    found: dict[int, Usage] = {}
+class Sample(NamedTuple):
+    """How long each process had waited for a processor, up to one point in time."""
+
+    time_s: float
+    waited_s: dict[str, float]  # by process name
+
+
+class LongWait(NamedTuple):
+    """A process that waited too long for a processor."""
+
+    name: str
+    waited_s: float
+    window_s: float  # the duration in which it waited so long
+
+
+def read_usages(pid: int) -> dict[int, Usage]:
+    """Return the counters of each thread of a process, by thread id; empty when the kernel does not provide them."""
+    usages: dict[int, Usage] = {}
     with contextlib.suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
             with contextlib.suppress(OSError, ValueError, IndexError):
-                ran, waited, *_ = (task / "schedstat").read_text().split()
+                ran_ns, waited_ns, *_ = (task / "schedstat").read_text().split()
                 state = (task / "stat").read_text().rpartition(")")[2].split()[0]
-                found[int(task.name)] = Usage(int(ran) * 1e-9, int(waited) * 1e-9, state == "R")
-    return found
+                usages[int(task.name)] = Usage(int(ran_ns) * 1e-9, int(waited_ns) * 1e-9, state == "R")
+    return usages
 
 
 class ProcessorWaits:
-    """Of some processes, over the last second."""
+    """Tracks how long some processes waited for a processor in the last second."""
 
     def __init__(
         self,
         lease_s: float,
-        read: Callable[[int], Mapping[int, Usage]] = usages,
+        read: Callable[[int], Mapping[int, Usage]] = read_usages,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """lease_s: a wait of about that long ends the run."""
-        self._lease_s, self._read, self._clock = lease_s, read, clock
-        self._since: dict[int, tuple[Usage, float]] = {}  # the newest usage of each thread, and when it came to be
-        self._seen: deque[tuple[float, dict[str, float]]] = deque()  # time, each process' wait until then
+        """Begin without samples. lease_s: a wait of about that duration ends the run."""
+        self._lease_s = lease_s
+        self._read = read
+        self._clock = clock
+        self._last_change: dict[int, tuple[Usage, float]] = {}  # of each thread: its usage, and when that was new
+        self._samples: deque[Sample] = deque()
 
-    def look(self, pids: Mapping[str, int]) -> None:
-        """Take the present numbers of the processes, by name; call it often."""
+    def sample(self, pids: Mapping[str, int]) -> None:
+        """Sample the counters of the processes, given by name; call it often."""
         now_s = self._clock()
-        now = {name: self._read(pid).items() for name, pid in pids.items()}
-        waits = {name: sum(self._waited_s(*thread, now_s) for thread in threads) for name, threads in now.items()}
-        self._seen.append((now_s, waits))
-        while len(self._seen) > 2 and now_s - self._seen[1][0] > KEPT_S:
-            self._seen.popleft()
+        usages = {name: self._read(pid) for name, pid in pids.items()}
+        waited_s: dict[str, float] = {}
+        for name, threads in usages.items():
+            waited_s[name] = sum(self._waited_s(thread, usage, now_s) for thread, usage in threads.items())
+        self._samples.append(Sample(now_s, waited_s))
+        while len(self._samples) > 2 and now_s - self._samples[1].time_s > HISTORY_S:
+            self._samples.popleft()
 
-    def longest(self) -> tuple[str, float, float] | None:
-        """Who waited too long, how long, and in which time, in seconds; None: nobody."""
-        found: tuple[str, float, float] | None = None
-        seen = list(self._seen)
-        for at, (began_s, before) in enumerate(seen):
-            later = next((one for one in seen[at + 1 :] if one[0] - began_s >= self._lease_s), None)
-            if later is None:
+    def find_longest(self) -> LongWait | None:
+        """Return the process that waited for the largest fraction of a window; None if no process waited too long.
+
+        A window begins at a sample and ends at the first sample at least one lease later.
+        """
+        longest: LongWait | None = None
+        samples = list(self._samples)
+        for index, begin in enumerate(samples):
+            end = self._first_after_a_lease(begin, samples[index + 1 :])
+            if end is None:
                 break
-            lasted_s = later[0] - began_s
-            for name, wait_s in later[1].items():
-                waited_s = min(wait_s - before.get(name, wait_s), lasted_s)
-                most = waited_s > SLOW_SHARE * max(self._lease_s, 0.5 * lasted_s)
-                if most and (found is None or waited_s / lasted_s > found[1] / found[2]):
-                    found = name, waited_s, lasted_s
-        return found
+            for wait in self._waits_between(begin, end):
+                if longest is None or wait.waited_s / wait.window_s > longest.waited_s / longest.window_s:
+                    longest = wait
+        return longest
 
-    def _waited_s(self, thread: int, now: Usage, now_s: float) -> float:
-        before, since_s = self._since.get(thread, (now, now_s))
-        if now != before or not now.ready:
+    def _first_after_a_lease(self, begin: Sample, later: list[Sample]) -> Sample | None:
+        return next((sample for sample in later if sample.time_s - begin.time_s >= self._lease_s), None)
+
+    def _waits_between(self, begin: Sample, end: Sample) -> list[LongWait]:
+        """Return the processes that waited too long between two samples."""
+        window_s = end.time_s - begin.time_s
+        limit_s = SLOW_FRACTION * max(self._lease_s, 0.5 * window_s)
+        waits: list[LongWait] = []
+        for name, end_s in end.waited_s.items():
+            begin_s = begin.waited_s.get(name, end_s)
+            waited_s = min(end_s - begin_s, window_s)
+            if waited_s > limit_s:
+                waits.append(LongWait(name, waited_s, window_s))
+        return waits
+
+    def _waited_s(self, thread: int, usage: Usage, now_s: float) -> float:
+        """Return how long a thread has waited so far, with the wait that still lasts."""
+        last_usage, since_s = self._last_change.get(thread, (usage, now_s))
+        if usage != last_usage or not usage.ready:
             since_s = now_s
-        self._since[thread] = now, since_s
-        return now.waited_s + now_s - since_s
+        self._last_change[thread] = usage, since_s
+        return usage.waited_s + now_s - since_s

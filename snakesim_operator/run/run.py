@@ -1,7 +1,7 @@
-"""`snakesim run`: starts backend host and services, arms, shows progress, ends everything, writes what is left.
+"""`snakesim run`: starts host and services, arms the robot, shows progress, ends all processes and writes the results.
 
-Nothing is started before the whole configuration has been checked. Whatever happens afterwards (the run completes,
-somebody presses Ctrl-C, a part fails, this process is killed) no process stays behind.
+No process is started before the whole configuration has been checked. No process is left afterwards, whether the run
+completes, the operator presses Ctrl-C, a part fails or this process is killed.
 """
 
 import contextlib
@@ -35,43 +35,84 @@ from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import HOST, Supervisor
 
 CONNECT_S = 0.5
-TELL_S = 20.0  # between two signs of life while nothing is heard
+REPORT_PERIOD_S = 20.0  # between two lines on the terminal while the host has not opened its network
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What the command line asks for."""
+    """A run, as the command line describes it."""
 
     config: RunConfig
     out: Path | None = None
+
+    # The network.
     endpoint: str | None = None
     router: str | None = None
     session: SessionFile | None = None  # how to connect to a lab's router
     namespace: str | None = None
-    unchecked: bool = False  # arm also a robot whose joints nobody has checked
-    stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
+
+    # Arming and faults.
+    unchecked: bool = False  # arm also a robot whose joints have not been checked
+    stay: bool = False  # a fault does not end the run: processes are started again, a person clears and arms
+
+    # Output.
     record: bool = True  # every message, in recording.mcap
-    raw_only: bool = False  # in it: without topics for viewers
-    console: bool = False  # show it in the browser
+    raw_only: bool = False  # the recording has no topics for viewers
+    console: bool = False  # show the run in the browser
 
     @property
     def network_name(self) -> str:
         """The robot's namespace."""
-        return self.namespace or (self.session and self.session.namespace) or self.config.robot.name
+        if self.namespace:
+            return self.namespace
+        if self.session and self.session.namespace:
+            return self.session.namespace
+        return self.config.robot.name
 
     @property
     def lab(self) -> Link | None:
         """How to reach the router that the run joins; None when its parts meet on this computer."""
         if self.session is not None:
             return Link.of_file(self.session, self.network_name)
-        return None if self.router is None else Link(self.router, self.network_name)
+        if self.router is not None:
+            return Link(self.router, self.network_name)
+        return None
 
 
 def run(request: RunRequest) -> int:
-    """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
+    """Run a scenario in processes of its own, from the checks to the report.
+
+    Returns:
+        The exit code: 0, or 1 on a fault or an early end, 3 when the record has gaps, 130 when interrupted.
+
+    Raises:
+        SnakesimError: a check failed; no process was started.
+    """
     request = replace(request, config=check_plugins(request.config))
+    _check_request(request)
+    link, stop_port = meeting_point(request.endpoint, request.lab, request.network_name)
+    ending = Ending()
+    with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
+        supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
+        processes = _RunProcesses(request, supervisor, link, files, config_file)
+        robot = LocalRobot.on(
+            link, request.config.robot.name, request.config.backend, stop_port, str(config_file.absolute())
+        )
+        with interruptible(ending):
+            with contextlib.ExitStack() as opened:
+                registry_failure = opened.enter_context(registered(robot))
+                if request.console:  # before the robot, because the operator waits for it
+                    opened.enter_context(console_beside(processes.common_arguments, files, say))
+                if registry_failure is not None:
+                    say(registry_failure)
+                _run_processes(processes, ending)
+            return _conclude(request, supervisor, files, ending)
+
+
+def _check_request(request: RunRequest) -> None:
+    """Raise SnakesimError when the run cannot be started as requested."""
     _check_router(request)
     check_recorder(record=request.record)
     if request.console:
@@ -79,33 +120,35 @@ def run(request: RunRequest) -> int:
     if request.endpoint is not None:
         check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
     refuse_second_robot(request.endpoint, request.lab)
-    link, stop_port = meeting_point(request.endpoint, request.lab, request.network_name)
-    ending = Ending()
-    with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
-        supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
-        names = (request.config.robot.name, request.config.backend)
-        common = [str(config_file), "--namespace", request.network_name, *_meeting(link)]
-        with interruptible(ending):
-            with (
-                registered(LocalRobot.on(link, *names, stop_port, str(config_file.absolute()))) as failure,
-                # first, because somebody waits for it
-                console_beside(common, files, say) if request.console else contextlib.nullcontext(),
-            ):
-                if failure is not None:
-                    say(failure)
-                _conduct(request, supervisor, link, files, config_file, ending)
-            from snakesim_operator.run.conclusion import Outcome, conclude
 
-            lost = list(supervisor.lost.values())
-            outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts, lost)
-            return conclude(request.config, files, ending, outcome, stay=request.stay)
+
+def _conclude(request: RunRequest, supervisor: Supervisor, files: RunFiles, ending: Ending) -> int:
+    """Write and print the results. Returns the exit code."""
+    # Imported only now, because the start of the robot does not need it.
+    from snakesim_operator.run.conclusion import Outcome, conclude
+
+    outcome = Outcome(
+        host=supervisor.host_record(),
+        robot=supervisor.robot(),
+        restarts=supervisor.restarts,
+        hosts=supervisor.hosts,
+        lost=list(supervisor.lost.values()),
+    )
+    return conclude(request.config, files, ending, outcome, stay=request.stay)
 
 
 @contextlib.contextmanager
 def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles, Path]]:
-    """The run's folder, held, and where its configuration is.
+    """Lock the run's folder for as long as the context lives, and write the configuration.
 
-    A folder that cannot be written to is no reason not to run: then nothing is kept.
+    A run whose folder is not writable goes on, but leaves no files.
+
+    Args:
+        config: configuration of the run.
+        out: the folder; None for the default one.
+
+    Yields:
+        The writer of the run's files, and the path of the configuration.
     """
     out = out or named_after(config.name)
     content = written(config)
@@ -125,7 +168,7 @@ def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles
 
 
 def check_recorder(*, record: bool) -> None:
-    """Raise ConfigError when a recording is wanted that cannot be written: what a run did cannot be had again."""
+    """Raise ConfigError when a recording is requested that cannot be written: a run cannot be recorded afterwards."""
     if record:
         extras.check("record", "a recording of the run", "; or run with --no-record")
 
@@ -135,80 +178,130 @@ def _warn(failure: str) -> None:
 
 
 def _check_router(request: RunRequest) -> None:
+    """Raise ConfigError when the run has two routers, or a fault that needs a router of its own and no such router."""
     if request.with_router:
         if request.lab is not None:
             raise ConfigError(
                 "--with-router starts a router of the run's own, --router and --session join another: give one of them"
             )
         return
-    wanted = [injection for injection in planned(request.config) if injection.target == ROUTER]
-    if wanted:
-        raise ConfigError(f"fault {str(wanted[0])!r}: this run has no router of its own; add --with-router")
+    router_faults = [injection for injection in planned(request.config) if injection.target == ROUTER]
+    if router_faults:
+        raise ConfigError(f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router")
 
 
-def _conduct(
-    request: RunRequest, supervisor: Supervisor, link: Link, files: RunFiles, config_file: Path, ending: Ending
-) -> None:
-    """Start the programs `snakesim host` and `snakesim service` as children, and see the run through."""
-    config = request.config
-    common = [str(config_file), "--namespace", request.network_name]
-    meeting = _meeting(link)
-    listening = ["--insecure"] if request.insecure else []
-    joins = request.router is not None or request.with_router
-    host_arguments = [
-        *("snakesim_hal.programs.host_program", *common, *listening, "--once", "--memory", supervisor.memory),
-        *(["--router", link.endpoint] if joins else meeting),
-        *(["--out", str(files.folder)] if files.folder else []),
-        *([] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
-    ]
-    try:
-        if request.with_router:
-            supervisor.start(ROUTER, ["snakesim_hal.programs.router_program", *common, *meeting, *listening])
-        supervisor.start(HOST, host_arguments)
+class _RunProcesses:
+    """Starts the processes of one run: router, host, services and recorder, each with its command line."""
+
+    def __init__(
+        self, request: RunRequest, supervisor: Supervisor, link: Link, files: RunFiles, config_file: Path
+    ) -> None:
+        self.request = request
+        self.supervisor = supervisor
+        self.link = link
+        self._files = files
+        self._scenario = [str(config_file), "--namespace", request.network_name]
+        if link.session:
+            self._network = ["--session", str(link.session.path)]
+        else:
+            self._network = ["--endpoint", link.endpoint]
+        self._listening = ["--insecure"] if request.insecure else []
+
+    @property
+    def common_arguments(self) -> list[str]:
+        """Arguments that name the scenario and the network."""
+        return [*self._scenario, *self._network]
+
+    def start(self) -> None:
+        """Start all processes, in the order in which they need one another."""
+        if self.request.with_router:
+            self._start_router()
+        self._start_host()
+        self._start_services()
+        if self.request.record and self._files.folder is not None:
+            self._start_recorder(self._files.folder)
+
+    def _start_router(self) -> None:
+        arguments = ["snakesim_hal.programs.router_program", *self.common_arguments, *self._listening]
+        self.supervisor.start(ROUTER, arguments)
+
+    def _start_host(self) -> None:
+        arguments = ["snakesim_hal.programs.host_program", *self._scenario, *self._listening]
+        arguments += ["--once", "--memory", self.supervisor.memory]
+        if self.request.router is not None or self.request.with_router:
+            arguments += ["--router", self.link.endpoint]
+        else:
+            arguments += self._network
+        if self._files.folder:
+            arguments += ["--out", str(self._files.folder)]
+        if not self.request.stay:
+            arguments += ["--end-after-fault", str(AFTER_FAULT_S)]
+        self.supervisor.start(HOST, arguments)
+
+    def _start_services(self) -> None:
+        """Start each service that is the run's own, except those that run inside the host."""
+        config = self.request.config
         for name, service in config.own_services.items():
             if name in config.beside:
                 continue
-            supervisor.start(
-                name, ["snakesim_hal.programs.service_program", name, *common, *meeting], may_restart=service.restart
+            arguments = ["snakesim_hal.programs.service_program", name, *self.common_arguments]
+            self.supervisor.start(name, arguments, may_restart=service.restart)
+
+    def _start_recorder(self, folder: Path) -> None:
+        arguments = ["snakesim_operator.recording.process", *self.common_arguments, "--out", str(folder)]
+        if self.request.raw_only:
+            arguments.append("--raw-only")
+        self.supervisor.start(RECORDER, arguments, vital=False)
+
+
+def _run_processes(processes: _RunProcesses, ending: Ending) -> None:
+    """Start the processes of a run, monitor them until the run is over, and end all of them."""
+    request = processes.request
+    supervisor = processes.supervisor
+    try:
+        processes.start()
+        with _session_of_run(processes.link, supervisor, ending) as session:
+            _print_start(request.config, processes.link)
+            monitor = RunMonitor(
+                request.config, session, supervisor, ending, say, stay=request.stay, unchecked=request.unchecked
             )
-        if request.record and files.folder is not None:
-            recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
-            recorder += ["--raw-only"] if request.raw_only else []
-            supervisor.start(RECORDER, recorder, vital=False)
-        with _session_of_run(link, supervisor, ending) as session:
-            say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.clock_mode}")
-            say(f"network: {link.endpoint}, namespace {link.namespace}")
-            if not config.has_own_control:
-                say("no control service of its own: a client that takes the lease commands and arms the robot")
-            RunMonitor(config, session, supervisor, ending, say, stay=request.stay, unchecked=request.unchecked).go()
+            monitor.run()
     except SnakesimError as error:
-        ending.because(str(error))
+        ending.add_cause(str(error))
     finally:
         ending.over = True
         supervisor.end()
 
 
-def _meeting(link: Link) -> list[str]:
-    return ["--session", str(link.session.path)] if link.session else ["--endpoint", link.endpoint]
+def _print_start(config: RunConfig, link: Link) -> None:
+    say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.clock_mode}")
+    say(f"network: {link.endpoint}, namespace {link.namespace}")
+    if not config.has_own_control:
+        say("no control service of its own: a client that takes the lease commands and arms the robot")
 
 
 @contextlib.contextmanager
 def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
-    """A session on the run's network, as soon as there is one. Raises NotConnectedError when a part has ended."""
-    began = shown_at = time.monotonic()
+    """Connect to the run's network as soon as the host has opened it.
+
+    Raises:
+        NotConnectedError: a process has ended, the operator interrupted the run, or the host took too long.
+    """
+    began_s = time.monotonic()
+    reported_s = began_s
     with contextlib.ExitStack() as stack:
         while True:
             try:
                 session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
                 break
             except NotConnectedError:
-                ended = supervisor.first_ended()
+                ended = supervisor.describe_first_end()
                 if ended is not None:
                     raise NotConnectedError(ended) from None
                 now = time.monotonic()
-                if now > began + START_LIMIT_S or ending.interrupted:
+                if now > began_s + START_LIMIT_S or ending.interrupted:
                     raise
-                if now > shown_at + TELL_S:
-                    say(f"starting: the host has not opened its network yet, after {now - began:.0f} s")
-                    shown_at = now
+                if now > reported_s + REPORT_PERIOD_S:
+                    say(f"starting: the host has not opened its network yet, after {now - began_s:.0f} s")
+                    reported_s = now
         yield session

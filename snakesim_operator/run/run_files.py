@@ -24,16 +24,16 @@ LIMIT_S = 5.0  # for a disk that hangs
 
 @dataclass
 class _Task:
-    """Something to write; rename: `content` is the new name."""
+    """One operation on a file. For a rename, `content` is the new name."""
 
     kind: Literal["append", "put", "rename"]
     name: str
     content: bytes
 
-    def takes(self, other: "_Task") -> bool:
-        """Whether another task can be merged into this one."""
-        alike = self.kind == other.kind == "append" and self.name == other.name
-        return alike and len(self.content) < TOGETHER_BYTES
+    def can_merge(self, other: "_Task") -> bool:
+        """Return whether the content of another task can be added to this one."""
+        appends_to_same_file = self.kind == other.kind == "append" and self.name == other.name
+        return appends_to_same_file and len(self.content) < TOGETHER_BYTES
 
 
 class RunFiles:
@@ -52,28 +52,28 @@ class RunFiles:
         self._handles: dict[str, int] = {}
         self._closing = False
         self._changed = threading.Condition()
-        self._thread = start_worker("files", self._work, on_error=self._drop_task)
+        self._thread = start_worker("files", self._write_files, on_error=self._drop_task)
 
     def append(self, name: str, content: bytes) -> None:
-        """Append to a file. With too much pending data, or in the file, it is lost."""
-        taken = self._appended.get(name, 0) + len(content)
-        if taken > FILE_BYTES:
+        """Append to a file. The content is lost if the file, or the data that waits for the disk, is too large."""
+        appended_bytes = self._appended.get(name, 0) + len(content)
+        if appended_bytes > FILE_BYTES:
             self._lost = self._lost or f"{name} is longer than {FILE_BYTES >> 20} MiB: the rest of it is lost"
             return
-        self._appended[name] = taken
-        self._ask(_Task("append", name, content))
+        self._appended[name] = appended_bytes
+        self._add_task(_Task("append", name, content))
 
     def put(self, name: str, content: bytes) -> None:
         """Write a whole file."""
-        self._ask(_Task("put", name, content))
+        self._add_task(_Task("put", name, content))
 
     def rename(self, name: str, to: str) -> None:
         """Rename an appended file; later appends begin a new one."""
         self._appended.pop(name, None)
-        self._ask(_Task("rename", name, to.encode()))
+        self._add_task(_Task("rename", name, to.encode()))
 
     def warn(self, failure: str) -> None:
-        """Warn once that something cannot be written, by whomever."""
+        """Warn once that a file cannot be written, by this or another process."""
         if not self._warned:
             self._warned = True
             self._warn(failure)
@@ -93,38 +93,39 @@ class RunFiles:
             return f"{self.folder}: the disk has not answered for {LIMIT_S:g} s"
         return self._lost
 
-    def _ask(self, task: _Task) -> None:
+    def _add_task(self, task: _Task) -> None:
         with self._changed:
             if self.folder is None:
                 return
             if self._waiting_bytes + len(task.content) > MEMORY_BYTES:
                 self._lost = self._failure or f"{self.folder}: the disk is too slow for the run's output"
                 return
-            if len(self._tasks) > 1 and self._tasks[-1].takes(task):  # the first one may be in progress
+            if len(self._tasks) > 1 and self._tasks[-1].can_merge(task):  # the first one may be in progress
                 self._tasks[-1].content += task.content
             else:
                 self._tasks.append(task)
             self._waiting_bytes += len(task.content)
             self._changed.notify_all()
 
-    def _work(self) -> None:
+    def _write_files(self) -> None:
+        """Carry out the tasks in order, in a thread. A task that fails is retried until the files are closed."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._tasks or self._closing)
                 if not self._tasks:
                     break
                 task = self._tasks[0]
-            before = len(task.content)
+            bytes_before = len(task.content)
             self._failure = self._attempt(task)
             if self._failure:
                 self.warn(self._failure)
             with self._changed:
                 if not self._failure or self._closing:
                     self._tasks.popleft()
-                    self._waiting_bytes -= before
+                    self._waiting_bytes -= bytes_before
                     self._lost = self._lost or self._failure
                 else:
-                    self._waiting_bytes -= before - len(task.content)
+                    self._waiting_bytes -= bytes_before - len(task.content)
                     self._changed.notify_all()
                     self._changed.wait_for(lambda: self._closing, RETRY_S)
                 self._changed.notify_all()
@@ -132,7 +133,7 @@ class RunFiles:
             os.close(handle)
 
     def _drop_task(self, error: Exception) -> None:
-        """Drop the task whose attempt raised what no disk raises: it would be raised again, and hold up the others."""
+        """Drop a task that raised an unexpected error: it would raise it again, and delay the other tasks."""
         with self._changed:
             if self._tasks:
                 task = self._tasks.popleft()
@@ -163,7 +164,8 @@ class RunFiles:
         handle = self._handles[task.name]
         try:
             while task.content:
-                task.content = task.content[os.write(handle, task.content) :]
+                written_bytes = os.write(handle, task.content)
+                task.content = task.content[written_bytes:]
         except OSError:
             if os.fstat(handle).st_size == 0:
                 os.close(self._handles.pop(task.name))

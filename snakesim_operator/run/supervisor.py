@@ -1,6 +1,6 @@
-"""The processes of a run: started in order, restarted with back-off where allowed, and never left behind.
+"""Starts the processes of a run in order, restarts them with back-off where that is allowed, and ends all of them.
 
-Nothing here arms anything: a restarted host boots disarmed, and a person arms it.
+Nothing here arms the robot: a restarted host boots disarmed, and a person arms it.
 """
 
 import contextlib
@@ -26,8 +26,11 @@ from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
 
 HOST = "host"
-FIRST_DELAY_S, LAST_DELAY_S = 0.5, 10.0
-HEALTHY_S = 30.0  # after which the next restart is the first one again
+MIN_DELAY_S = 0.5  # before the first restart of a process; each further delay is twice the one before
+MAX_DELAY_S = 10.0
+HEALTHY_S = 30.0  # a process that ran this long is restarted with the minimum delay again
+HOST_RECORD_BYTES = 2**20  # more than the host's statistics ever take
+REGULAR_EXIT_CODES = (0, 1)  # the host wrote its record before it ended
 
 
 @dataclass
@@ -40,25 +43,28 @@ class Part:
     child: Child
     vital: bool = True  # whether the run ends with it
     started_s: float = field(default_factory=time.monotonic)
-    delay_s: float = FIRST_DELAY_S
-    again_s: float | None = None  # time of its restart; None while it runs
+    delay_s: float = MIN_DELAY_S
+    restart_due_s: float | None = None  # monotonic time of its restart; None while it runs
 
-    def ended(self) -> str | None:
-        """How it ended; reported once for each time it ends."""
-        return self.child.how_it_ended() if self.again_s is None else None
+    def describe_end(self) -> str | None:
+        """Return how the process ended; None while it runs, or when its restart is scheduled already."""
+        if self.restart_due_s is not None:
+            return None
+        return self.child.how_it_ended()
 
-    def put_off(self) -> float:
-        """Schedule its restart; returns the delay."""
+    def schedule_restart(self) -> float:
+        """Schedule the restart with exponential back-off. Returns the delay in s."""
         now = time.monotonic()
         if now - self.started_s > HEALTHY_S:
-            self.delay_s = FIRST_DELAY_S
-        delay_s, self.again_s = self.delay_s, now + self.delay_s
-        self.delay_s = min(2 * delay_s, LAST_DELAY_S)
+            self.delay_s = MIN_DELAY_S
+        delay_s = self.delay_s
+        self.restart_due_s = now + delay_s
+        self.delay_s = min(2 * delay_s, MAX_DELAY_S)
         return delay_s
 
-    def is_due(self) -> bool:
-        """Whether its restart is due."""
-        return self.again_s is not None and time.monotonic() >= self.again_s
+    def is_restart_due(self) -> bool:
+        """Return whether a scheduled restart is due now."""
+        return self.restart_due_s is not None and time.monotonic() >= self.restart_due_s
 
 
 class Supervisor:
@@ -73,40 +79,65 @@ class Supervisor:
         *,
         stay: bool = False,
     ) -> None:
-        """stop_port: for every host of the run, one after the other; requests without a host wait in it.
+        """Prepare a run; no process is started yet.
 
-        stay: processes that end are restarted, once the run has started up.
+        Args:
+            files: receive the output of each process.
+            ending: collects the reasons for which the run ends.
+            say: prints a line for the operator.
+            stop_port: bound socket that each host of the run inherits in turn. Requests that arrive while no host runs
+                wait in it.
+            stay: whether processes that end are restarted, once the run has started up.
         """
+        # What the run reports about its processes.
         self.restarts: list[Restart] = []
-        self.lost: dict[str, str] = {}  # parts that ended and were not vital, and how
-        self.came_up = False  # until then a restart would not help a process that ends
+        self.lost: dict[str, str] = {}  # for each part that ended and was not vital: its last line of output
+        self.started_up = False  # until then a restart would not help a process that ends
+
+        # Collaborators.
         self._files = files
-        self._memory = os.memfd_create("snakesim-host")
         self._ending = ending
         self._say = say
         self._stay = stay
+
+        # What the processes share.
+        self._memory = os.memfd_create("snakesim-host")
         self._stop_port = stop_port
         self._secret = {RUN_KEY: new_run_key()}
+
+        # The processes.
         self._parts: dict[str, Part] = {}
         self.host: StarterEnd | None = None  # the private channel to the newest host
         self._begun_s = time.monotonic()
 
     def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True, vital: bool = True) -> None:
-        """Start a Python module as a part of the run. vital: whether the run ends when this part does."""
-        self._parts[name] = Part(name, arguments, may_restart, self._launch(name, arguments), vital)
+        """Start a Python module as a part of the run.
+
+        Args:
+            name: of the part, unique in the run.
+            arguments: the module's name and its command line.
+            may_restart: whether the part may be restarted when it ends.
+            vital: whether the run ends when this part does.
+        """
+        child = self._launch(name, arguments)
+        self._parts[name] = Part(name, arguments, may_restart, child, vital)
 
     def _launch(self, name: str, arguments: Sequence[str]) -> Child:
         keep = partial(self._files.append, f"{name}.log")
-        if name != HOST:
-            return children.start(name, arguments, keep, more=self._secret)
-        ours, its = socket_pair()
-        with its:
-            private = ["--channel", str(its.fileno()), "--stop-port", str(self._stop_port.fileno())]
-            inherits = (its.fileno(), self._stop_port.fileno())
-            child = children.start(name, [*arguments, *private], keep, inherits=inherits, more=self._secret)
+        if name == HOST:
+            return self._launch_host(arguments, keep)
+        return children.start(name, arguments, keep, more=self._secret)
+
+    def _launch_host(self, arguments: Sequence[str], keep: Callable[[bytes], object]) -> Child:
+        """Start a host that inherits the stop port and its end of a new private channel."""
+        supervisor_end, host_end = socket_pair()
+        with host_end:
+            inherits = (host_end.fileno(), self._stop_port.fileno())
+            private = ["--channel", str(inherits[0]), "--stop-port", str(inherits[1])]
+            child = children.start(HOST, [*arguments, *private], keep, inherits=inherits, more=self._secret)
         if self.host is not None:
             self.host.close()
-        self.host = StarterEnd(ours)
+        self.host = StarterEnd(supervisor_end)
         return child
 
     @property
@@ -115,36 +146,40 @@ class Supervisor:
         return f"/proc/{os.getpid()}/fd/{self._memory}"
 
     def host_record(self) -> HostRecord | None:
-        """The host's statistics, half a second old while it runs; None while unknown."""
+        """Return the host's statistics, up to half a second old while it runs; None while they are unknown."""
         with contextlib.suppress(OSError, *UNDECODABLE):
-            return msgspec.json.decode(os.pread(self._memory, 2**20, 0), type=HostRecord)
+            content = os.pread(self._memory, HOST_RECORD_BYTES, 0)
+            return msgspec.json.decode(content, type=HostRecord)
         return None
 
     def robot(self) -> Description | None:
-        """The host's description; None while unknown."""
+        """Return the host's description; None while it is unknown."""
         return self.host.description if self.host is not None else None
 
-    def take_in(self) -> None:
-        """Read what the host has said; one that was reset counts as another."""
+    def read_host_messages(self) -> None:
+        """Read what the host has sent. A host that was reset counts as another host."""
         if self.host is None:
             return
-        before = self.host.resets
+        resets_before = self.host.resets
         self.host.take_in()
-        for _ in range(self.host.resets - before):
-            at_s = time.monotonic() - self._begun_s
-            self.restarts.append(Restart(name=HOST, how="host was reset", at_s=round(at_s, 3), after_s=0.0))
+        for _ in range(self.host.resets - resets_before):
+            self._note_restart(HOST, "host was reset", delay_s=0.0)
             robot = self.host.description
-            what = f"snakesim arm {robot.robot} {robot.backend}" if robot is not None else "snakesim arm"
-            self._say(f"the simulator was reset: it is at the start, and disarmed; go on with `{what}`")
+            command = f"snakesim arm {robot.robot} {robot.backend}" if robot is not None else "snakesim arm"
+            self._say(f"the simulator was reset: it is at the start, and disarmed; go on with `{command}`")
+
+    def _note_restart(self, name: str, how: str, delay_s: float) -> None:
+        elapsed_s = time.monotonic() - self._begun_s
+        self.restarts.append(Restart(name=name, how=how, at_s=round(elapsed_s, 3), after_s=delay_s))
 
     @property
     def names(self) -> list[str]:
-        """Every process of the run."""
+        """The names of all processes of the run."""
         return list(self._parts)
 
     @property
     def hosts(self) -> int:
-        """How many HAL hosts the run has had."""
+        """The number of HAL hosts that the run has had."""
         return 1 + sum(restart.name == HOST for restart in self.restarts)
 
     def signal(self, name: str, number: int) -> None:
@@ -152,85 +187,115 @@ class Supervisor:
         self._parts[name].child.process.send_signal(number)
 
     def pids(self) -> dict[str, int]:
-        """The process id of each process that runs now, by name."""
-        return {name: part.child.process.pid for name, part in self._parts.items() if part.again_s is None}
+        """Return the process id of each process that runs now, by name."""
+        return {name: part.child.process.pid for name, part in self._parts.items() if part.restart_due_s is None}
 
     def host_runs(self) -> bool:
-        """Whether the host runs now."""
+        """Return whether the host runs now."""
         return self._parts[HOST].child.process.poll() is None
 
-    def first_ended(self) -> str | None:
-        """How the first process that ended did so; None while all run."""
-        vital = [part for part in self._parts.values() if part.vital]
-        return next((how for part in vital if (how := part.child.how_it_ended()) is not None), None)
-
-    def goes_on(self) -> bool:
-        """Restart ended processes where allowed; False when the run is over, regularly or not."""
+    def describe_first_end(self) -> str | None:
+        """Return how the first vital part that has ended did so, in the order of their start; None while all run."""
         for part in self._parts.values():
-            how = part.ended()
-            if how is None:
-                if part.is_due():
-                    part.child = self._launch(part.name, part.arguments)
-                    part.again_s, part.started_s = None, time.monotonic()
-            elif not part.vital:
-                self._go_on_without(part, how)
-            elif part.name == HOST and self._host_is_done():
-                return False
-            elif self._stay and self.came_up and part.may_restart:
-                self._put_off(part, how)
-            else:
-                self._ending.because(how, first=True)
-                return False
+            if not part.vital:
+                continue
+            how = part.child.how_it_ended()
+            if how is not None:
+                return how
+        return None
+
+    def restart_ended_parts(self) -> bool:
+        """Restart processes that have ended, where that is allowed.
+
+        Returns:
+            Whether the run continues. False: a part has ended that may not be restarted, or the host is done.
+        """
+        for part in self._parts.values():
+            how = part.describe_end()
+            if how is not None:
+                if not self._continue_after_end(part, how):
+                    return False
+            elif part.is_restart_due():
+                part.child = self._launch(part.name, part.arguments)
+                part.restart_due_s = None
+                part.started_s = time.monotonic()
         return True
 
-    def _go_on_without(self, part: Part, how: str) -> None:
-        if part.name not in self.lost:
-            self.lost[part.name] = (part.child.words.last() or [how])[-1]
-            self._files.warn(self.lost[part.name])
+    def _continue_after_end(self, part: Part, how: str) -> bool:
+        """Decide what the end of a part means for the run. Returns whether the run continues."""
+        if not part.vital:
+            self._continue_without(part, how)
+            return True
+        if part.name == HOST and self._host_is_done():
+            return False
+        if self._stay and self.started_up and part.may_restart:
+            self._restart_later(part, how)
+            return True
+        self._ending.add_cause(how, first=True)
+        return False
 
-    def _put_off(self, part: Part, how: str) -> None:
-        delay_s = part.put_off()
+    def _continue_without(self, part: Part, how: str) -> None:
+        """Warn once that a part that the run does not need has ended."""
+        if part.name in self.lost:
+            return
+        lines = part.child.words.last() or [how]
+        self.lost[part.name] = lines[-1]
+        self._files.warn(lines[-1])
+
+    def _restart_later(self, part: Part, how: str) -> None:
+        delay_s = part.schedule_restart()
         if part.name == HOST and self.host is not None:
             self.host.close()
             self.host = None
-        at_s = time.monotonic() - self._begun_s
-        self.restarts.append(Restart(name=part.name, how=how, at_s=round(at_s, 3), after_s=delay_s))
+        self._note_restart(part.name, how, delay_s)
         self._say(f"{how}; restart in {delay_s:g} s")
 
     def _host_is_done(self) -> bool:
-        """Whether the host has ended with a complete record."""
+        """Return whether the host has ended with a complete record."""
         record = self.host_record()
-        if record is None or record.ended == "running" or self._parts[HOST].child.process.returncode not in (0, 1):
+        if record is None or record.ended == "running":
+            return False
+        if self._parts[HOST].child.process.returncode not in REGULAR_EXIT_CODES:
             return False
         return not self._stay or record.ended in ("complete", "finished")
 
     def end(self) -> None:
-        """End everything, the host first and in order, so that its record is written. Nothing is left after this."""
+        """End all processes, the host first, so that its record is written. None is left after this."""
         running = [part.child for part in self._parts.values()]
-        host = self._parts.get(HOST)
-        if host is not None and host.again_s is None:
-            children.ask_to_end(host.child)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                host.child.process.wait(children.STOP_LIMIT_S)
-            how = host.child.how_it_ended()
-            if how is not None and host.child.process.returncode not in (0, 1):
-                self._ending.because(how)
-        for part in self._parts.values():
-            how = part.ended()
-            if part.name != HOST and part.vital and how is not None:
-                self._ending.because(how, first=True)  # before any fault that the host has noted since
+        self._end_host()
+        self._note_early_ends()
         children.stop_all(running)
         for part in self._parts.values():
             if not part.vital and part.child.process.returncode:
-                self._go_on_without(part, part.child.how_it_ended() or "")
-        self._print_last_words()
+                self._continue_without(part, part.child.how_it_ended() or "")
+        self._print_last_output()
 
-    def _print_last_words(self) -> None:
+    def _end_host(self) -> None:
+        """End the host in order, and note how it ended if it wrote no record."""
+        host = self._parts.get(HOST)
+        if host is None or host.restart_due_s is not None:
+            return
+        children.request_end(host.child)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            host.child.process.wait(children.STOP_LIMIT_S)
+        how = host.child.how_it_ended()
+        if how is not None and host.child.process.returncode not in REGULAR_EXIT_CODES:
+            self._ending.add_cause(how)
+
+    def _note_early_ends(self) -> None:
+        """Note the vital parts that ended before they were stopped: any fault that the host noted is a consequence."""
+        for part in self._parts.values():
+            how = part.describe_end()
+            if part.name != HOST and part.vital and how is not None:
+                self._ending.add_cause(how, first=True)
+
+    def _print_last_output(self) -> None:
         if self._ending.reason is None or self._ending.interrupted:
             return
         for part in self._parts.values():
-            words = part.child.words.last()
-            if words:
-                self._say(f"--- output of {part.name}:")
-                for line in words:
-                    self._say(line)
+            lines = part.child.words.last()
+            if not lines:
+                continue
+            self._say(f"--- output of {part.name}:")
+            for line in lines:
+                self._say(line)

@@ -1,6 +1,6 @@
-"""Findings of `snakesim doctor` about the kernel: what keeps a control loop from running when it is due.
+"""Findings of `snakesim doctor` about the kernel: what delays a control loop.
 
-Read from /proc and /sys of a folder, so that a test can lay out another computer.
+They are read from /proc and /sys below a folder, so that a test can describe another computer.
 """
 
 import errno
@@ -16,7 +16,7 @@ ROOT = Path("/")
 
 
 def kernel(root: Path = ROOT) -> Iterator[Finding]:
-    """Preemption, clock of the processors, processors set aside, serial adapters and their ports."""
+    """Yield findings about preemption, processor clocks, isolated processors, serial adapters and their ports."""
     yield from _preemption(root)
     yield from _governor(root)
     yield from _isolated(root)
@@ -25,10 +25,10 @@ def kernel(root: Path = ROOT) -> Iterator[Finding]:
 
 
 def _preemption(root: Path) -> Iterator[Finding]:
-    words = _read(root / "proc/version")
-    if words is None:
+    version = _read(root / "proc/version")
+    if version is None:
         return
-    if _read(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in words:
+    if _read(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         yield Finding(what="kernel", state="ok", detail="PREEMPT_RT")
         return
     detail = "not PREEMPT_RT: a tick may begin milliseconds late; `snakesim top` shows how late (docs/real-time.md)"
@@ -36,30 +36,32 @@ def _preemption(root: Path) -> Iterator[Finding]:
 
 
 def _governor(root: Path) -> Iterator[Finding]:
-    found = {_read(path) for path in (root / "sys/devices/system/cpu").glob("cpu*/cpufreq/scaling_governor")} - {None}
-    if not found:
+    paths = (root / "sys/devices/system/cpu").glob("cpu*/cpufreq/scaling_governor")
+    governors = {_read(path) for path in paths} - {None}
+    if not governors:
         yield Finding(what="governor", state="ok", detail="not known: this kernel does not set the processors' clock")
-    elif found == {"performance"}:
+    elif governors == {"performance"}:
         yield Finding(what="governor", state="ok", detail="performance")
     else:
-        names = ", ".join(sorted(name for name in found if name))
+        names = ", ".join(sorted(name for name in governors if name))
         detail = f"{names}: a processor that has slowed down takes longer for the first ticks"
         yield Finding(what="governor", state="warn", detail=detail, fix=["sudo cpupower frequency-set -g performance"])
 
 
 def _isolated(root: Path) -> Iterator[Finding]:
-    apart = _read(root / "sys/devices/system/cpu/isolated")
-    if apart:
-        detail = f"{apart} kept free of other programs; a host uses them when started with `taskset -c {apart}`"
+    isolated = _read(root / "sys/devices/system/cpu/isolated")
+    if isolated:
+        detail = f"{isolated} kept free of other programs; a host uses them when started with `taskset -c {isolated}`"
     else:
         detail = f"none of {os.cpu_count()}; from 500 Hz on one for the host alone is worth it (docs/real-time.md)"
     yield Finding(what="isolated processors", state="ok", detail=detail)
 
 
 def _serial_adapters(root: Path) -> Iterator[Finding]:
-    """FTDI's driver collects bytes for `latency_timer` milliseconds, unless told otherwise."""
+    """Yield a finding for each FTDI adapter, whose driver collects bytes for `latency_timer` milliseconds."""
     for timer in sorted((root / "sys/bus/usb-serial/devices").glob("*/latency_timer")):
-        latency_ms, port = _read(timer) or "", timer.parent.name
+        latency_ms = _read(timer) or ""
+        port = timer.parent.name
         if latency_ms.isdecimal() and int(latency_ms) > FTDI_LATENCY_MS:
             fix = [f"echo {FTDI_LATENCY_MS} | sudo tee {timer}"]
             detail = f"{port} holds back what it received for up to {latency_ms} ms"
@@ -69,24 +71,30 @@ def _serial_adapters(root: Path) -> Iterator[Finding]:
 
 
 def _serial_ports(root: Path) -> Iterator[Finding]:
-    """Whether ports of adapters may be opened, and nobody else has them for himself."""
-    for port in sorted(path for name in ("ttyUSB*", "ttyACM*") for path in (root / "dev").glob(name)):
-        try:
-            number = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        except OSError as error:
-            fix = ["sudo usermod -aG dialout $USER    # then log in again"] if error.errno == errno.EACCES else []
-            detail = f"{port.name} cannot be opened: {error.strerror}"
-            yield Finding(what="serial port", state="warn", detail=detail, fix=fix or [f"ls -l {port}"])
-            continue
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            detail, fix = f"{port.name} is in use by another program", [f"sudo fuser -v {port}"]
-            yield Finding(what="serial port", state="warn", detail=detail, fix=fix)
-        else:
-            yield Finding(what="serial port", state="ok", detail=f"{port.name} can be opened")
-        finally:
-            os.close(number)
+    """Yield a finding for each port of an adapter."""
+    folder = root / "dev"
+    for port in sorted([*folder.glob("ttyUSB*"), *folder.glob("ttyACM*")]):
+        yield _check_serial_port(port)
+
+
+def _check_serial_port(port: Path) -> Finding:
+    """Check whether this user may open a port, and no other program has locked it."""
+    try:
+        handle = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        fix = [f"ls -l {port}"]
+        if error.errno == errno.EACCES:
+            fix = ["sudo usermod -aG dialout $USER    # then log in again"]
+        detail = f"{port.name} cannot be opened: {error.strerror}"
+        return Finding(what="serial port", state="warn", detail=detail, fix=fix)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        detail = f"{port.name} is in use by another program"
+        return Finding(what="serial port", state="warn", detail=detail, fix=[f"sudo fuser -v {port}"])
+    finally:
+        os.close(handle)
+    return Finding(what="serial port", state="ok", detail=f"{port.name} can be opened")
 
 
 def _read(path: Path) -> str | None:

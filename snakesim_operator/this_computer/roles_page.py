@@ -1,4 +1,4 @@
-"""`schemas/roles.md`: the table of roles, as a page for people."""
+"""Writes `schemas/roles.md`: the table of roles as a page for people."""
 
 from collections.abc import Iterable, Iterator
 
@@ -22,30 +22,59 @@ then delivered is decided key by key.
 
 
 def roles_page() -> str:
-    """The page's text."""
-    rows = [INTRODUCTION, *_table(("role", "is"), ((role, about) for role, about in ABOUT.items())), ""]
-    rows += [*_table(("key", *Role), (_row(line) for line in TABLE)), "", NOTES, "## In Zenoh's words", ""]
-    rows += ["What a router lets in from such a process, and what it sends to it.", ""]
-    return "\n".join([*rows, *_table(("act", "in", "out"), _acts()), ""])
+    """Return the text of the page."""
+    return "\n".join(
+        [
+            INTRODUCTION,
+            *_table(("role", "is"), ABOUT.items()),
+            "",
+            *_table(("key", *Role), [_key_row(line) for line in TABLE]),
+            "",
+            NOTES,
+            "## In Zenoh's words",
+            "",
+            "What a router lets in from such a process, and what it sends to it.",
+            "",
+            *_table(("act", "in", "out"), _message_rows()),
+            "",
+        ]
+    )
 
 
-def _row(line: Line) -> tuple[str, ...]:
-    marked = " (if allowed)" if line.key in INJECTION else ""
-    return (f"`{line.key}`{marked}", *(", ".join(line.acts(role)) or "-" for role in Role))
+def _key_row(line: Line) -> tuple[str, ...]:
+    """Return a key, and what each role may do at it."""
+    condition = " (if allowed)" if line.key in INJECTION else ""
+    cells = [f"`{line.key}`{condition}"]
+    for role in Role:
+        cells.append(", ".join(line.acts(role)) or "-")
+    return tuple(cells)
 
 
-def _acts() -> Iterator[tuple[str, ...]]:
-    for about, acts in (("", MESSAGES), (", of a latched key also", MESSAGES_OF_LATCHED)):
+def _message_rows() -> Iterator[tuple[str, ...]]:
+    """Yield each act with the Zenoh messages that it consists of, into the router and out of it."""
+    for suffix, acts in (("", MESSAGES), (", of a latched key also", MESSAGES_OF_LATCHED)):
         for act, messages in acts.items():
-            yield f"{act}{about}", *(_passing(messages, flow) for flow in ("ingress", "egress"))
+            yield f"{act}{suffix}", _format_messages(messages, "ingress"), _format_messages(messages, "egress")
 
 
-def _passing(messages: Iterable[tuple[str, str, str]], flow: str) -> str:
-    """The messages of a flow, as a cell."""
-    named = [f"`{message}`" + (f" at `KEY{after}`" if after else "") for at, message, after in messages if at == flow]
-    return ", ".join(named) or "-"
+def _format_messages(messages: Iterable[tuple[str, str, str]], flow: str) -> str:
+    """Return the messages of a flow, as a cell. messages: flow, name, and what follows the key."""
+    names: list[str] = []
+    for message_flow, message, key_suffix in messages:
+        if message_flow != flow:
+            continue
+        place = f" at `KEY{key_suffix}`" if key_suffix else ""
+        names.append(f"`{message}`{place}")
+    return ", ".join(names) or "-"
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    titles = list(head)
-    return [f"| {' | '.join(cells)} |" for cells in (titles, ["---"] * len(titles), *(list(row) for row in rows))]
+def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    titles = list(header)
+    lines = [_table_line(titles), _table_line(["---"] * len(titles))]
+    lines += [_table_line(row) for row in rows]
+    return lines
+
+
+def _table_line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"

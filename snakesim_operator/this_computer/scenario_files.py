@@ -1,5 +1,6 @@
-"""`snakesim scenarios` and `snakesim config`: what is shipped, and what a scenario comes to."""
+"""`snakesim scenarios` lists the shipped files; `snakesim config` shows every value that a scenario results in."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -8,60 +9,79 @@ from snakesim_hal.base.errors import short
 from snakesim_hal.base.terminal import say, say_json
 from snakesim_hal.model.files import leaves, read_part, shipped
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_installed, in_file, plugin_settings
-from snakesim_hal.model.scenario import Loaded
+from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.programs.preflight import check_plugins
 
-ABOUT = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}  # where each says what it is
+DESCRIPTION_KEYS = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}
+MAX_VALUE_CHARACTERS = 48  # longer values are not aligned
+
+Row = tuple[str, Any, str]  # key, value, and the file or flag that it came from
 
 
 def list_shipped(*, as_json: bool) -> int:
-    """Print the name of every shipped file, and what it is."""
-    listed = {
-        kind: {name: read_part(name, kind).values.get(about, "") for name in shipped(kind)}
-        for kind, about in ABOUT.items()
-    }
+    """Print the name and the description of every shipped file."""
+    shipped_files: dict[str, dict[str, str]] = {}
+    for kind, description_key in DESCRIPTION_KEYS.items():
+        shipped_files[kind] = {name: read_part(name, kind).values.get(description_key, "") for name in shipped(kind)}
     if as_json:
-        say_json(listed)
+        say_json(shipped_files)
         return 0
-    for kind, names in listed.items():
+    for kind, descriptions in shipped_files.items():
         say(f"{kind}:")
-        for name, about in names.items():
-            say(f"  {name:<18}{about}")
+        for name, description in descriptions.items():
+            say(f"  {name:<18}{description}")
     return 0
 
 
 def show_config(loaded: Loaded, *, as_json: bool) -> int:
-    """Print every value, and where it came from. Raises ConfigError."""
+    """Print every value of a scenario, and the file or flag that it came from. Raises ConfigError."""
     check_plugins(loaded.config, loaded.table, run_files=False)
-    every = _every_value(loaded)
+    rows = _find_values(loaded)
     if as_json:
-        say_json({key: {"value": value, "origin": origin} for key, value, origin in every})
+        say_json({key: {"value": value, "origin": origin} for key, value, origin in rows})
         return 0
-    rows = [(key, short(repr(value) if isinstance(value, str) else str(value)), origin) for key, value, origin in every]
-    key_width = max(len(key) for key, _, _ in rows)
-    value_width = min(max(len(value) for _, value, _ in rows), 48)
-    for key, value, origin in rows:
-        say(f"{key:<{key_width}}  {value:<{value_width}}  {origin}")
-    for section, name in (
-        (loaded.config.control_section, loaded.config.controller),
-        (loaded.config.backend_section, loaded.config.backend),
-        *((f"services.{name}", service.code) for name, service in loaded.config.own_services.items()),
-    ):
-        if in_file(name):
-            say(f"{section}: not checked, because that would run {name}; `snakesim run` checks it")
+    _print_rows(rows)
+    _print_unchecked(loaded.config)
     return 0
 
 
-def _every_value(loaded: Loaded) -> list[tuple[str, Any, str]]:
-    """Those of the scenario, with every setting of the chosen controller and backend, whoever set it."""
-    config, table = loaded.config, loaded.table
-    rows = {key: (value, origin) for key, value, origin in loaded.explain() if key not in ("controllers", "backends")}
+def _print_rows(rows: Sequence[Row]) -> None:
+    """Print key, value and origin in three columns."""
+    texts = [short(repr(value) if isinstance(value, str) else str(value)) for _, value, _ in rows]
+    key_width = max(len(key) for key, _, _ in rows)
+    value_width = min(max(len(text) for text in texts), MAX_VALUE_CHARACTERS)
+    for (key, _, origin), text in zip(rows, texts, strict=True):
+        say(f"{key:<{key_width}}  {text:<{value_width}}  {origin}")
+
+
+def _print_unchecked(config: RunConfig) -> None:
+    """Print which sections are not checked, because their plugin is a file whose code would run."""
+    plugins = [
+        (config.control_section, config.controller),
+        (config.backend_section, config.backend),
+    ]
+    plugins += [(f"services.{name}", service.code) for name, service in config.own_services.items()]
+    for section, plugin in plugins:
+        if in_file(plugin):
+            say(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
+
+
+def _find_values(loaded: Loaded) -> list[Row]:
+    """Return all values of the scenario, with every setting of the chosen controller and backend."""
+    config = loaded.config
+    table = loaded.table
+    values: dict[str, tuple[Any, str]] = {}
+    for key, value, origin in loaded.explain():
+        if key not in ("controllers", "backends"):
+            values[key] = (value, origin)
     for group, name, section, given in (
         (CONTROLLERS, config.controller, config.control_section, config.control_settings),
         (BACKENDS, config.backend, config.backend_section, config.backend_settings),
     ):
         plugin = find_installed(group, name)
-        if plugin is not None:
-            settings = msgspec.to_builtins(plugin_settings(plugin, given, table.source, section, table.origin))
-            rows |= {key: (value, table.origin_of(key)) for key, value in leaves(settings, section)}
-    return [(key, value, origin) for key, (value, origin) in rows.items()]
+        if plugin is None:
+            continue
+        checked = plugin_settings(plugin, given, table.source, section, table.origin)
+        for key, value in leaves(msgspec.to_builtins(checked), section):
+            values[key] = (value, table.origin_of(key))
+    return [(key, value, origin) for key, (value, origin) in values.items()]

@@ -65,13 +65,13 @@ def test_a_joystick_is_found_read_and_lost() -> None:
     wait_until(lambda: sticks.append(stick) or True if (stick := found()) else False, "the device to be there")
     stick = sticks[0]
     device.sends(EV_ABS, ABS_Y, 0)
-    assert not stick.take(1.0) and stick.forward == pytest.approx(1.0)
+    assert not stick.read_events(1.0) and stick.forward == pytest.approx(1.0)
     device.sends(EV_ABS, ABS_X, -100)
-    assert not stick.take(1.0) and stick.right == pytest.approx(-1.0)
+    assert not stick.read_events(1.0) and stick.right == pytest.approx(-1.0)
     device.sends(EV_KEY, BTN_SOUTH, 1)
-    assert stick.take(1.0), "the emergency stop"
+    assert stick.read_events(1.0), "the emergency stop"
     device.unplug()
-    wait_until(lambda: stick.take(0.1) or stick.lost, "the stick to be lost")
+    wait_until(lambda: stick.read_events(0.1) or stick.lost, "the stick to be lost")
     assert stick.forward == 0.0
     stick.close()
 

@@ -24,205 +24,285 @@ from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, T
 
 PERIOD_S = 0.05
 SHOWN_EVERY = 4  # periods
-KEY_AGE_S = 15.0  # after this long without a key, nobody may be at the keyboard
-SILENT_S = 1.0  # without a clock
+MAX_FASTEST_M_S = 10
+KEY_AGE_S = 15.0  # after this long without a key, the operator may have left the keyboard
+SILENT_S = 1.0  # messages older than this are shown with their age
 STOP_WAIT_S = 20.0  # at the end, for an emergency stop that is under way
 HELP = "up, down: speed   left, right: direction   s: stop   SPACE: EMERGENCY STOP   q: quit"
 
 
 def teleop(where: RobotSelection, fastest_m_s: float, joystick: Path | None) -> int:
-    """Until q, Ctrl-C, or the terminal or the joystick is gone. Returns 1 for the latter. Raises SnakesimError.
+    """Drive a robot until the operator presses q or Ctrl-C, or until the terminal or the joystick is gone.
 
-    joystick: its device, or an empty path for the first one; None: keys alone.
+    Args:
+        where: selects the robot.
+        fastest_m_s: the maximum speed.
+        joystick: its device, or an empty path for the first one; None: keys alone.
+
+    Returns:
+        The exit code: 0, or 1 if the terminal or the joystick is gone.
+
+    Raises:
+        SnakesimError: no robot, no joystick or no terminal, or the speed is out of range.
     """
-    if not 0 < fastest_m_s <= 10:
-        raise ConfigError(f"--fastest {fastest_m_s:g}: give a speed above 0, and at most 10 m/s")
+    if not 0 < fastest_m_s <= MAX_FASTEST_M_S:
+        raise ConfigError(f"--fastest {fastest_m_s:g}: give a speed above 0, and at most {MAX_FASTEST_M_S} m/s")
     with contextlib.ExitStack() as opened:
-        stick = None if joystick is None else open_joystick(None if joystick == Path() else joystick)
-        if stick is not None:
+        stick: Joystick | None = None
+        if joystick is not None:
+            device = None if joystick == Path() else joystick
+            stick = open_joystick(device)
             opened.callback(stick.close)
         keyboard = Keyboard() if stick is None or sys.stdin.isatty() else None
         link = only_robot(where, "teleop")
         session = opened.enter_context(open_session(link, CONNECT_S))
         if keyboard is not None:
             opened.enter_context(keyboard)
-        return Teleop(session, link, fastest_m_s, keyboard, stick).go()
+        return Teleop(session, link, fastest_m_s, keyboard, stick).run()
 
 
 class Teleop:
-    """One operator, one robot."""
+    """Reads one operator's input, sends it to one robot, and shows the robot's state."""
 
     def __init__(
         self, session: Session, link: Link, fastest_m_s: float, keyboard: Keyboard | None, stick: Joystick | None
     ) -> None:
-        self._link, self._keyboard, self._stick = link, keyboard, stick
-        self._me = f"{user_name()[:40]}, teleop {os.getpid()}"  # two may steer
-        self._steering = Steering(self._me, fastest_m_s)
+        # The operator.
+        self._link = link
+        self._keyboard = keyboard
+        self._stick = stick
+        self._user = f"{user_name()[:40]}, teleop {os.getpid()}"  # with the process id: one user may run two
+        self._steering = Steering(self._user, fastest_m_s)
+        self._ignores_keys = False  # the newest keys were late
+        self._end_reason = ""  # not empty: the loop ends
+
+        # What is sent.
         self._intents = session.publisher(keys.INTENT, Intent)
+        self._sent_ns = -1  # robot time of the newest intent
+
+        # What is received.
         self._clocks = session.reader(keys.CLOCK, Clock)
         self._worlds = session.reader(keys.WORLD, World)
         self._states = session.reader(keys.CONTROL_STATE, ControlState)
         self._statuses = session.latched_reader(keys.STATUS, Status)
         self._others = session.reader(keys.INTENT, Intent)
+
+        # The newest of each, with the monotonic time of its arrival.
         self._clock: Clock | None = None
         self._clock_s = time.monotonic()
-        self._sent_ns = -1
         self._status: Status | None = None
         self._status_s = 0.0
         self._control: ControlState | None = None
         self._control_s = 0.0
         self._body_w_rad: float | None = None
-        self._other = ""
-        self._ending = ""  # why it ends
-        self._ignores_keys = False  # the newest keys came late
-        # The emergency stop, whose means exist before it is needed.
+        self._other_user = ""
+
+        # The emergency stop, which is prepared before it is needed.
         self._stop = PreparedStop(RobotSelection(link.endpoint, link.namespace, link.session), link)
         self._stop.connect(session)
         self._stopping: Future[str] | None = None
 
-    def go(self) -> int:
-        """Returns 0 when the operator ended it."""
+    def run(self) -> int:
+        """Run the loop. Returns 0 when the operator ended it, 1 when the terminal or the joystick is gone."""
         on_stop_signal(lambda: self._end("interrupted"))
         signal.signal(signal.SIGHUP, lambda *_: self._end("the terminal was closed"))
-        drawn = turn = 0
-        while not self._ending:
-            began = time.monotonic()
+        lines_on_screen = 0
+        period = 0
+        while not self._end_reason:
+            began_s = time.monotonic()
             self._read_operator()
             self._read_robot()
-            if not self._ending:
-                self._send()
-            if turn % SHOWN_EVERY == 0 and sys.stdout.isatty():
-                drawn = overwrite_lines(self._screen_lines(), drawn)
-            turn += 1
-            time.sleep(max(PERIOD_S - (time.monotonic() - began), 0.0))
-        if self._stopping is not None:  # its threads end with this process
+            if not self._end_reason:
+                self._send_intent()
+            if period % SHOWN_EVERY == 0 and sys.stdout.isatty():
+                lines_on_screen = overwrite_lines(self._screen_lines(), lines_on_screen)
+            period += 1
+            time.sleep(max(PERIOD_S - (time.monotonic() - began_s), 0.0))
+        self._finish()
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            say(f"teleop ended: {self._end_reason}; nothing is asked of {self._link.namespace} any more")
+        return 1 if self._input_is_lost() else 0
+
+    def _finish(self) -> None:
+        """Wait for an emergency stop that is under way; otherwise stop the robot sooner than the last intent ends."""
+        if self._stopping is not None:  # the threads of the stop end with this process
             wait([self._stopping], STOP_WAIT_S)
             self._stop.close()
-        elif self._steering.touched_s is not None:  # sooner than by expiry
+        elif self._steering.touched_s is not None:
             self._steering.stop(time.monotonic())
             self._sent_ns = -1
-            self._send()
-        with contextlib.suppress(OSError):  # a terminal that is gone
-            say(f"teleop ended: {self._ending}; nothing is asked of {self._link.namespace} any more")
-        return 1 if self._lost() else 0
+            self._send_intent()
 
-    def _lost(self) -> bool:
-        return (self._keyboard is not None and self._keyboard.gone) or (self._stick is not None and self._stick.lost)
+    def _stick_is_lost(self) -> bool:
+        return self._stick is not None and self._stick.lost
 
-    def _end(self, why: str) -> None:
-        self._ending = self._ending or why
+    def _input_is_lost(self) -> bool:
+        """Return whether the terminal or the joystick is gone."""
+        terminal_is_gone = self._keyboard is not None and self._keyboard.gone
+        return terminal_is_gone or self._stick_is_lost()
+
+    def _end(self, reason: str) -> None:
+        """Let the loop end. The first reason counts."""
+        self._end_reason = self._end_reason or reason
 
     def _read_operator(self) -> None:
-        now_s, steering = time.monotonic(), self._steering
-        found = self._keyboard.keys(0.0) if self._keyboard is not None else []
-        late = self._keyboard is not None and self._keyboard.late
-        if found:
-            self._ignores_keys = late
-        for key in found:
+        """Read keyboard and joystick, and end the loop if one of them is gone."""
+        now_s = time.monotonic()
+        if self._keyboard is not None:
+            self._read_keyboard(self._keyboard, now_s)
+        if self._stick is not None:
+            self._read_stick(self._stick)
+        if self._stick_is_lost():
+            self._end("the joystick is gone")
+        elif self._input_is_lost():
+            self._end("the terminal is gone")
+
+    def _read_keyboard(self, keyboard: Keyboard, now_s: float) -> None:
+        """Carry out all pressed keys. Late keys may stop the robot, but not drive it."""
+        pressed_keys = keyboard.keys(0.0)
+        if pressed_keys:
+            self._ignores_keys = keyboard.late
+        for key in pressed_keys:
             match key:
-                case "up" | "down" | "left" | "right" if late:
-                    pass
                 case " ":
-                    self._stop_at_once()
+                    self._request_stop()
                 case "q":
                     self._end("quit")
                 case "s":
-                    steering.stop(now_s)
-                case "up" | "down" if self._stick is None:
-                    steering.faster(1 if key == "up" else -1, now_s)
-                case "left" | "right" if self._stick is None:
-                    steering.turn(HEADING_STEP_RAD * (1 if key == "left" else -1), self._body_w_rad, now_s)
+                    self._steering.stop(now_s)
+                case "up" | "down" | "left" | "right" if self._stick is None and not keyboard.late:
+                    self._steer_by_key(key, now_s)
                 case _:
                     pass
-        if self._stick is not None:
-            self._read_stick(self._stick)
-        if self._lost():
-            self._end(
-                "the joystick is gone" if self._stick is not None and self._stick.lost else "the terminal is gone"
-            )
+
+    def _steer_by_key(self, key: str, now_s: float) -> None:
+        match key:
+            case "up":
+                self._steering.change_speed(1, now_s)
+            case "down":
+                self._steering.change_speed(-1, now_s)
+            case "left":
+                self._steering.rotate_heading(HEADING_STEP_RAD, self._body_w_rad, now_s)
+            case _:
+                self._steering.rotate_heading(-HEADING_STEP_RAD, self._body_w_rad, now_s)
 
     def _read_stick(self, stick: Joystick) -> None:
-        """Ask for what the stick asks for, from the time of its newest event on, unless that is too long ago."""
-        if stick.take(0.0):
-            self._stop_at_once()
+        """Request the speed and the rotation of the stick's position, unless its newest event is too old."""
+        if stick.read_events(0.0):
+            self._request_stop()
         if stick.is_silent(time.monotonic()):
             return
         if stick.forward or stick.right or self._steering.touched_s is not None:
-            self._steering.push(stick.forward, stick.moved_s)
+            self._steering.set_speed_fraction(stick.forward, stick.moved_s)
         if stick.right:
-            self._steering.turn(-stick.right * TURN_RAD_S * PERIOD_S, self._body_w_rad, stick.moved_s)
+            self._steering.rotate_heading(-stick.right * TURN_RAD_S * PERIOD_S, self._body_w_rad, stick.moved_s)
 
-    def _is_left(self) -> bool:
-        """Whether the operator has done nothing for so long that nobody may be there."""
+    def _operator_may_be_gone(self) -> bool:
+        """Return whether the last input is so old that the operator may have left."""
         touched_s = self._steering.touched_s
         limit_s = KEY_AGE_S if self._stick is None else STICK_AGE_S
         return touched_s is not None and time.monotonic() - touched_s > limit_s
 
-    def _stop_at_once(self) -> None:
-        """Stop by all ways, beside this loop, again at each press; and nothing is asked for any more."""
-        self._stopping = self._stop.request(self._me)
+    def _request_stop(self) -> None:
+        """Request an emergency stop in other threads, once more at each press. No intent is sent from then on."""
+        self._stopping = self._stop.request(self._user)
 
-    def _stop_in_words(self) -> str:
-        """What came of the newest emergency stop."""
+    def _describe_stop(self) -> str:
+        """Return the result of the newest emergency stop."""
         stopping = self._stopping
         if stopping is None or not stopping.done():
             return "sent"
         error = stopping.exception()
-        return stopping.result() if error is None else f"NOT STOPPED, press SPACE again: {error}"
+        if error is not None:
+            return f"NOT STOPPED, press SPACE again: {error}"
+        return stopping.result()
 
     def _read_robot(self) -> None:
+        """Read the newest messages of the robot, and of other operators."""
         if clocks := self._clocks.drain():
-            self._clock, self._clock_s = clocks[-1], time.monotonic()
+            self._clock = clocks[-1]
+            self._clock_s = time.monotonic()
         if statuses := self._statuses.drain():
-            self._status, self._status_s = statuses[-1], time.monotonic()
+            self._status = statuses[-1]
+            self._status_s = time.monotonic()
         if states := self._states.drain():
-            self._control, self._control_s = states[-1], time.monotonic()
-        for world in self._worlds.drain()[-1:]:
-            self._body_w_rad = yaw_of(rotation_from_quaternion(world.base_orientation_wxyz))
+            self._control = states[-1]
+            self._control_s = time.monotonic()
+        if worlds := self._worlds.drain():
+            self._body_w_rad = yaw_of(rotation_from_quaternion(worlds[-1].base_orientation_wxyz))
         for intent in self._others.drain():
-            if intent.who != self._me:
-                self._other = intent.who
+            if intent.who != self._user:
+                self._other_user = intent.who
 
-    def _send(self) -> None:
-        """An intent for each new robot time, once the operator has asked for something, and while he is there."""
+    def _send_intent(self) -> None:
+        """Send an intent for each new robot time, once the operator has made an input.
+
+        The intent has speed 0 while the operator may be gone.
+        """
         clock = self._clock
-        nothing_asked = self._stopping is not None or self._steering.touched_s is None
-        if nothing_asked or clock is None or clock.timestamp_ns == self._sent_ns:
+        if self._stopping is not None or self._steering.touched_s is None:
             return
-        if self._is_left():
+        if clock is None or clock.timestamp_ns == self._sent_ns:
+            return
+        if self._operator_may_be_gone():
             self._steering.speed_m_s = 0.0
         self._sent_ns = clock.timestamp_ns
         self._intents.put(self._steering.intent(clock.timestamp_ns))
 
     def _screen_lines(self) -> list[str]:
-        status, control, steering = self._status, self._control, self._steering
-        robot = "no status yet" if status is None else f"{status.lifecycle}{_heard(self._status_s)}: {status.why}"
-        backend = "" if status is None else f" ({status.backend})"
-        said = "nothing heard" if control is None else f"{control.state}{_heard(self._control_s)}: {control.reason}"
-        lines = [f"{self._link.namespace}{backend}: {robot}", f"control: {said}"]
-        towards = "the mission's way" if steering.heading_w_rad is None else _degrees(steering.heading_w_rad)
-        body = "unknown" if self._body_w_rad is None else _degrees(self._body_w_rad)
-        asked = f"asked: {steering.speed_m_s:+.2f} m/s, {towards}; body: {body}"
-        silent_s = time.monotonic() - self._clock_s
-        if self._stopping is not None:
-            asked = f"EMERGENCY STOP: {self._stop_in_words()}. Then: snakesim clear, snakesim arm"
-        elif silent_s > SILENT_S:
-            held_up = "" if status is None or _heard(self._status_s) else status.held_up
-            asked = f"{held_up or f'the robot has given no clock for {silent_s:.0f} s'}: nothing can be asked for"
-        elif steering.touched_s is None:
-            asked = "nothing asked for yet: the mission goes on"
-        elif self._is_left() and self._stick is None:
-            asked = f"no key for {KEY_AGE_S:.0f} s: stopped; press one to go on"
-        elif self._is_left():
-            asked = f"no event of the joystick for {STICK_AGE_S:.0f} s: stopped; move it to go on"
+        request = self._describe_request()
         if self._ignores_keys:
-            asked = f"{asked}   (keys that came late were ignored)"
-        return [*lines, asked, f"also steering: {self._other}" if self._other else "", HELP]
+            request = f"{request}   (keys that came late were ignored)"
+        return [
+            self._describe_status(),
+            self._describe_control(),
+            request,
+            f"also steering: {self._other_user}" if self._other_user else "",
+            HELP,
+        ]
+
+    def _describe_status(self) -> str:
+        status = self._status
+        if status is None:
+            return f"{self._link.namespace}: no status yet"
+        age = _describe_age(self._status_s)
+        return f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.why}"
+
+    def _describe_control(self) -> str:
+        control = self._control
+        if control is None:
+            return "control: nothing heard"
+        return f"control: {control.state}{_describe_age(self._control_s)}: {control.reason}"
+
+    def _describe_request(self) -> str:
+        """Return what the operator requests from the robot, or why no request is sent."""
+        if self._stopping is not None:
+            return f"EMERGENCY STOP: {self._describe_stop()}. Then: snakesim clear, snakesim arm"
+        silent_s = time.monotonic() - self._clock_s
+        if silent_s > SILENT_S:
+            return f"{self._describe_silence(silent_s)}: nothing can be asked for"
+        if self._steering.touched_s is None:
+            return "nothing asked for yet: the mission goes on"
+        if self._operator_may_be_gone():
+            if self._stick is None:
+                return f"no key for {KEY_AGE_S:.0f} s: stopped; press one to go on"
+            return f"no event of the joystick for {STICK_AGE_S:.0f} s: stopped; move it to go on"
+        heading_w_rad = self._steering.heading_w_rad
+        heading = "the mission's way" if heading_w_rad is None else _degrees(heading_w_rad)
+        body = "unknown" if self._body_w_rad is None else _degrees(self._body_w_rad)
+        return f"asked: {self._steering.speed_m_s:+.2f} m/s, {heading}; body: {body}"
+
+    def _describe_silence(self, silent_s: float) -> str:
+        """Return why the robot publishes no clock: the reason in a recent status, or the time since the last clock."""
+        status = self._status
+        if status is not None and status.held_up and not _describe_age(self._status_s):
+            return status.held_up
+        return f"the robot has given no clock for {silent_s:.0f} s"
 
 
-def _heard(at_s: float) -> str:
-    """How old what was heard is, if it is old."""
-    age_s = time.monotonic() - at_s
+def _describe_age(arrival_s: float) -> str:
+    """Return the age of a message, if it is old; otherwise an empty text."""
+    age_s = time.monotonic() - arrival_s
     return f" (heard {age_s:.0f} s ago)" if age_s > SILENT_S else ""
 
 

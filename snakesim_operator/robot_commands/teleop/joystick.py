@@ -4,8 +4,8 @@ Read directly, 24 bytes an event: the package `evdev` has no wheels, and would n
 Source: linux/input.h and linux/input-event-codes.h.
 
 A device sends an event when something changes, and nothing otherwise. So a stick that is held still, a pad that is
-switched off and a receiver that has lost its pad look alike. Each event has the time at which the kernel got it. What
-the stick asks for counts for STICK_AGE_S from then on.
+switched off and a receiver that has lost its pad look alike. Each event has the time at which the kernel got it. The
+position of the stick is valid for STICK_AGE_S from then on.
 """
 
 import fcntl
@@ -26,7 +26,7 @@ BUTTONS = range(0x120, 0x140)  # BTN_JOYSTICK to BTN_THUMBR; every one of them i
 ABSINFO = struct.Struct("6i")  # value, minimum, maximum, fuzz, flat, resolution
 DEAD_ZONE = 0.12  # of the way to either side
 MAX_EVENTS = 256  # in one read
-CLOCK_MONOTONIC = 1  # of which events have the time, once the device was asked for it
+CLOCK_MONOTONIC = 1  # the clock that is requested for the time of events
 STICK_AGE_S = 5.0  # after this long without an event the stick counts as released
 
 
@@ -42,30 +42,33 @@ def _read_ioctl(number: int, size: int) -> int:
 class Axis:
     """The ends of an axis, in the device's unit."""
 
-    least: int
-    most: int
+    lower: int
+    upper: int
 
-    def share(self, value: int) -> float:
-        """From -1 to 1; 0 in the dead zone, from whose edge it begins without a jump."""
-        middle, half = (self.least + self.most) / 2, (self.most - self.least) / 2
-        share = max(-1.0, min(1.0, (value - middle) / half))
-        beyond = max(abs(share) - DEAD_ZONE, 0.0) / (1 - DEAD_ZONE)
-        return beyond if share > 0 else -beyond
+    def normalize(self, value: int) -> float:
+        """Return a position from -1 to 1; 0 in the dead zone, from whose edge it grows without a jump."""
+        middle = (self.lower + self.upper) / 2
+        half_range = (self.upper - self.lower) / 2
+        position = max(-1.0, min(1.0, (value - middle) / half_range))
+        beyond_dead_zone = max(abs(position) - DEAD_ZONE, 0.0) / (1 - DEAD_ZONE)
+        return beyond_dead_zone if position > 0 else -beyond_dead_zone
 
 
 class Joystick:
     """The left stick and the buttons of one device."""
 
     def __init__(self, handle: int, x: Axis, y: Axis) -> None:
-        """handle: to read events from, without blocking; closed by `close`."""
-        self.handle, self._x, self._y = handle, x, y
-        self.right = self.forward = 0.0  # from -1 to 1
+        """Read events from a device that does not block. handle: its file descriptor, which `close` closes."""
+        self.handle = handle
+        self._x = x
+        self._y = y
+        self.right = 0.0  # from -1 to 1
+        self.forward = 0.0  # from -1 to 1
         self.lost = False  # unplugged, or its driver is gone
-        self.moved_s = -math.inf  # when the kernel got the newest event, monotonic
+        self.moved_s = -math.inf  # monotonic time at which the kernel received the newest event
 
-    def take(self, wait_s: float) -> bool:
-        """Take in what happened, at the latest after a time. Returns whether a button was pressed."""
-        pressed = False
+    def read_events(self, wait_s: float) -> bool:
+        """Read events, and wait for them up to a time. Returns whether a button was pressed."""
         ready, _, _ = select.select([self.handle], [], [], wait_s)
         if not ready:
             return False
@@ -76,22 +79,30 @@ class Joystick:
         except OSError:  # ENODEV: unplugged
             data = b""
         if not data:
-            self.lost, self.right, self.forward = True, 0.0, 0.0
+            self.lost = True
+            self._release()
             return False
-        for seconds, microseconds, kind, code, value in EVENT.iter_unpack(data[: len(data) // EVENT.size * EVENT.size]):
+        whole_bytes = len(data) // EVENT.size * EVENT.size
+        pressed = False
+        for seconds, microseconds, kind, code, value in EVENT.iter_unpack(data[:whole_bytes]):
             self.moved_s = seconds + 1e-6 * microseconds
             if kind == EV_ABS and code == ABS_X:
-                self.right = self._x.share(value)
+                self.right = self._x.normalize(value)
             elif kind == EV_ABS and code == ABS_Y:
-                self.forward = -self._y.share(value)  # away from the operator is negative
+                self.forward = -self._y.normalize(value)  # away from the operator is negative
             elif kind == EV_SYN and code == SYN_DROPPED:
-                self.right = self.forward = 0.0  # until the stick is moved again
+                self._release()  # until the stick is moved again
             elif kind == EV_KEY and code in BUTTONS and value == 1:
                 pressed = True
         return pressed
 
+    def _release(self) -> None:
+        """Count the stick as released."""
+        self.right = 0.0
+        self.forward = 0.0
+
     def is_silent(self, now_s: float) -> bool:
-        """Whether there was no event for so long that the operator, or the pad, may be gone."""
+        """Return whether there was no event for so long that the operator, or the pad, may be gone."""
         return now_s - self.moved_s > STICK_AGE_S
 
     def close(self) -> None:
@@ -100,28 +111,35 @@ class Joystick:
 
 
 def open_joystick(device: Path | None) -> Joystick:
-    """device: such as /dev/input/event5; None: the first with a stick and buttons. Raises ConfigError."""
-    tried = [device] if device is not None else sorted(Path("/dev/input").glob("event*"))
-    why = "there is no /dev/input/event*" if device is None else ""
-    for path in tried:
+    """Open a joystick.
+
+    Args:
+        device: such as /dev/input/event5; None: the first device with a stick and buttons.
+
+    Raises:
+        ConfigError: there is no such device, or it cannot be opened.
+    """
+    paths = [device] if device is not None else sorted(Path("/dev/input").glob("event*"))
+    problem = "there is no /dev/input/event*" if device is None else ""
+    for path in paths:
         try:
             handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            why = f"{path}: {error.strerror}"
+            problem = f"{path}: {error.strerror}"
             continue
-        axes = _axes(handle)
-        if axes is not None and _has_monotonic_times(handle):
+        axes = _read_axes(handle)
+        if axes is not None and _use_monotonic_times(handle):
             return Joystick(handle, *axes)
         os.close(handle)
-        why = f"{path}: has no stick with axes X and Y, and buttons"
+        problem = f"{path}: has no stick with axes X and Y, and buttons"
     raise ConfigError(
-        f"--joystick: {why}. Plug one in, name its device, or get the permission: sudo usermod -aG input $USER, "
+        f"--joystick: {problem}. Plug one in, name its device, or get the permission: sudo usermod -aG input $USER, "
         f"and log in again"
     )
 
 
-def _has_monotonic_times(handle: int) -> bool:
-    """Ask for events with the time of the monotonic clock, which nobody sets; whether the device does that."""
+def _use_monotonic_times(handle: int) -> bool:
+    """Request events with the time of the monotonic clock, which is never set. Returns whether the device does it."""
     try:
         fcntl.ioctl(handle, _write_ioctl(0xA0, 4), struct.pack("i", CLOCK_MONOTONIC))
     except OSError:
@@ -129,21 +147,32 @@ def _has_monotonic_times(handle: int) -> bool:
     return True
 
 
-def _axes(handle: int) -> tuple[Axis, Axis] | None:
-    """Of the stick; None when the device has none, or no joystick buttons, as a touch pad."""
+def _read_axes(handle: int) -> tuple[Axis, Axis] | None:
+    """Return the axes X and Y of the stick; None for a device without them, or without buttons of a joystick."""
     try:
-        bits = bytearray(96)
-        fcntl.ioctl(handle, _read_ioctl(0x20 + EV_KEY, len(bits)), bits)
-        if not any(bits[code // 8] >> code % 8 & 1 for code in BUTTONS):
+        if not _has_joystick_buttons(handle):
             return None
-        found: list[Axis] = []
-        for axis in (ABS_X, ABS_Y):
-            info = bytearray(ABSINFO.size)
-            fcntl.ioctl(handle, _read_ioctl(0x40 + axis, len(info)), info)
-            _, least, most, *_ = ABSINFO.unpack(info)
-            if most <= least:
-                return None
-            found.append(Axis(least, most))
-        return found[0], found[1]
+        x = _read_axis(handle, ABS_X)
+        y = _read_axis(handle, ABS_Y)
     except OSError:
         return None
+    if x is None or y is None:
+        return None
+    return x, y
+
+
+def _has_joystick_buttons(handle: int) -> bool:
+    """Return whether a device has any of BUTTONS; a touch pad has none."""
+    bits = bytearray(96)  # one bit for each key code
+    fcntl.ioctl(handle, _read_ioctl(0x20 + EV_KEY, len(bits)), bits)
+    return any(bits[code // 8] >> code % 8 & 1 for code in BUTTONS)
+
+
+def _read_axis(handle: int, axis: int) -> Axis | None:
+    """Return the range of an axis; None if it is empty."""
+    info = bytearray(ABSINFO.size)
+    fcntl.ioctl(handle, _read_ioctl(0x40 + axis, len(info)), info)
+    _, lower, upper, *_ = ABSINFO.unpack(info)
+    if upper <= lower:
+        return None
+    return Axis(lower, upper)

@@ -59,13 +59,13 @@ def test_only_what_is_looked_at() -> None:
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as beside:
         images = hal.publisher(keys.depth("head"), DepthImage)
         (camera,) = cameras_of(beside, robot, 80)
-        camera.turn()
+        camera.publish_preview()
         assert not images.heard()
         with open_session(Link(endpoint, "worm")) as far:
             seen = far.reader(keys.preview(keys.depth("head")), Preview)
-            wait_until(lambda: camera.turn() or images.heard(), "the image fetched")
+            wait_until(lambda: camera.publish_preview() or images.heard(), "the image fetched")
             images.put(depth(3))
             found: list[Preview] = []
-            wait_until(lambda: camera.turn() or found.extend(seen.drain()) or found, "a preview")
+            wait_until(lambda: camera.publish_preview() or found.extend(seen.drain()) or found, "a preview")
             assert found[0].tick == 3 and found[0].width == 80
-        wait_until(lambda: camera.turn() or not images.heard(), "the image left alone again")
+        wait_until(lambda: camera.publish_preview() or not images.heard(), "the image left alone again")

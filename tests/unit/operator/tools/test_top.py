@@ -26,10 +26,10 @@ def arrival(key: str, message: Message, at_ms: float) -> Arrival:
 def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     robot, traffic = description(), Traffic()
     for tick in range(100):
-        traffic.take(arrival("lab/worm/sensor/joints", state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick))
-        traffic.take(arrival("lab/worm/hal/clock", clock(tick + 2), 10 * tick + 1))
+        traffic.add(arrival("lab/worm/sensor/joints", state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick))
+        traffic.add(arrival("lab/worm/hal/clock", clock(tick + 2), 10 * tick + 1))
         answer = command(robot, tick=tick, sequence=tick)
-        traffic.take(arrival("lab/worm/actuator/joints", answer, 10 * tick + 3))
+        traffic.add(arrival("lab/worm/actuator/joints", answer, 10 * tick + 3))
     lines = {line.key: line for line in traffic.lines(1000 * MS)}
     joints = lines[keys.JOINTS]
     assert (joints.robot, joints.writer) == ("lab/worm", "HAL")
@@ -41,11 +41,11 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
 
 def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -> None:
     traffic = Traffic("worm")
-    traffic.take(Arrival("sensor/joints", b"noise", encoding_of(JointState), 0))
+    traffic.add(Arrival("sensor/joints", b"noise", encoding_of(JointState), 0))
     for i in range(MAX_KEYS + 10):
-        traffic.take(Arrival(f"evil/{i}", b"x", "", i))
+        traffic.add(Arrival(f"evil/{i}", b"x", "", i))
     for i in range(2 * KEPT):
-        traffic.take(Arrival("evil/0", b"x", "", i * MS))
+        traffic.add(Arrival("evil/0", b"x", "", i * MS))
     lines = traffic.lines(MS)
     assert len(lines) == MAX_KEYS and traffic.keys_left_out == 11
     assert lines[0].failure == "malformed" and lines[1].writer is None

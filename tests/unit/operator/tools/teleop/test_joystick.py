@@ -34,7 +34,7 @@ class Device:
         seconds, microseconds = divmod(round(1e6 * at_s), 1_000_000)
         time = seconds, microseconds
         os.write(self._write, EVENT.pack(*time, kind, code, value) + EVENT.pack(*time, EV_SYN, 0, 0))
-        return self.stick.take(1.0)
+        return self.stick.read_events(1.0)
 
     def unplug(self) -> None:
         os.close(self._write)
@@ -70,7 +70,7 @@ def test_lost_events_and_a_lost_device_let_go_of_the_stick(device: Device) -> No
     assert device.stick.forward == 0.0
     device.sends(EV_ABS, ABS_Y, 0)
     device.unplug()
-    device.stick.take(1.0)
+    device.stick.read_events(1.0)
     assert device.stick.lost and device.stick.forward == 0.0
 
 

@@ -43,7 +43,7 @@ def test_a_stick_that_falls_silent_asks_for_nothing_any_more(monkeypatch: pytest
         heard, clocks = robot.reader(keys.INTENT, Intent, depth=256), robot.publisher(keys.CLOCK, Clock)
         stick = Joystick(read, Axis(0, 255), Axis(0, 255))
         teleop = Teleop(session, link, 0.2, None, stick)
-        loop = threading.Thread(target=teleop.go)
+        loop = threading.Thread(target=teleop.run)
         monkeypatch.setattr(command, "on_stop_signal", lambda _stop: None)  # of the main thread alone
         monkeypatch.setattr(signal, "signal", lambda *_: None)
         loop.start()
@@ -91,7 +91,7 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
         hand = threading.Thread(target=be_a_robot_and_a_hand)
         hand.start()
         stick = Joystick(read, Axis(0, 255), Axis(0, 255))
-        assert Teleop(session, link, 0.2, None, stick).go() == 1
+        assert Teleop(session, link, 0.2, None, stick).run() == 1
         hand.join()
         stick.close()
         intents = heard.drain()
