@@ -1,4 +1,8 @@
-"""What a service is, and the loop around it: join, act on ticks, publish what the service says, report it done."""
+"""The interface of a service, and the loop around it.
+
+The loop connects a service to its robot, calls it for every tick that is due, publishes its outputs, and reports to the
+host that the tick is done.
+"""
 
 import contextlib
 import traceback
