@@ -1,4 +1,8 @@
-"""What a service is, and the loop around it: join, act on ticks, publish what the service says, report it done."""
+"""The interface of a service, and the loop around it.
+
+The loop connects a service to its robot, calls it for every tick that is due, publishes its outputs, and reports to the
+host that the tick is done.
+"""
 
 import contextlib
 import traceback
@@ -17,42 +21,42 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Message
 
-SILENCE_S = 1.0
-MOST_SHOWN = 16  # keys
-TRY_S = 2.0  # to meet the robot
-START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
+SILENCE_S = 1.0  # a clock that is silent for longer has stopped
+MAX_SHOWN_KEYS = 16  # bound of `waits_for` in a process entry
+TRY_S = 2.0  # duration of one attempt to find the robot
+START_LIMIT_S = 600.0  # until every part of a run has started: MuJoCo starts slowly in an emulated, busy machine
 
 
 class Service(Protocol):
-    """What stands behind an entry point in the group `snakesim.services`, and in `[services.NAME]` of a scenario.
+    """The class behind an entry point in the group `snakesim.services`, and `[services.NAME]` of a scenario.
 
     The constructor subscribes to everything that the service will read.
     """
 
     name: str
     urgent: bool = False  # whether the robot waits for this service in every tick
-    too_slow: str = ""  # what shows that it cannot keep up in real time; empty: nothing does
+    too_slow: str = ""  # evidence that it is too slow for real time; empty: none
 
     def __init__(self, client: Client, config: RunConfig) -> None: ...
 
     def configure(self, robot: Description) -> None:
-        """Learn what robot is there; called before the first tick, and again when the HAL has started over."""
+        """Prepare for a robot. Called before the first tick, and again after a restart of the HAL host."""
         ...
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """What to publish for a tick, as (key, message); None when the service is not able to say anything yet."""
+        """Return what to publish for a tick, as (key, message); None while the service has no output yet."""
         ...
 
     def silence(self) -> list[tuple[str, Message]]:
-        """What to publish when the HAL's clock has been silent for a second."""
+        """Return what to publish when the HAL's clock has been silent for a second, as (key, message)."""
         return []
 
     def pause(self, clock: Clock) -> None:
-        """Called some 20 times a second while a simulator is paused, for requests that need no tick."""
+        """Serve requests that need no tick. Called about 20 times a second while a simulator is paused."""
 
 
 class ServiceLoop:
-    """One service of one robot, over one session."""
+    """Runs one service of one robot, over one session."""
 
     def __init__(
         self,
@@ -61,26 +65,43 @@ class ServiceLoop:
         session: Session,
         goes_on: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Meets the robot. Raises NotConnectedError when there is none.
+        """Construct the service, and wait for its robot.
 
-        goes_on: called after each try that found no robot; whether to try again.
+        Args:
+            service_type: class of the service.
+            config: of the run.
+            session: connection to the network.
+            goes_on: called after each attempt that found no robot; returns whether to try again.
+
+        Raises:
+            NotConnectedError: There is no robot.
+            ServiceError: The service raised an error. The error names the service.
         """
         name = service_type.name
         schedule = config.services.get(name, Schedule())
-        self._who = f"service {schedule.code or name} (class {getattr(service_type, '__name__', service_type)})"
+
+        # For errors.
+        class_name = getattr(service_type, "__name__", service_type)
+        self._label = f"service {schedule.code or name} (class {class_name})"
         self._module = service_type.__module__
-        self._client = client = Client(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
-        with self._named("__init__"):
+
+        # The service, which subscribes in its constructor, before the robot is there.
+        client = Client(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
+        self._client = client
+        with self._errors_named("__init__"):
             self.service = service_type(client, config)
-        robot = _met(client, goes_on)
-        with self._named("configure"):
+        robot = _wait_for_robot(client, goes_on)
+        with self._errors_named("configure"):
             self.service.configure(robot)
         self._faults = faults_of_service(name, config, session, robot, lambda: client.newest_clock)
-        self._due = client.ticks(0.0, pauses=True)
-        self._session, self._entry = session, own_entry(name, config)
+        self._due_ticks = client.ticks(0.0, pauses=True)
+
+        # What other processes see of it.
+        self._session = session
+        self._entry = own_entry(name, config)
 
     def join(self) -> None:
-        """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
+        """Announce the service. From now on the robot may be armed, perhaps before the first tick arrives here."""
         clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
             self._faults.turn(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
@@ -88,72 +109,92 @@ class ServiceLoop:
         self._client.announce()
 
     def run(self, over: Callable[[], bool] = lambda: False) -> None:
-        """Act on every tick that is due, for as long as this process lives; over: or until it is true."""
+        """Act on every tick, for as long as this process lives, or until `over` returns True."""
         for clock in self._client.ticks(SILENCE_S, pauses=True):
             if over():
                 return
-            if clock is not None:
+            if clock is None:
+                self._act_on_silence()
+            else:
                 self._act(clock)
-                continue
-            self._faults.idle()
-            with self._named("silence"):
-                for key, message in self.service.silence():
-                    self._client.put(key, message)
 
     def act(self) -> None:
         """Act on the ticks that are due now, and return."""
-        while (clock := next(self._due)) is not None:
+        while (clock := next(self._due_ticks)) is not None:
             self._act(clock)
 
     def close(self) -> None:
-        """Send nothing more that is late."""
+        """Drop the messages that injected faults still delay."""
         self._faults.close()
 
+    def _act_on_silence(self) -> None:
+        self._faults.idle()
+        with self._errors_named("silence"):
+            for key, message in self.service.silence():
+                self._client.put(key, message)
+
     def _act(self, clock: Clock) -> None:
-        """A tick that is shown again, because the robot is not armed yet, is answered again."""
+        """Publish the outputs for a tick, and report it done.
+
+        Until the robot is armed, the host sends the same tick again and again, and each time it is answered again.
+        """
         if clock.paused:
             self._faults.idle()
-            with self._named("pause"):
+            with self._errors_named("pause"):
                 self.service.pause(clock)
             return
         self._faults.turn(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
         robot = self._client.new_description()
         if robot is not None:
-            with self._named("configure"):
+            with self._errors_named("configure"):
                 self.service.configure(robot)
-        with self._named("outputs"):
+        with self._errors_named("outputs"):
             outputs = self.service.outputs(clock)
             if clock.lifecycle != "armed":
-                if keys.JOINTS in self._client.lacks:
-                    outputs = None  # they come every tick; once armed it would be too late to hear of them
-                self._show_waiting([] if outputs is not None else sorted(self._client.lacks)[:MOST_SHOWN])
+                outputs = self._outputs_before_arming(outputs)
             if outputs is None:
                 return
             for key, message in outputs:
                 self._client.put(key, message)
         self._client.done(clock.tick)
 
-    def _show_waiting(self, lacks: list[str]) -> None:
-        """Tell the host what this service waits for, so that whoever waits for the service knows it."""
-        if lacks != self._entry.waits_for:
-            self._entry = msgspec.structs.replace(self._entry, waits_for=lacks)
+    def _outputs_before_arming(self, outputs: list[tuple[str, Message]] | None) -> list[tuple[str, Message]] | None:
+        """Return the outputs that count before the robot is armed, and show what the service waits for.
+
+        A service without joint states has no output, even if it can do without them: they come in every tick, and once
+        the robot is armed it would be too late to find out that they do not arrive.
+        """
+        missing = self._client.lacks
+        if keys.JOINTS in missing:
+            outputs = None
+        if outputs is None:
+            self._show_waiting(sorted(missing)[:MAX_SHOWN_KEYS])
+        else:
+            self._show_waiting([])
+        return outputs
+
+    def _show_waiting(self, missing: list[str]) -> None:
+        """Publish the keys that this service waits for, so that the host can name them."""
+        if missing != self._entry.waits_for:
+            self._entry = msgspec.structs.replace(self._entry, waits_for=missing)
             self._shown.put(self._entry)
 
     @contextlib.contextmanager
-    def _named(self, method: str) -> Iterator[None]:
+    def _errors_named(self, method: str) -> Iterator[None]:
         """Turn exceptions of a method into errors that name the service, which may be third-party code."""
         try:
             yield
         except WireError as error:
-            raise ServiceError(f"{self._who}: {error.detail}") from None
+            raise ServiceError(f"{self._label}: {error.detail}") from None
         except SnakesimError:
             raise
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise ServiceError(f"{self._who}: {method}() {raised(error, self._module)}") from error
+            raise ServiceError(f"{self._label}: {method}() {raised(error, self._module)}") from error
 
 
-def _met(client: Client, goes_on: Callable[[], bool]) -> Description:
+def _wait_for_robot(client: Client, goes_on: Callable[[], bool]) -> Description:
+    """Return the description of the robot. Raises NotConnectedError if there is none and `goes_on` returns False."""
     while True:
         try:
             return client.description(TRY_S)

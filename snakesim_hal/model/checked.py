@@ -1,12 +1,12 @@
-"""What a robot file says of the last start check: who found its joints as the file says, when, and on which drives.
+"""The record of the last start check in a robot file: who confirmed the joints, when, and on which drives.
 
-It counts for the joints and the properties that were judged: once the file says otherwise of how a joint is mounted, or
+The record is valid for the joints and the properties that were checked. If the file changes how a joint is mounted, or
 another drive answers, the robot counts as not checked.
 """
 
 import hashlib
 from collections.abc import Sequence
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -16,62 +16,85 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import MAX_JOINTS, from_zero
 
-CHECK = "joint_check"  # the controller of the start check: what it is for needs no check before
+CHECK = "joint_check"  # the controller of the start check; it may run on a robot that is not checked yet
 Words = Annotated[str, Meta(max_length=200)]
 JointProperty = Literal["drive", "order", "sign", "gear", "zero"]
-PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)  # of every joint, that a start check judges
+PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)  # those that a start check confirms for every joint
 JointNames = Annotated[list[Words], Meta(max_length=MAX_JOINTS)]
 
 
 class Checked(FileStruct, frozen=True, kw_only=True):
     """The section [checked], which `snakesim joints check` writes."""
 
+    # Who checked what, and when.
     by: Words
     on: Words  # date
-    joints: Words  # digest of how they are mounted
+    joints: Words  # digest of how the joints are mounted, see `mounting_digest`
     backend: Words
     hardware: Words = ""
-    serials: JointNames = []  # tail to head; empty: the drive does not say it
-    # Properties that were confirmed of every joint: by the check, but for those of `by_hand`. All are needed to arm.
+    serials: JointNames = []  # serial numbers of the drives, tail to head; empty: the drive does not report it
+
+    # Properties that are confirmed for every joint. A robot can be armed only if all of them are.
     confirmed: Annotated[list[JointProperty], Meta(max_length=len(PROPERTIES))] = []
-    by_hand: Annotated[dict[JointProperty, JointNames], Meta(max_length=len(PROPERTIES))] = {}  # -> joints
-    straight: bool = False  # zeros were judged from the pose in which a person laid the robot
+
+    # Property -> joints for which a person confirmed it; for the others the check did.
+    by_hand: Annotated[dict[JointProperty, JointNames], Meta(max_length=len(PROPERTIES))] = {}
+
+    straight: bool = False  # true: a person laid the robot straight, and the zeros were judged from that pose
     allowed_backlash_rad: Annotated[float, from_zero(0.5, "rad")] = 0.0  # of every gear
 
 
 def mounting_digest(joints: Sequence[Joint]) -> str:
-    """Of what the start check judges: order, axes, ids, buses, signs, zeros, gears, torque constants."""
-    rows = [
-        (joint.name, joint.axis, joint.id, msgspec.to_builtins(joint.drive), joint.motor.torque_constant_nm_per_a)
-        for joint in joints
-    ]
-    return hashlib.sha256(msgspec.json.encode(rows, order="deterministic")).hexdigest()[:16]
+    """Return a digest of everything that the start check judges.
+
+    It covers the order, axes, ids, buses, signs, zeros, gears and torque constants of the joints.
+    """
+    rows: list[tuple[str, str, int, Any, float | None]] = []
+    for joint in joints:
+        drive = msgspec.to_builtins(joint.drive)
+        rows.append((joint.name, joint.axis, joint.id, drive, joint.motor.torque_constant_nm_per_a))
+    encoded = msgspec.json.encode(rows, order="deterministic")
+    return hashlib.sha256(encoded).hexdigest()[:16]
 
 
 def why_unchecked(checked: Checked | None, joints: Sequence[Joint], robot: Description) -> str:
-    """Why this robot, as it is now, counts as not checked; empty: it was, or nothing real moves."""
+    """Return why this robot counts as not checked, in words; empty if it is checked, or if nothing real moves.
+
+    Args:
+        checked: the record in the robot file.
+        joints: the joints as the robot file has them now.
+        robot: the description from the host, with the serial numbers that the drives report now.
+    """
     if robot.emulated:
         return ""
-    again = "check it again (docs/commissioning.md)"
     if checked is None:
         return "nobody has checked that its joints are as its file says: do so (docs/commissioning.md)"
+    again = "check it again (docs/commissioning.md)"
     since = f"since {checked.by} checked it on {checked.on}"
     if checked.joints != mounting_digest(joints):
         return f"how its joints are mounted was changed in its file {since}: {again}"
-    if missing := [name for name in PROPERTIES if name not in checked.confirmed]:
+    unconfirmed = [name for name in PROPERTIES if name not in checked.confirmed]
+    if unconfirmed:
         return (
-            f"the check by {checked.by} on {checked.on} did not confirm of every joint: {', '.join(missing)}: {again}"
+            f"the check by {checked.by} on {checked.on} did not confirm of every joint: {', '.join(unconfirmed)}: "
+            f"{again}"
         )
-    serials = [joint.serial for joint in robot.joints]
-    if any(serials) or any(checked.serials):
-        pairs = zip(robot.joints, checked.serials or [""] * len(serials), strict=False)
-        others = [
-            f"{joint.name} has drive {joint.serial or 'unknown'}, and had {before or 'unknown'}"
-            for joint, before in pairs
-            if joint.serial != before
-        ]
-        return f"{'; '.join(others)}: changed {since}: {again}" if others else ""
+    drives_report_serials = any(joint.serial for joint in robot.joints)
+    if drives_report_serials or any(checked.serials):
+        replaced = _replaced_drives(checked, robot)
+        return f"{'; '.join(replaced)}: changed {since}: {again}" if replaced else ""
     if (checked.backend, checked.hardware) != (robot.backend, robot.hardware):
-        there, here = f"{checked.backend} {checked.hardware}", f"{robot.backend} {robot.hardware}"
-        return f"its drives do not say who they are, and it is on {here} now, {there} {since}: {again}"
+        checked_on = f"{checked.backend} {checked.hardware}"
+        now_on = f"{robot.backend} {robot.hardware}"
+        return f"its drives do not say who they are, and it is on {now_on} now, {checked_on} {since}: {again}"
     return ""
+
+
+def _replaced_drives(checked: Checked, robot: Description) -> list[str]:
+    """Return a sentence for each joint whose drive has another serial number than at the check."""
+    checked_serials = checked.serials or [""] * len(robot.joints)
+    sentences: list[str] = []
+    for joint, before in zip(robot.joints, checked_serials, strict=False):
+        if joint.serial != before:
+            sentences.append(f"{joint.name} has drive {joint.serial or 'unknown'}, and had {before or 'unknown'}")
+    return sentences

@@ -1,4 +1,4 @@
-"""A number that each field has of its own, such as a friction: what a lab does not choose."""
+"""Randomized values of an episode, such as a friction that differs from one random scene to the next."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,39 +13,60 @@ from snakesim_hal.model.scenario import Override
 
 
 class Draw(FileStruct, frozen=True, kw_only=True):
-    """Evenly between two numbers, the same for all its keys; a field is a number, and always has the same draw."""
+    """A uniform distribution of one value, which all keys in `set` get; the number of a random scene decides it."""
 
-    set: Annotated[list[str], Meta(min_length=1)]
+    set: Annotated[list[str], Meta(min_length=1)]  # dotted keys
     low: float
     high: float
 
     def __post_init__(self) -> None:
-        """Raises ValueError, for the file reader."""
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= self.high):
+        """Check the bounds. Raises ValueError, for the file reader."""
+        are_finite = math.isfinite(self.low) and math.isfinite(self.high)
+        if not are_finite or self.low > self.high:
             raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
 
     def on_field(self, field: int, origin: str = "[[draw]]") -> list[Override]:
-        """By the field's number and the first key, so that a draw more changes no other."""
-        number = np.random.default_rng([field, *self.set[0].encode()]).uniform(self.low, self.high)
-        return [Override(key, round(float(number), 6), origin) for key in self.set]
+        """Return the value of every key for one random scene.
+
+        Only the number of the scene and the first key seed the value, so that an additional `Draw` does not change the
+        values of the others.
+
+        Args:
+            field: number of the random scene.
+            origin: where the distribution comes from, for error messages.
+        """
+        first_key = self.set[0]
+        random = np.random.default_rng([field, *first_key.encode()])
+        value = round(float(random.uniform(self.low, self.high)), 6)
+        return [Override(key, value, origin) for key in self.set]
 
 
 def draws_of(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
-    """Of `{"key": (low, high)}`; a comma puts keys together. Raises ConfigError."""
-    found: list[Draw] = []
+    """Return the distributions of `{"key": (low, high)}`; keys that a comma separates get the same value.
+
+    Raises:
+        ConfigError: The bounds of a key are not two finite numbers in order.
+    """
+    draws: list[Draw] = []
     for keys, bounds in (given or {}).items():
         try:
             low, high = (float(bound) for bound in bounds)
-            found.append(Draw(set=[key.strip() for key in keys.split(",")], low=low, high=high))
+            key_list = [key.strip() for key in keys.split(",")]
+            draws.append(Draw(set=key_list, low=low, high=high))
         except (TypeError, ValueError):
-            wrong = f"draw {keys}: {short(str(bounds))}: give the lowest and the highest number, both finite"
-            raise ConfigError(wrong) from None
-    return found
+            raise ConfigError(
+                f"draw {keys}: {short(str(bounds))}: give the lowest and the highest number, both finite"
+            ) from None
+    return draws
 
 
 def parse_draw(text: str) -> tuple[str, list[str]]:
-    """`key=low:high` of --draw, for `draws_of`. Raises ConfigError."""
-    keys, equals, given = (part.strip() for part in text.partition("="))
-    if not (keys and equals and given):
+    """Return keys and bounds of the `key=low:high` of a --draw option, for `draws_of`.
+
+    Raises:
+        ConfigError: A part of it is missing.
+    """
+    keys, equals, bounds = (part.strip() for part in text.partition("="))
+    if not (keys and equals and bounds):
         raise ConfigError(f"--draw {short(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4")
-    return keys, given.split(":")
+    return keys, bounds.split(":")

@@ -1,15 +1,15 @@
-"""What can be made to go wrong on request: the one registry of kinds, and the words for files, commands and emulators.
+"""The registry of all kinds of injected faults, and their text form in files, commands and emulators.
 
-    kill:control@2            at 2 s of robot time after the first arming
-    drop:actuator/joints@2-4=0.3    from 2 s to 4 s, three of ten
-    mute:joint_3@5-6.5        joint_3 says nothing for 1.5 s
+    kill:control@2                  at 2 s of robot time after the first arming
+    drop:actuator/joints@2-4=0.3    from 2 s to 4 s, three of ten messages
+    mute:joint_3@5-6.5              joint_3 sends nothing for 1.5 s
 
-Pure: says what an injection means and who carries it out; whoever that is does it.
+This module defines what an injected fault means and which part of a run carries it out. It carries out nothing itself.
 """
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, isfinite
 from typing import Literal, get_args
 
@@ -28,10 +28,15 @@ DOERS: Mapping[Doer, str] = {
     "host": "the host",
     "simulator": "the simulator",
 }
-RUN, HAL, CONTROL = "run", "hal", "control"
-ROUTER = "router"  # that of a run with --with-router
+
+# Parts of a run, as `Injection.part` returns them; other parts are services, by name.
+RUN = "run"
+HAL = "hal"
+CONTROL = "control"
+ROUTER = "router"  # the Zenoh router of a run with --with-router
+
 FORM = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
-LONGEST_TEXT = 200  # characters of one, as people write it
+LONGEST_TEXT = 200  # characters of an injected fault in its text form
 _text = re.compile(
     r"(?P<kind>[a-z_]+):(?P<target>[a-z0-9_/]+)@(?P<start>[0-9.]+)(-(?P<end>[0-9.]+))?(=(?P<amount>[-+0-9.e]+))?"
 )
@@ -40,10 +45,10 @@ _numbered = re.compile(r"(?P<type>joint|bus)_(?P<number>[1-9][0-9]*)")
 
 @dataclass(frozen=True)
 class Amount:
-    """How much of it: the number behind `=`."""
+    """The strength of an injected fault: the number behind `=`."""
 
-    about: str
-    unit: str
+    about: str  # what the number is
+    unit: str  # "1": it has no unit
     default: float
     low: float
     high: float
@@ -51,13 +56,13 @@ class Amount:
 
 @dataclass(frozen=True)
 class Kind:
-    """One way to go wrong."""
+    """One kind of injected fault."""
 
     about: str
-    by: tuple[Doer, ...]  # who carries it out; of two the first, where it can
-    amount: Amount | None = None
-    once: bool = False  # it happens, and has no end
-    in_module: str = ""  # what it is in a module, where that is more than `about`
+    by: tuple[Doer, ...]  # who carries it out; of two, the first one if it can
+    amount: Amount | None = None  # none: it has no strength
+    once: bool = False  # true: it happens at its start, and has no end
+    in_module: str = ""  # what it does in a joint module, where that is more than `about`
 
 
 SHARE = Amount("share of the messages", "1", 1.0, 0.0, 1.0)
@@ -129,34 +134,34 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
 
 @dataclass(frozen=True)
 class Injection:
-    """One thing that goes wrong, for some time. Make it with `parse` or `checked`: those know what is allowed."""
+    """One fault that is injected for some time. Make it with `parse` or `checked`, which know what is allowed."""
 
     kind: str
     target: str
-    start_s: float = 0.0  # of robot time since the first arming; for emulators, since they were started
+    start_s: float = 0.0  # robot time since the first arming; for emulators, time since their start
     end_s: float = inf
     amount: float | None = None
 
     @property
     def target_type(self) -> TargetType:
-        """What sort of thing it happens to."""
+        """Return what sort of thing the fault happens to."""
         return target_type(self.target)
 
     @property
     def about(self) -> Kind:
-        """What it is."""
+        """Return the kind of fault, from the registry."""
         return KINDS[self.target_type][self.kind]
 
     @property
     def number(self) -> int:
-        """Of a joint or bus: its index from the tail, from 0."""
+        """Return the index of the joint or bus that is the target: from 0, joints from the tail."""
         match = _numbered.fullmatch(self.target)
         assert match is not None, f"{self.target} has no number"
         return int(match["number"]) - 1
 
     @property
     def part(self) -> str:
-        """Who carries it out: the supervisor `run`, the host `hal`, or a service."""
+        """Return the part of a run that carries it out: the supervisor `run`, the host `hal`, or a service by name."""
         match self.about.by[0]:
             case "supervisor":
                 return RUN
@@ -168,13 +173,16 @@ class Injection:
                 return HAL
 
     def __str__(self) -> str:
-        end = "" if self.end_s == inf else f"-{self.end_s:.12g}"
-        amount = "" if self.amount is None else f"={self.amount:.12g}"
-        return f"{self.kind}:{self.target}@{self.start_s:.12g}{end}{amount}"
+        text = f"{self.kind}:{self.target}@{self.start_s:.12g}"
+        if self.end_s != inf:
+            text += f"-{self.end_s:.12g}"
+        if self.amount is not None:
+            text += f"={self.amount:.12g}"
+        return text
 
 
 def target_type(target: str) -> TargetType:
-    """What sort of thing a name means."""
+    """Return what sort of thing a target is, by its name."""
     numbered = _numbered.fullmatch(target)
     if numbered is not None:
         return "joint" if numbered["type"] == "joint" else "bus"
@@ -189,26 +197,48 @@ OUTSIDE = ("operator", "preview")  # writers that are no part of a run
 
 
 def writer_of(key: str) -> str:
-    """The part that writes a key. Raises ConfigError for a key that no part of a run writes."""
+    """Return the part of a run that writes a key.
+
+    Raises:
+        ConfigError: No part of a run writes the key.
+    """
     row = keys.row_at(key)
-    if row is not None and row.kind in ("stream", "latched") and row.writer not in OUTSIDE:
-        if row.key == keys.DONE_ALL:
-            return keys.service_of(key)
-        return {"HAL": HAL, "lease holder": CONTROL}.get(row.writer, row.writer)
-    streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer not in OUTSIDE]
-    raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
+    if row is None or not _is_written_by_run(row):
+        streams = [row.key for row in keys.SPACE if _is_written_by_run(row)]
+        raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
+    if row.key == keys.DONE_ALL:
+        return keys.service_of(key)
+    match row.writer:
+        case "HAL":
+            return HAL
+        case "lease holder":
+            return CONTROL
+        case service:
+            return service
+
+
+def _is_written_by_run(row: keys.Row) -> bool:
+    """Return whether a part of a run publishes messages under the keys of a row."""
+    return row.kind in ("stream", "latched") and row.writer not in OUTSIDE
 
 
 def parse(text: str) -> Injection:
-    """An injection from its text in a file. Raises ConfigError."""
+    """Return the injected fault that a text describes, such as `mute:joint_3@2-3.5`.
+
+    Raises:
+        ConfigError: The text is not valid, or the fault is not allowed.
+    """
     if len(text) > LONGEST_TEXT:
         raise ConfigError(f"fault {text[:40]!r}...: {len(text)} characters, at most {LONGEST_TEXT}: give {FORM}")
     match = _text.fullmatch(text.strip())
     if match is None:
         raise ConfigError(f"fault {text!r}: give {FORM}. Kinds: {kinds_in_short()}")
+    amount: float | None = None
     try:
-        start_s, end_s = float(match["start"]), float(match["end"] or inf)
-        amount = None if match["amount"] is None else float(match["amount"])
+        start_s = float(match["start"])
+        end_s = float(match["end"] or inf)
+        if match["amount"] is not None:
+            amount = float(match["amount"])
     except ValueError:
         raise ConfigError(f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3") from None
     if end_s <= start_s:
@@ -216,22 +246,22 @@ def parse(text: str) -> Injection:
     return checked(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
 
 
-def checked(injection: Injection, said: str | None = None) -> Injection:
-    """The same, when it is allowed, with the default of its amount filled in. Raises ConfigError."""
-    text = str(injection) if said is None else said
-    sort = injection.target_type
-    allowed = KINDS[sort]
-    if injection.kind not in allowed:
-        others = [other for other in get_args(TargetType) if injection.kind in KINDS[other]]
-        also = ["processes" if other == "process" else f"{other}s" for other in others]
-        hint = f"; {injection.kind} is for {' and '.join(also)}" if also else ""
-        raise ConfigError(
-            f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "
-            f"{', '.join(allowed)}{hint}"
-        )
-    kind = allowed[injection.kind]
-    if sort == "key":
-        writer_of(injection.target)
+def checked(injection: Injection, given_text: str | None = None) -> Injection:
+    """Return the injected fault with the default of its amount filled in, if it is allowed.
+
+    Args:
+        injection: to check.
+        given_text: how the user wrote it, for errors; None: its own text form.
+
+    Raises:
+        ConfigError: The target has no such kind of fault, the key has no writer, or the amount is not allowed.
+    """
+    text = str(injection) if given_text is None else given_text
+    kind = KINDS[injection.target_type].get(injection.kind)
+    if kind is None:
+        raise _unknown_kind_error(injection, text)
+    if injection.target_type == "key":
+        writer_of(injection.target)  # raises for a key without a writer
     if kind.amount is None:
         if injection.amount is not None:
             raise ConfigError(f"fault {text!r}: {injection.kind} takes no amount; leave out ={injection.amount:g}")
@@ -242,36 +272,78 @@ def checked(injection: Injection, said: str | None = None) -> Injection:
             f"fault {text!r}: {kind.amount.about} = {amount:g} must be from {kind.amount.low:g} to "
             f"{kind.amount.high:g} {kind.amount.unit}"
         )
-    return Injection(injection.kind, injection.target, injection.start_s, injection.end_s, amount)
+    return replace(injection, amount=amount)
+
+
+def _unknown_kind_error(injection: Injection, text: str) -> ConfigError:
+    """Return the error for a kind that the target does not have; it names the targets that have this kind."""
+    sort = injection.target_type
+    others = [other for other in get_args(TargetType) if injection.kind in KINDS[other]]
+    plurals = ["processes" if other == "process" else f"{other}s" for other in others]
+    hint = f"; {injection.kind} is for {' and '.join(plurals)}" if plurals else ""
+    return ConfigError(
+        f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "
+        f"{', '.join(KINDS[sort])}{hint}"
+    )
 
 
 def check_targets(injections: Iterable[Injection], *, services: Iterable[str], joints: int, buses: int) -> None:
-    """Whether a run has everything that is to go wrong. Raises ConfigError."""
+    """Check that a run has every target of its injected faults.
+
+    Args:
+        injections: the faults.
+        services: names of the services that the run starts.
+        joints: number of joints.
+        buses: number of buses.
+
+    Raises:
+        ConfigError: The run has no such joint, bus, process or key, or the router cannot do it.
+    """
     processes = [*services, "host", ROUTER]
     for injection in injections:
-        sort = injection.target_type
-        if sort in ("joint", "bus"):
-            count = joints if sort == "joint" else buses
-            if injection.number >= count:
-                has = f"{sort}_1 to {sort}_{count}" if count else f"no {sort}"
-                raise ConfigError(f"fault {str(injection)!r}: there is no {injection.target}; this run has {has}")
-        elif sort == "process" and injection.target not in processes:
-            raise ConfigError(
-                f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has "
-                f"{', '.join(processes)}"
-            )
-        elif sort == "key" and injection.part not in processes and injection.part != HAL:
-            raise ConfigError(
-                f"fault {str(injection)!r}: {injection.part} writes {injection.target}, and this run does not start it"
-            )
-        elif injection.target == ROUTER and injection.part != RUN:
-            can = [kind for kind, about in KINDS["process"].items() if "supervisor" in about.by]
-            raise ConfigError(f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(can)}")
+        match injection.target_type:
+            case "joint":
+                _check_number(injection, "joint", joints)
+            case "bus":
+                _check_number(injection, "bus", buses)
+            case "process":
+                _check_process(injection, processes)
+            case "key":
+                _check_writer(injection, processes)
+            case "simulator" | "clock":
+                pass
+
+
+def _check_number(injection: Injection, sort: str, count: int) -> None:
+    """Raise ConfigError if the number of a joint or bus is above their count."""
+    if injection.number >= count:
+        has = f"{sort}_1 to {sort}_{count}" if count else f"no {sort}"
+        raise ConfigError(f"fault {str(injection)!r}: there is no {injection.target}; this run has {has}")
+
+
+def _check_process(injection: Injection, processes: list[str]) -> None:
+    """Raise ConfigError if the run has no such process, or the router cannot do it."""
+    if injection.target not in processes:
+        raise ConfigError(
+            f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has {', '.join(processes)}"
+        )
+    if injection.target == ROUTER and injection.part != RUN:
+        possible = [name for name, kind in KINDS["process"].items() if "supervisor" in kind.by]
+        raise ConfigError(f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(possible)}")
+
+
+def _check_writer(injection: Injection, processes: list[str]) -> None:
+    """Raise ConfigError if the run does not start the process that writes the key."""
+    writer = injection.part
+    if writer not in processes and writer != HAL:
+        raise ConfigError(
+            f"fault {str(injection)!r}: {writer} writes {injection.target}, and this run does not start it"
+        )
 
 
 @dataclass(frozen=True)
 class Change:
-    """An injection begins or ends."""
+    """The time at which an injected fault begins or ends."""
 
     at_s: float
     injection: Injection
@@ -279,7 +351,7 @@ class Change:
 
 
 class Plan:
-    """Injections in the order of time."""
+    """The beginnings and ends of injected faults, in the order of time."""
 
     def __init__(self, injections: Iterable[Injection] = ()) -> None:
         self._changes: list[Change] = []
@@ -287,38 +359,41 @@ class Plan:
             self.add(injection)
 
     def add(self, injection: Injection) -> None:
-        """One more."""
+        """Add an injected fault to the plan."""
         self._changes.append(Change(injection.start_s, injection, True))
         if injection.end_s != inf and not injection.about.once:
             self._changes.append(Change(injection.end_s, injection, False))
         self._changes.sort(key=lambda change: change.at_s)
 
     def next_s(self) -> float:
-        """When the next one begins or ends; inf when none will."""
+        """Return the time of the next change; inf if there is none left."""
         return self._changes[0].at_s if self._changes else inf
 
     def until(self, now_s: float) -> list[Change]:
-        """What begins or ends by now, each once."""
+        """Remove the changes that are due by now from the plan, and return them."""
         due = [change for change in self._changes if change.at_s <= now_s]
         self._changes = self._changes[len(due) :]
         return due
 
 
 def explain() -> str:
-    """Every kind, for a command's help."""
+    """Return a list of every kind, for a command's help."""
     lines: list[str] = []
     for sort, kinds in KINDS.items():
         lines.append(f"{sort}:")
         for name, kind in kinds.items():
-            amount = kind.amount
-            much = ""
-            if amount is not None:
-                unit = "" if amount.unit == "1" else f" {amount.unit}"
-                much = f"; amount: {amount.about}, {amount.default:g}{unit} if not given"
-            lines.append(f"  {name:<14} {kind.about}{much}")
+            lines.append(f"  {name:<14} {kind.about}{_explain_amount(kind.amount)}")
     return "\n".join(lines)
 
 
+def _explain_amount(amount: Amount | None) -> str:
+    """Return what the amount of a kind is, and its default; empty if the kind has none."""
+    if amount is None:
+        return ""
+    unit = "" if amount.unit == "1" else f" {amount.unit}"
+    return f"; amount: {amount.about}, {amount.default:g}{unit} if not given"
+
+
 def kinds_in_short() -> str:
-    """Every kind by what it happens to."""
+    """Return the names of all kinds in one line, by the sort of target."""
     return "; ".join(f"{sort}: {', '.join(kinds)}" for sort, kinds in KINDS.items())

@@ -1,4 +1,4 @@
-"""The injected faults that a run has planned, and whether the run supports them."""
+"""The injected faults that the configuration of a run contains, and whether the run can carry them out."""
 
 from collections.abc import Collection
 
@@ -11,24 +11,40 @@ MAX_BUSES = 8
 
 
 def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
-    """Parse them from their texts. Raises ConfigError with the number of the wrong one."""
-    found: list[Injection] = []
+    """Return the injected faults of a configuration.
+
+    Args:
+        config: of the run.
+        table: the values as read, to name the file or flag in errors.
+
+    Raises:
+        ConfigError: A text is not valid. The error has its number.
+    """
+    injections: list[Injection] = []
     for i, text in enumerate(config.faults):
         try:
-            found.append(parse(text))
+            injections.append(parse(text))
         except ConfigError as error:
             raise ConfigError(f"{_place(config, i, table)}: {error}") from None
-    return found
+    return injections
 
 
 def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, because: str) -> None:
-    """Check that a backend supports the planned faults of joints, buses and the simulator. Raises ConfigError.
+    """Check that a backend can inject the planned faults of joints, buses and the simulator.
 
-    does: kinds of these that it knows by itself; because: why it knows no more. The host does some for any backend.
+    Args:
+        config: of the run.
+        does: kinds of fault that the backend injects itself; the host injects some for any backend.
+        buses: number of buses of the backend.
+        because: why the backend injects no other kinds, for the error.
+
+    Raises:
+        ConfigError: The backend cannot inject a planned fault.
     """
     for i, injection in enumerate(check_planned(config, buses=buses)):
-        own = injection.part == HAL and injection.target_type not in ("process", "key")
-        if own and not {"host", "samples"} & {*injection.about.by} and injection.kind not in does:
+        concerns_backend = injection.part == HAL and injection.target_type not in ("process", "key")
+        host_can = "host" in injection.about.by or "samples" in injection.about.by
+        if concerns_backend and not host_can and injection.kind not in does:
             raise ConfigError(
                 f"{_place(config, i, None)}: backend {config.backend!r} cannot do {injection.kind} to "
                 f"{injection.target}: {because}"
@@ -36,7 +52,11 @@ def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, b
 
 
 def check_without_run(config: RunConfig, table: Table | None = None) -> None:
-    """Check that none needs `snakesim run`, which alone starts, kills and freezes processes. Raises ConfigError."""
+    """Check that no planned fault needs `snakesim run`, which alone starts, kills and freezes processes.
+
+    Raises:
+        ConfigError: A planned fault needs it.
+    """
     for i, injection in enumerate(planned(config, table)):
         if injection.part == RUN:
             raise ConfigError(
@@ -46,9 +66,13 @@ def check_without_run(config: RunConfig, table: Table | None = None) -> None:
 
 
 def check_planned(config: RunConfig, table: Table | None = None, buses: int = MAX_BUSES) -> list[Injection]:
-    """The planned faults; every target exists: process, key, joint or bus. Raises ConfigError."""
-    found = planned(config, table)
-    for i, injection in enumerate(found):
+    """Return the injected faults of a configuration, after a check that the run has all their targets.
+
+    Raises:
+        ConfigError: A text is not valid, or the run has no such process, key, joint or bus.
+    """
+    injections = planned(config, table)
+    for i, injection in enumerate(injections):
         try:
             check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)
             if injection.part == RUN and injection.target in config.beside:
@@ -58,9 +82,10 @@ def check_planned(config: RunConfig, table: Table | None = None, buses: int = MA
                 )
         except ConfigError as error:
             raise ConfigError(f"{_place(config, i, table)}: {error}") from None
-    return found
+    return injections
 
 
 def _place(config: RunConfig, i: int, table: Table | None) -> str:
+    """Return where the fault number i stands, for errors: file or flag if they are known, else the scenario."""
     origin = f"scenario {config.name!r}" if table is None else table.origin_of("faults")
     return f"{origin}: `faults[{i}]`"

@@ -1,4 +1,4 @@
-"""Where a value of a file departs from its Struct, and what is wanted there in words: for the errors of `files`."""
+"""Find the first value of a file that its Struct does not allow, and describe types in words: for errors of `files`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,79 +11,107 @@ from msgspec import inspect
 
 @dataclass(frozen=True)
 class Violation:
-    """The first place where a value is not what it should be."""
+    """The first place where a value is not what its type allows."""
 
     kind: Literal["unknown", "missing", "wrong"]
-    steps: list[str]  # the way to it
-    value: Any = None
-    wanted: Any = None  # type
-    why: str = ""
-    known: Sequence[str] = ()  # fields beside an unknown one
+    steps: list[str]  # names and numbers that lead from the whole value to the place
+    value: Any = None  # if it is wrong
+    wanted: Any = None  # the type that is expected there
+    why: str = ""  # the reason that msgspec gives
+    known: Sequence[str] = ()  # the allowed fields beside an unknown one
 
 
 def first_violation(value: Any, wanted: Any, steps: Sequence[str] = ()) -> Violation | None:
-    """None when the value is of the type; else the innermost part that is wrong by itself."""
+    """Return the innermost part of a value that is wrong by itself, or None if the value has the wanted type.
+
+    Args:
+        value: as read from TOML or JSON.
+        wanted: a type that msgspec can check.
+        steps: the way from the whole file to the value.
+    """
     try:
         msgspec.convert(value, wanted)
     except msgspec.ValidationError as error:
         why = str(error)
     else:
         return None
-    structs = [option for option in _options(wanted) if _is_struct(option)]
-    if isinstance(value, dict) and structs:
-        chosen = [struct for struct in structs if _is_meant(value, struct)]
-        found = _flaw_of_section(value, chosen[0], steps) if chosen else _flaw_of_tag(value, structs, steps)
-        if found is not None:
-            return found
-    for step, part, type_ in _parts(value, wanted):
-        found = first_violation(part, type_, [*steps, step])
-        if found is not None:
-            return found
+    if isinstance(value, dict):
+        violation = _violation_of_section(value, wanted, steps)
+        if violation is not None:
+            return violation
+    for step, part, part_type in _parts(value, wanted):
+        violation = first_violation(part, part_type, [*steps, step])
+        if violation is not None:
+            return violation
     return Violation("wrong", list(steps), value, wanted, why)
 
 
-def _flaw_of_section(section: dict[str, Any], struct: type[msgspec.Struct], steps: Sequence[str]) -> Violation | None:
-    """A field too many, or one too few."""
-    config, fields = struct.__struct_config__, msgspec.structs.fields(struct)
-    known = [field.encode_name for field in fields] + ([config.tag_field] if config.tag_field else [])
-    for name in section if config.forbid_unknown_fields else ():
-        if name not in known:
-            return Violation("unknown", [*steps, name], known=known)
+def _violation_of_section(section: dict[str, Any], wanted: Any, steps: Sequence[str]) -> Violation | None:
+    """Return a violation by the section's own fields, not by what is inside of them."""
+    structs = [option for option in _options(wanted) if _is_struct(option)]
+    if not structs:
+        return None
+    matching = [struct for struct in structs if _tag_matches(section, struct)]
+    if not matching:
+        return _violation_of_tag(section, structs, steps)
+    return _violation_of_fields(section, matching[0], steps)
+
+
+def _violation_of_fields(
+    section: dict[str, Any], struct: type[msgspec.Struct], steps: Sequence[str]
+) -> Violation | None:
+    """Return a field that the Struct does not have, or one that is required and missing."""
+    config = struct.__struct_config__
+    fields = msgspec.structs.fields(struct)
+    known = [field.encode_name for field in fields]
+    if config.tag_field:
+        known.append(config.tag_field)
+    if config.forbid_unknown_fields:
+        for name in section:
+            if name not in known:
+                return Violation("unknown", [*steps, name], known=known)
     for field in fields:
         if field.required and field.encode_name not in section:
             return Violation("missing", [*steps, field.encode_name], wanted=field.type)
     return None
 
 
-def _flaw_of_tag(section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], steps: Sequence[str]) -> Violation:
-    tag = str(structs[0].__struct_config__.tag_field)
-    wanted = Literal[tuple(struct.__struct_config__.tag for struct in structs)]
-    if tag not in section:
-        return Violation("missing", [*steps, tag], wanted=wanted)
-    return Violation("wrong", [*steps, tag], section[tag], wanted, "there is no such kind")
+def _violation_of_tag(
+    section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], steps: Sequence[str]
+) -> Violation:
+    """Return the violation of a section whose tag is missing, or belongs to none of the Structs."""
+    tag_field = str(structs[0].__struct_config__.tag_field)
+    tags = tuple(struct.__struct_config__.tag for struct in structs)
+    wanted = Literal[tags]
+    if tag_field not in section:
+        return Violation("missing", [*steps, tag_field], wanted=wanted)
+    return Violation("wrong", [*steps, tag_field], section[tag_field], wanted, "there is no such kind")
 
 
 def _parts(value: Any, wanted: Any) -> Iterator[tuple[str, Any, Any]]:
-    """What is inside of a value: (step, part, wanted type)."""
+    """Yield every part inside of a value as (step, part, wanted type)."""
     for option in _options(wanted):
-        container, inner = get_origin(option), get_args(option)
-        if isinstance(value, dict) and _is_struct(option) and _is_meant(value, option):
+        container = get_origin(option)
+        arguments = get_args(option)
+        if isinstance(value, dict) and _is_struct(option) and _tag_matches(value, option):
             for field in msgspec.structs.fields(option):
                 if field.encode_name in value:
                     yield field.encode_name, value[field.encode_name], field.type
         elif container is dict and isinstance(value, dict):
+            _, value_type = arguments
             for key, part in value.items():
-                yield key, part, inner[1]
+                yield key, part, value_type
         elif container is list and isinstance(value, list):
+            (item_type,) = arguments
             for i, part in enumerate(value):
-                yield str(i), part, inner[0]
+                yield str(i), part, item_type
         elif container is tuple and isinstance(value, list):
-            for i, (part, type_) in enumerate(zip(value, inner, strict=False)):
-                yield str(i), part, type_
+            for i, (part, part_type) in enumerate(zip(value, arguments, strict=False)):
+                yield str(i), part, part_type
 
 
 def _options(wanted: Any) -> list[Any]:
-    """The alternatives of a union, without their notes; one for any other type."""
+    """Return the alternatives of a union, without annotations; for any other type, only that type."""
     origin = get_origin(wanted)
     if origin is Annotated:
         return _options(get_args(wanted)[0])
@@ -96,14 +124,16 @@ def _is_struct(option: Any) -> bool:
     return isinstance(option, type) and issubclass(option, msgspec.Struct)
 
 
-def _is_meant(section: dict[str, Any], struct: type[msgspec.Struct]) -> bool:
-    """Whether a section is of this Struct, by its tag where it has one."""
+def _tag_matches(section: dict[str, Any], struct: type[msgspec.Struct]) -> bool:
+    """Return whether a section has the tag of a Struct; true for a Struct without a tag."""
     config = struct.__struct_config__
-    return config.tag_field is None or section.get(config.tag_field) == config.tag
+    if config.tag_field is None:
+        return True
+    return section.get(config.tag_field) == config.tag
 
 
 def _alternatives(info: inspect.Type | None) -> list[inspect.Type]:
-    """The alternatives of a union; one for any other type."""
+    """Return the alternatives of a union; for any other type, only that type."""
     if info is None:
         return []
     if isinstance(info, inspect.Metadata):
@@ -114,28 +144,35 @@ def _alternatives(info: inspect.Type | None) -> list[inspect.Type]:
 
 
 def unit_of(info: inspect.Type | None) -> str:
-    """The unit of a number; empty when it has none."""
+    """Return the unit of a number; empty if it has no unit. Of a union, the first unit counts."""
     if isinstance(info, inspect.UnionType):
-        return next(filter(None, map(unit_of, info.types)), "")
+        for option in info.types:
+            unit = unit_of(option)
+            if unit:
+                return unit
+        return ""
     if isinstance(info, inspect.Metadata):
-        return str((info.extra_json_schema or {}).get("unit", ""))
+        extra = info.extra_json_schema or {}
+        return str(extra.get("unit", ""))
     return ""
 
 
 def in_words(info: inspect.Type | None) -> str:
-    """The type of a field, in words."""
-    said: list[str] = []
+    """Return the type of a field in words, such as "a number > 0 in m"."""
+    unit = unit_of(info)
+    descriptions: list[str] = []
     for option in _alternatives(info):
-        word = _word(option, unit_of(info))
-        if word is not None:
-            said.append(word)
-    return " or ".join(said) or "another value"
+        description = _describe(option, unit)
+        if description is not None:
+            descriptions.append(description)
+    return " or ".join(descriptions) or "another value"
 
 
-def _word(option: inspect.Type, unit: str) -> str | None:
+def _describe(option: inspect.Type, unit: str) -> str | None:
+    """Return one type that is not a union in words; None if a file cannot contain it."""
     match option:
         case inspect.FloatType() | inspect.IntType():
-            return _number(option, unit)
+            return _describe_number(option, unit)
         case inspect.LiteralType(values=values):
             return "one of " + ", ".join(repr(value) for value in values)
         case inspect.EnumType(cls=enum):
@@ -159,8 +196,13 @@ def _word(option: inspect.Type, unit: str) -> str | None:
             return None
 
 
-def _number(option: inspect.FloatType | inspect.IntType, unit: str) -> str:
-    word = "a number" if isinstance(option, inspect.FloatType) else "a whole number"
-    signs = ((">=", option.ge), (">", option.gt), ("<=", option.le), ("<", option.lt))
-    bounds = [f"{sign} {bound:g}" for sign, bound in signs if bound is not None]
-    return " ".join(filter(None, [word, " and ".join(bounds), f"in {unit}" if unit else ""]))
+def _describe_number(option: inspect.FloatType | inspect.IntType, unit: str) -> str:
+    """Return a number in words, with its bounds and its unit."""
+    words = ["a number" if isinstance(option, inspect.FloatType) else "a whole number"]
+    limits = ((">=", option.ge), (">", option.gt), ("<=", option.le), ("<", option.lt))
+    bounds = [f"{sign} {limit:g}" for sign, limit in limits if limit is not None]
+    if bounds:
+        words.append(" and ".join(bounds))
+    if unit:
+        words.append(f"in {unit}")
+    return " ".join(words)

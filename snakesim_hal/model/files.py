@@ -19,6 +19,8 @@ StructT = TypeVar("StructT", bound=msgspec.Struct)
 SHIPPED = Path(__file__).parents[1] / "shipped"
 ROUTER = SHIPPED / "router.json5"
 SCHEMAS = Path(__file__).parents[1] / "schemas"  # in the repository a link to the folder beside the packages
+MAX_INDEX_DIGITS = 9  # Python converts longer numbers slowly, and no list is that long
+MAX_SHOWN_TEXT = 40  # characters of a damaged text in an error
 
 
 class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -27,39 +29,55 @@ class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 @dataclass
 class Table:
-    """Values as read, with the origin of each leaf; keys of `origin` are dotted."""
+    """Values as read, with the origin of each leaf."""
 
     values: dict[str, Any]
-    source: str
-    origin: dict[str, str] = field(default_factory=dict)
+    source: str  # the file
+    origin: dict[str, str] = field(default_factory=dict)  # dotted key -> file or flag
 
     def put(self, dotted: str, value: Any, origin: str) -> None:
-        """Set a value, creating the parent tables."""
+        """Set a value, and create the sections above it.
+
+        Args:
+            dotted: key, such as `scene.ground.friction`; an entry of a list is named by its number.
+            value: any value of a TOML file.
+            origin: file or flag that gives the value.
+
+        Raises:
+            ConfigError: There is no such entry of a list, or a part of the key is a value and not a section.
+        """
         *parents, last = dotted.split(".")
         if len(parents) >= MAX_DEPTH:
             raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MAX_DEPTH} are allowed")
-        place: Any = self.values
-        for i, name in enumerate(parents):
-            if isinstance(place, list):
-                place = _list_entry(place, name, ".".join(parents[: i + 1]), origin)
-                continue
-            place = place.setdefault(name, {})
-            if not isinstance(place, dict | list):
-                raise ConfigError(
-                    f"{origin}: `{'.'.join(parents[: i + 1])}` is the value {short(repr(place))}, not a section; "
-                    f"`{dotted}` cannot be set inside it"
-                )
-        if isinstance(place, list):
-            _list_entry(place, last, dotted, origin)
-            place[int(last)] = value
+        section = self._section_for(dotted, parents, origin)
+        if isinstance(section, list):
+            index = _list_index(section, last, dotted, origin)
+            section[index] = value
         else:
-            place[last] = value
-        for key in [k for k in self.origin if k == dotted or k.startswith(dotted + ".")]:
+            section[last] = value
+        replaced = [key for key in self.origin if key == dotted or key.startswith(dotted + ".")]
+        for key in replaced:
             del self.origin[key]
         self.origin.update(_origins(value, origin, dotted))
 
+    def _section_for(self, dotted: str, parents: list[str], origin: str) -> Any:
+        """Return the dict or list that the parents of a key lead to; sections that are missing are created."""
+        section: Any = self.values
+        for i, name in enumerate(parents):
+            path = ".".join(parents[: i + 1])
+            if isinstance(section, list):
+                section = section[_list_index(section, name, path, origin)]
+                continue
+            section = section.setdefault(name, {})
+            if not isinstance(section, dict | list):
+                raise ConfigError(
+                    f"{origin}: `{path}` is the value {short(repr(section))}, not a section; "
+                    f"`{dotted}` cannot be set inside it"
+                )
+        return section
+
     def origin_of(self, dotted: str) -> str:
-        """The file or flag that set a dotted key; `default` when none did."""
+        """Return the file or flag that gives the value of a dotted key; `default` if none does."""
         key = dotted
         while key:
             if key in self.origin:
@@ -68,66 +86,88 @@ class Table:
         return "default"
 
     def file_of(self, dotted: str) -> str:
-        """The file that contains a field, or its nearest neighbors if it is missing."""
-        place = dotted
-        while place:
+        """Return the file that contains a field, or its nearest neighbors if the field is missing."""
+        section = dotted
+        while section:
             for key, origin in self.origin.items():
-                if (key == place or key.startswith(place + ".")) and not origin.startswith("--"):
+                is_inside = key == section or key.startswith(section + ".")
+                is_flag = origin.startswith("--")
+                if is_inside and not is_flag:
                     return origin
-            place = place.rpartition(".")[0]
+            section = section.rpartition(".")[0]
         return self.source
 
 
 def _origins(value: Any, origin: str, prefix: str = "") -> dict[str, str]:
-    """An empty section sets nothing, so all its fields keep their defaults."""
+    """Return the origin of every leaf below a value; an empty section has none, as its fields keep their defaults."""
     return {key: origin for key, leaf in leaves(value, prefix) if leaf != {}}
 
 
-def _list_entry(place: list[Any], name: str, dotted: str, origin: str) -> Any:
-    if not name.isdecimal() or len(name) > 9 or int(name) >= len(place):
-        has = f"has entries 0 to {len(place) - 1}; name one by its number" if place else "is empty"
-        raise ConfigError(f"{origin}: `{dotted}`: the list {has}")
-    return place[int(name)]
+def _list_index(entries: list[Any], name: str, dotted: str, origin: str) -> int:
+    """Return the index of the entry that a part of a dotted key names. Raises ConfigError if there is none."""
+    is_number = name.isdecimal() and len(name) <= MAX_INDEX_DIGITS
+    if is_number and int(name) < len(entries):
+        return int(name)
+    if not entries:
+        raise ConfigError(f"{origin}: `{dotted}`: the list is empty")
+    raise ConfigError(f"{origin}: `{dotted}`: the list has entries 0 to {len(entries) - 1}; name one by its number")
 
 
 def leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every leaf below a value as (dotted key, value); lists of tables are numbered from 0, other lists are leaves."""
-    join = f"{prefix}." if prefix else ""
+    """Yield every leaf below a value as (dotted key, value).
+
+    Entries of a list of tables are numbered from 0; any other list is one leaf, and so is an empty section.
+    """
+    path = f"{prefix}." if prefix else ""
     if isinstance(value, dict) and value:
         for key, inner in value.items():
-            yield from leaves(inner, f"{join}{key}")
-    elif isinstance(value, list) and value and all(isinstance(v, dict) for v in value):
+            yield from leaves(inner, f"{path}{key}")
+    elif isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value):
         for i, inner in enumerate(value):
-            yield from leaves(inner, f"{join}{i}")
+            yield from leaves(inner, f"{path}{i}")
     else:
         yield prefix, value
 
 
 def read_table(path: Path) -> Table:
-    """Read a TOML or JSON file. Raises ConfigError when it is missing or not valid."""
+    """Read a TOML or JSON file.
+
+    Raises:
+        ConfigError: The file is missing or not valid.
+    """
     text = read_text(path)
-    is_json = path.suffix == ".json" or text.startswith("{")  # which no TOML does; a file in memory has no suffix
-    values = parse_json(text, str(path)) if is_json else parse_toml(text, str(path))
+    # No TOML file begins with a brace. A file in memory has no suffix.
+    is_json = path.suffix == ".json" or text.startswith("{")
+    parse = parse_json if is_json else parse_toml
+    values = parse(text, str(path))
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds a {type(values).__name__}, not a table of settings")
     return Table(values, str(path), _origins(values, str(path)))
 
 
 def find(name: str, kind: str, beside: Path | None = None) -> Path:
-    """Path of a robot, scene or scenario: a path to a file (relative to `beside`), or the name of a shipped one.
+    """Return the path of a robot, scene or scenario file.
 
-    kind: `robots`, `scenes` or `scenarios`.
+    Args:
+        name: of a shipped file, or the path of any file.
+        kind: `robots`, `scenes` or `scenarios`.
+        beside: folder that a relative path starts from; None: the working folder.
+
+    Raises:
+        ConfigError: There is no shipped file of that name.
     """
     if name.endswith((".toml", ".json")) or "/" in name:
         path = expanded(name)
-        return path if path.is_absolute() or beside is None else beside / path
+        if path.is_absolute() or beside is None:
+            return path
+        return beside / path
     if name not in shipped(kind):
-        raise ConfigError(f"no {kind[:-1]} called {short(name)!r}{_what_it_is(name, kind)}")
+        raise ConfigError(f"no {kind[:-1]} called {short(name)!r}{_hint_for_unknown(name, kind)}")
     return SHIPPED / kind / f"{name}.toml"
 
 
-def _what_it_is(name: str, kind: str) -> str:
-    """What a name may be that no shipped file of a kind has, and what to do."""
+def _hint_for_unknown(name: str, kind: str) -> str:
+    """Return what the user may mean by a name that no shipped file of a kind has, and what to do."""
     if kind == "scenarios" and name.endswith(".py"):
         return f": it is Python. A controller of your own: --controller ./{short(name)}:CLASS, behind a scenario's name"
     for other in ("robots", "scenes"):
@@ -140,9 +180,16 @@ def _what_it_is(name: str, kind: str) -> str:
 
 
 def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tuple[Path, ...] = ()) -> Table:
-    """Read a robot or a scene. With `extends = "planar13"` its file says only what differs from another one's.
+    """Read a robot or a scene. A file with `extends = "planar13"` contains only what differs from that robot.
 
-    extended: the files that extend this one, which it cannot extend in turn.
+    Args:
+        name: of a shipped file, or the path of any file.
+        kind: `robots` or `scenes`.
+        beside: folder that a relative path starts from; None: the working folder.
+        extended: the files that extend this one, which it cannot extend in turn.
+
+    Raises:
+        ConfigError: A file is missing or not valid, or files extend each other.
     """
     path = find(name, kind, beside)
     if path.resolve() in extended:
@@ -160,7 +207,7 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
 
 
 def _settings(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value in a section and those in it; a list is one value."""
+    """Yield every value in a section, and in the sections inside of it, as (dotted key, value); a list is one value."""
     for key, value in section.items():
         if isinstance(value, dict):
             yield from _settings(value, f"{prefix}{key}.")
@@ -169,7 +216,7 @@ def _settings(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def expanded(name: str) -> Path:
-    """A path, with `~` for the home folder. Raises ConfigError when there is no such home."""
+    """Return a path in which `~` is replaced by the home folder. Raises ConfigError if there is no such home."""
     try:
         return Path(name).expanduser()
     except RuntimeError as error:
@@ -177,12 +224,21 @@ def expanded(name: str) -> Path:
 
 
 def shipped(kind: str) -> list[str]:
-    """Names of the shipped files of a kind."""
+    """Return the names of the shipped files of a kind: `robots`, `scenes` or `scenarios`."""
     return sorted(path.stem for path in (SHIPPED / kind).glob("*.toml"))
 
 
 def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
-    """Check a table against a Struct. Raises ConfigError naming file, field, value, unit and range."""
+    """Check a table against a Struct, and return the Struct.
+
+    Args:
+        table: values as read.
+        struct: the type that they must have.
+        under: dotted key of the section that the table is, for errors.
+
+    Raises:
+        ConfigError: A value is not allowed. The error names file, field, value, unit and range.
+    """
     try:
         return msgspec.convert(table.values, struct)
     except msgspec.ValidationError as error:
@@ -190,42 +246,82 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
         assert violation is not None, error
         raise ConfigError(_explain(violation, table, under)) from None
     except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
-        odd = ascii(error.object[error.start : error.end])[:40]
+        odd = ascii(error.object[error.start : error.end])[:MAX_SHOWN_TEXT]
         raise ConfigError(
             f"{table.source}: a key or a text holds {odd}, which is not a character; write it again"
         ) from None
 
 
 def _explain(violation: Violation, table: Table, under: str) -> str:
-    *steps, name = [under, *violation.steps] if under else violation.steps or [""]
-    dotted, whole = ".".join([*steps, short(name)]), ".".join([*steps, name])
-    if violation.kind == "unknown":
-        deeper = [short(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(whole)]
-        close = nearest(name, violation.known) or next(iter(deeper), None)
-        hint = f"did you mean `{close}`?" if close else f"known fields: {', '.join(sorted(violation.known))}."
-        set_by = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
-        return f"{set_by[0] if set_by else table.file_of(dotted)}: unknown field `{dotted}`; {hint}"
-    info = msgspec.inspect.type_info(violation.wanted)
-    if violation.kind == "missing":
-        return f"{table.file_of(dotted)}: field `{dotted}` is missing; add it ({in_words(info)})."
-    unit, value = unit_of(info), violation.value
+    """Return the error text for a violation."""
+    if under:
+        *steps, name = [under, *violation.steps]
+    else:
+        *steps, name = violation.steps or [""]
+    dotted = ".".join([*steps, short(name)])
+    match violation.kind:
+        case "unknown":
+            full_key = ".".join([*steps, name])
+            return _explain_unknown(violation, table, dotted, full_key)
+        case "missing":
+            wanted = in_words(msgspec.inspect.type_info(violation.wanted))
+            return f"{table.file_of(dotted)}: field `{dotted}` is missing; add it ({wanted})."
+        case "wrong":
+            return _explain_wrong(violation, table, dotted)
+
+
+def _explain_unknown(violation: Violation, table: Table, dotted: str, full_key: str) -> str:
+    """Return the error text for an unknown field.
+
+    It suggests a field of the same section with a similar name, or else the same name in another section.
+
+    Args:
+        violation: kind `unknown`.
+        table: values as read.
+        dotted: key of the field, shortened for display.
+        full_key: the whole key of the field.
+    """
+    name = violation.steps[-1]
+    elsewhere = [short(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(full_key)]
+    suggestion = nearest(name, violation.known)
+    if not suggestion and elsewhere:
+        suggestion = elsewhere[0]
+    hint = f"did you mean `{suggestion}`?" if suggestion else f"known fields: {', '.join(sorted(violation.known))}."
+    origins = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
+    origin = origins[0] if origins else table.file_of(dotted)
+    return f"{origin}: unknown field `{dotted}`; {hint}"
+
+
+def _explain_wrong(violation: Violation, table: Table, dotted: str) -> str:
+    """Return the error text for a value that is not allowed."""
+    value = violation.value
+    why = violation.why
     origin = table.origin_of(dotted)
-    origin = table.file_of(dotted) if origin == "default" else origin
-    if isinstance(value, dict) and not violation.why.startswith(
-        "Expected"
-    ):  # each field is right, together they are not
-        return f"{origin}: `{dotted}`: {violation.why}" if dotted else f"{origin}: {violation.why}"
-    shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
-    why = "" if violation.why.startswith(("Expected `int", "Expected `float")) else f": {short(_lower(violation.why))}"
-    return f"{origin}: `{dotted}` = {shown} is not allowed{why}; expected {in_words(info)}."
+    if origin == "default":
+        origin = table.file_of(dotted)
+
+    each_field_is_right = isinstance(value, dict) and not why.startswith("Expected")
+    if each_field_is_right:  # the check of the whole section has failed
+        return f"{origin}: `{dotted}`: {why}" if dotted else f"{origin}: {why}"
+
+    info = msgspec.inspect.type_info(violation.wanted)
+    unit = unit_of(info)
+    shown = short(_repr(value))
+    if unit and isinstance(value, int | float):
+        shown += f" {unit}"
+    reason = ""
+    if not why.startswith(("Expected `int", "Expected `float")):  # the expected range says more
+        reason = f": {short(_lower_first(why))}"
+    return f"{origin}: `{dotted}` = {shown} is not allowed{reason}; expected {in_words(info)}."
 
 
-def _lower(text: str) -> str:
+def _lower_first(text: str) -> str:
     return text[:1].lower() + text[1:]
 
 
 def _repr(value: Any) -> str:
+    """Return the repr of a value; Python refuses to print integers of more than 4300 digits."""
     try:
         return repr(value)
-    except ValueError:  # Python does not print integers of more than 4300 digits
+    except ValueError:
         return "a very large number"

@@ -1,9 +1,10 @@
-"""Scenes that were made for one robot, in proportion for another.
+"""Scale a scene that was laid out for one robot to another robot.
 
-A row of pegs suits a body whose joints are as far apart, and as thick, as the one that it was laid out for. So a scene
-that says which one (`reference_robot`) is changed for other robots before anything else reads it: the wave of its route
-by the spacing of joints, corridors and gaps by the radius, and random fields stand as far beyond the route as before.
-What a flag sets stays. The scene then is made for this robot, so it can be read again.
+A row of pegs suits a robot with the same distance between joints, and the same radius, as the robot that it was laid
+out for. So a scene that names this robot's dimensions (`reference_robot`) is changed for every other robot, before
+anything else reads it: the wave of its route in proportion to the spacing of the joints, and corridors and gaps by the
+radius. Random fields keep their distance from the end of the route. Values that a flag gives are not changed.
+Afterwards `reference_robot` has the dimensions of the new robot, so a scene that is read again does not change again.
 """
 
 from collections.abc import Callable
@@ -15,30 +16,49 @@ from snakesim_hal.model.scene import SceneFile, SineRoute
 
 
 def spacing_m(robot: RobotFile) -> float | None:
-    """The longest straight part between two neighboring yaw joints; None: there are no two."""
-    return max(yaw_segments_m(robot.axes, robot.link_lengths_m)[1:-1], default=None)
+    """Return the longest straight part between two neighboring yaw joints; None if there are no two yaw joints."""
+    segments_m = yaw_segments_m(robot.axes, robot.link_lengths_m)
+    between_joints_m = segments_m[1:-1]
+    return max(between_joints_m, default=None)
 
 
 def fitted(scene: SceneFile, robot: RobotFile, is_given: Callable[[str], bool]) -> dict[str, Any]:
-    """What is different for this robot, by dotted key below `scene`. is_given: whether a flag sets a key."""
-    reference_robot, spacing = scene.reference_robot, spacing_m(robot)
-    if reference_robot is None or spacing is None:
+    """Return the values of a scene that differ for this robot, by dotted key below `scene`.
+
+    Args:
+        scene: laid out for its `reference_robot`.
+        robot: the robot of the run.
+        is_given: returns whether a flag gives the value of a key; such a value is kept.
+    """
+    reference_robot = scene.reference_robot
+    robot_spacing_m = spacing_m(robot)
+    if reference_robot is None or robot_spacing_m is None:
         return {}
-    radius, more = robot.module.radius_m, robot.module.radius_m - reference_robot.radius_m
-    share = spacing / reference_robot.spacing_m
-    if share == 1.0 and more == 0.0:
+    radius_m = robot.module.radius_m
+    extra_radius_m = radius_m - reference_robot.radius_m
+    scale = robot_spacing_m / reference_robot.spacing_m
+    if scale == 1.0 and extra_radius_m == 0.0:
         return {}
-    changed: dict[str, Any] = {"reference_robot.spacing_m": spacing, "reference_robot.radius_m": radius}
-    route, ahead = scene.route, 0.0
+
+    changed: dict[str, Any] = {
+        "reference_robot.spacing_m": robot_spacing_m,
+        "reference_robot.radius_m": radius_m,
+    }
+    longer_route_m = 0.0
+    route = scene.route
     if isinstance(route, SineRoute):
-        lengths = {name: getattr(route, name) for name in ("amplitude_m", "wavelength_m", "length_m")}
-        changed |= {f"route.{name}": share * length for name, length in lengths.items()}
-        ahead = 0.0 if is_given("route.length_m") else (share - 1.0) * route.length_m
+        changed["route.amplitude_m"] = scale * route.amplitude_m
+        changed["route.wavelength_m"] = scale * route.wavelength_m
+        changed["route.length_m"] = scale * route.length_m
+        if not is_given("route.length_m"):
+            longer_route_m = (scale - 1.0) * route.length_m
     for i, row in enumerate(scene.pegs_along_route):
-        changed[f"pegs_along_route.{i}.corridor_m"] = radius + share * (row.corridor_m - reference_robot.radius_m)
+        body_clearance_m = row.corridor_m - reference_robot.radius_m
+        changed[f"pegs_along_route.{i}.corridor_m"] = radius_m + scale * body_clearance_m
     for i, field in enumerate(scene.random_field):
-        for name in ("min_corner_m", "max_corner_m"):
-            x, y = getattr(field, name)
-            changed[f"random_field.{i}.{name}"] = [x + ahead, y]
-        changed[f"random_field.{i}.clearance_m"] = max(field.clearance_m + 2.0 * more, 0.0)
+        min_x, min_y = field.min_corner_m
+        max_x, max_y = field.max_corner_m
+        changed[f"random_field.{i}.min_corner_m"] = [min_x + longer_route_m, min_y]
+        changed[f"random_field.{i}.max_corner_m"] = [max_x + longer_route_m, max_y]
+        changed[f"random_field.{i}.clearance_m"] = max(field.clearance_m + 2.0 * extra_radius_m, 0.0)
     return {key: value for key, value in changed.items() if not is_given(key)}

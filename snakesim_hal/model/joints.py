@@ -1,11 +1,10 @@
-"""The joints of a robot file: sections for all of them, and a table of exceptions for single ones.
+"""The joints of a robot file: sections for all joints, and a table of exceptions for single ones.
 
-`[limits]`, `[motor]`, `[drive]`, `[heat]` and `[supply]` hold for every joint; `[joints.joint_3]` says what differs in
-one, by the same names. `table` puts them together: one `Joint` each, tail to head.
+`[limits]`, `[motor]`, `[drive]`, `[heat]` and `[supply]` are for every joint. `[joints.joint_3]` contains the values
+that differ for one joint, with the same keys. `table` combines them into one `Joint` for each, tail to head.
 """
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
@@ -17,7 +16,8 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Axis, Measurement
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
-MAX_TURN_RAD = 3.14159
+MAX_TURN_RAD = 3.14159  # to either side
+MAX_ID = 2**29  # exclusive; extended CAN identifiers have 29 bits
 
 Side = Annotated[float, bounded(-MAX_TURN_RAD, MAX_TURN_RAD, "rad")]
 Torque = Annotated[float, above(1000, "N·m")]
@@ -37,22 +37,35 @@ Backlash = Annotated[float, from_zero(0.5, "rad")]
 class Limits(FileStruct, frozen=True, kw_only=True):
     """Limits of a joint; enforced by the limiter and by the motor."""
 
-    angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]  # to either side
-    angle_min_rad: Side | None = None  # of a side that differs
+    # Angle, to either side; `angle_min_rad` and `angle_max_rad` for a side that differs.
+    angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]
+    angle_min_rad: Side | None = None
     angle_max_rad: Side | None = None
-    # To either side, that the cable of a joint without end stops bears.
+
+    # Revolutions to either side that the cable of a joint without end stops can take; none: it has end stops.
     cable_turns: Annotated[float, above(100, "turns")] | None = None
-    cable_unwound: Text = ""  # when it was, at the joint's zero; written by `snakesim joints zero`
+
+    # Date at which the cable was unwound with the joint at its zero; `snakesim joints zero` writes it.
+    cable_unwound: Text = ""
+
+    # Motion.
     speed_rad_s: Annotated[float, above(100, "rad/s")]
     acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
     torque_nm: Torque
     torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
-    derate_from_c: Celsius = 80.0  # of the winding: above it torque is derated
-    stop_at_c: Celsius = 105.0  # a fifth of the torque is left, and the robot stops
+
+    # Temperature of the winding: above `derate_from_c` torque is derated; at `stop_at_c` a fifth of it is left, and
+    # the robot stops.
+    derate_from_c: Celsius = 80.0
+    stop_at_c: Celsius = 105.0
+
     min_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
 
     def __post_init__(self) -> None:
-        """Derating must begin before the robot stops, and a joint must turn. Raises ValueError, for the file reader."""
+        """Check the limits against each other. Raises ValueError, for the file reader.
+
+        Derating must begin before the robot stops, the joint must have travel, and its cable must allow all of it.
+        """
         if self.stop_at_c <= self.derate_from_c:
             raise ValueError(
                 f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
@@ -63,8 +76,8 @@ class Limits(FileStruct, frozen=True, kw_only=True):
                 f"it may turn from {self.lower_rad:g} to {self.upper_rad:g} rad, which leaves no travel: "
                 f"`angle_min_rad` (or minus `angle_rad`) must be below `angle_max_rad` (or `angle_rad`)"
             )
-
-        if self.cable_turns is not None and self.cable_turns < max(-self.lower_rad, self.upper_rad) / (2 * math.pi):
+        limit_turns = max(-self.lower_rad, self.upper_rad) / (2 * math.pi)
+        if self.cable_turns is not None and self.cable_turns < limit_turns:
             raise ValueError(
                 f"`cable_turns` = {self.cable_turns:g} turns is less than its limits of {self.lower_rad:g} to "
                 f"{self.upper_rad:g} rad: narrow the limits"
@@ -72,28 +85,33 @@ class Limits(FileStruct, frozen=True, kw_only=True):
 
     @property
     def lower_rad(self) -> float:
-        """The joint's lowest angle."""
+        """Return the joint's lowest angle."""
         return -self.angle_rad if self.angle_min_rad is None else self.angle_min_rad
 
     @property
     def upper_rad(self) -> float:
-        """The joint's highest angle."""
+        """Return the joint's highest angle."""
         return self.angle_rad if self.angle_max_rad is None else self.angle_max_rad
 
 
 class Motor(FileStruct, frozen=True, kw_only=True):
     """Motor of a joint, as seen at the joint: behind the gear."""
 
-    stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]  # position mode
-    damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]  # position mode
-    velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]  # velocity mode
+    # Gains: of position mode, and of velocity mode.
+    stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]
+    damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]
+    velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]
+
+    # Dynamics.
     response_time_s: Lag  # first-order lag of the torque
-    armature_kg_m2: RotorInertia  # rotor inertia seen at the joint
-    friction_nm: Friction = 0.0
-    viscous_nm_s_per_rad: Viscosity = 0.0
-    torque_constant_nm_per_a: TorqueConstant | None = None  # of the drive's shaft, before a `gear`; none: not known
-    rated_nm: Torque | None = None  # that heats it as [heat] says; none: `limits.torque_nm`
-    peak_nm: Torque | None = None  # that it can give at all: no limit may be above it; none: not known
+    armature_kg_m2: RotorInertia  # rotor inertia
+    friction_nm: Friction = 0.0  # Coulomb friction
+    viscous_nm_s_per_rad: Viscosity = 0.0  # viscous friction
+
+    # Torque.
+    torque_constant_nm_per_a: TorqueConstant | None = None  # at the drive's shaft, before a `gear`; none: unknown
+    rated_nm: Torque | None = None  # torque for which [heat] gives temperatures and losses; none: `limits.torque_nm`
+    peak_nm: Torque | None = None  # torque that no limit may exceed; none: unknown
 
 
 DriveMode = Literal["position", "velocity", "torque"]
@@ -104,16 +122,21 @@ Measures = Annotated[list[Measurement], Meta(max_length=3)]
 class Drive(FileStruct, frozen=True, kw_only=True):
     """How a joint's drive is connected and mounted: drive angle = zero_rad + sign * gear * joint angle."""
 
-    driver: Text = ""  # of its protocol, such as dynamixel; empty: the backend's only one
-    port: Text = ""  # bus or serial port, such as can0; empty: as the backend's settings say
-    sign: Sign = 1  # -1: mounted the other way round, so that the drive turns against the joint
-    zero_rad: Zero = 0.0  # what the drive measures at the joint's zero
-    gear: Gear = 1.0  # turns of the drive's shaft in one turn of the joint
-    modes: Modes = msgspec.field(default_factory=lambda: ["position", "velocity", "torque"])  # that it can be in
+    # Connection.
+    driver: Text = ""  # driver type, such as dynamixel; empty: the only one of the backend
+    port: Text = ""  # bus or serial port, such as can0; empty: the one in the backend's settings
+
+    # Mounting.
+    sign: Sign = 1  # -1: the drive rotates against the joint
+    zero_rad: Zero = 0.0  # angle that the drive measures at the joint's zero
+    gear: Gear = 1.0  # revolutions of the drive's shaft per revolution of the joint
+
+    # Abilities: control modes, and what it measures beside the angle.
+    modes: Modes = msgspec.field(default_factory=lambda: ["position", "velocity", "torque"])
     measures: Measures = msgspec.field(default_factory=lambda: ["torque", "temperature", "voltage"])
 
     def __post_init__(self) -> None:
-        """A robot is armed by holding its pose. Raises ValueError, for the file reader."""
+        """Check that the drive can hold its position, as it must when a robot is armed. Raises ValueError."""
         if "position" not in self.modes:
             raise ValueError(
                 f"`modes` = {self.modes} lacks position, in which every joint holds its pose when it is armed; add it, "
@@ -124,13 +147,17 @@ class Drive(FileStruct, frozen=True, kw_only=True):
 class Heat(FileStruct, frozen=True, kw_only=True):
     """How a motor warms up. The defaults are typical of a small geared servo; none was measured."""
 
-    ambient_c: Annotated[float, bounded(-50, 100, "°C")] = 20.0
-    # Of the winding, at rest under the rated torque, for ever.
+    ambient_c: Annotated[float, bounded(-50, 100, "°C")] = 20.0  # of the air or water around the robot
+
+    # Final temperature rise of the winding at standstill under the rated torque.
     rise_at_rated_k: Annotated[float, above(1000, "K")] = 240.0
     time_constant_s: Annotated[float, above(1e5, "s")] = 60.0
-    # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm.
+
+    # Copper loss at the rated torque. With `rise_at_rated_k` the defaults give 5 K/W from winding to water, a guess of
+    # the right order for a housing of 100 mm.
     loss_at_rated_w: Annotated[float, from_zero(1e5, "W")] = 48.0
-    # Of the winding's rise, in the electronics beside it; a guess.
+
+    # Temperature rise of the electronics as a fraction of the winding's rise; a guess.
     board_fraction: Annotated[float, from_zero(1, "1")] = 0.3
 
 
@@ -138,21 +165,22 @@ class Supply(FileStruct, frozen=True, kw_only=True):
     """Electrical supply of a joint."""
 
     voltage_v: Annotated[float, above(1000, "V")] = 24.0
-    idle_a: Annotated[float, from_zero(1000, "A")] = 0.05
+    idle_a: Annotated[float, from_zero(1000, "A")] = 0.05  # current that the electronics draw
 
 
 class _Id(FileStruct, frozen=True, kw_only=True):
-    id: Annotated[int, Meta(ge=0, lt=2**29)] | None = None  # on its bus; none: the joint's number
+    id: Annotated[int, Meta(ge=0, lt=MAX_ID)] | None = None  # on its bus; none: the joint's number
 
 
-_OF_ALL = {"ambient_c"}  # the water is the same for all
-_differing = (
+# Every field of the sections for all joints is an optional field of the exceptions of one joint. Only the ambient
+# temperature is always the same for all.
+_exception_fields = [
     (field.name, field.type | None, None)
     for section in (Limits, Motor, Drive, Heat, Supply)
     for field in msgspec.structs.fields(section)
-    if field.name not in _OF_ALL
-)
-_of_one: Any = msgspec.defstruct("_OfOne", [*_differing], bases=(_Id,), frozen=True, kw_only=True)
+    if field.name != "ambient_c"
+]
+_of_one: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_Id,), frozen=True, kw_only=True)
 
 
 class JointExceptions(_of_one):
@@ -168,7 +196,7 @@ class Joint:
 
     name: str
     axis: Axis
-    id: int
+    id: int  # on its bus
     limits: Limits
     motor: Motor
     drive: Drive
@@ -177,7 +205,7 @@ class Joint:
 
     @property
     def rated_nm(self) -> float:
-        """The torque that heats its motor as `heat` says."""
+        """Return the torque for which `heat` gives temperatures and losses."""
         return self.limits.torque_nm if self.motor.rated_nm is None else self.motor.rated_nm
 
 
@@ -190,48 +218,71 @@ def table(
     heat: Heat,
     supply: Supply,
 ) -> list[Joint]:
-    """Every joint, tail to head; raises ValueError, which names the joint, for what no joint can be."""
+    """Return every joint as built, tail to head.
+
+    Args:
+        axes: axis of every joint, tail to head.
+        exceptions: what differs in single joints, by the joint's name.
+        limits: of every joint without exceptions; likewise the other sections.
+        motor: see `limits`.
+        drive: see `limits`.
+        heat: see `limits`.
+        supply: see `limits`.
+
+    Raises:
+        ValueError: There is no joint of that name, or a joint has values that contradict each other. The error names
+            the joint.
+    """
     names = [f"joint_{i + 1}" for i in range(len(axes))]
     for name in exceptions:
         if name not in names:
             raise ValueError(f"[joints.{name}]: this robot has {names[0]} to {names[-1]}, by [chain]")
     joints: list[Joint] = []
     for i, (name, axis) in enumerate(zip(names, axes, strict=True)):
-        own = exceptions.get(name, JointExceptions())
+        differing = exceptions.get(name, JointExceptions())
         try:
             joint = Joint(
                 name=name,
                 axis=axis,
-                id=i + 1 if own.id is None else own.id,
-                limits=_limits(limits, own),
-                motor=_with(motor, own),
-                drive=_with(drive, own),
-                heat=_with(heat, own),
-                supply=_with(supply, own),
+                id=i + 1 if differing.id is None else differing.id,
+                limits=_limits_with(limits, differing),
+                motor=_with(motor, differing),
+                drive=_with(drive, differing),
+                heat=_with(heat, differing),
+                supply=_with(supply, differing),
             )
             _check(joint)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         joints.append(joint)
-    _check_all(joints)
+    _check_response_times(joints)
+    _check_ids(joints)
     return joints
 
 
-def _limits(common: Limits, own: JointExceptions) -> Limits:
-    if own.angle_rad is not None:  # to either side, whatever those of all are
-        common = msgspec.structs.replace(common, angle_rad=own.angle_rad, angle_min_rad=None, angle_max_rad=None)
-    return _with(common, own)
+def _limits_with(common: Limits, differing: JointExceptions) -> Limits:
+    """Return the limits of one joint. Its `angle_rad` replaces all angle limits of the section for all joints."""
+    if differing.angle_rad is not None:
+        common = msgspec.structs.replace(common, angle_rad=differing.angle_rad, angle_min_rad=None, angle_max_rad=None)
+    return _with(common, differing)
 
 
-def _with(section: SectionT, own: JointExceptions) -> SectionT:
-    """A section with one joint's exceptions."""
-    said = {name: getattr(own, name, None) for name in section.__struct_fields__}
-    differs = {name: value for name, value in said.items() if value is not None}
-    return msgspec.structs.replace(section, **differs) if differs else section
+def _with(section: SectionT, differing: JointExceptions) -> SectionT:
+    """Return a section in which one joint's exceptions replace the values for all joints."""
+    replacements: dict[str, Any] = {}
+    for name in section.__struct_fields__:
+        value = getattr(differing, name, None)
+        if value is not None:
+            replacements[name] = value
+    if not replacements:
+        return section
+    return msgspec.structs.replace(section, **replacements)
 
 
 def _check(joint: Joint) -> None:
-    limits, peak_nm = joint.limits, joint.motor.peak_nm
+    """Check values of one joint that are in different sections. Raises ValueError."""
+    limits = joint.limits
+    peak_nm = joint.motor.peak_nm
     if peak_nm is not None and limits.torque_nm > peak_nm:
         raise ValueError(
             f"`torque_nm` = {limits.torque_nm:g} N·m is more than its motor's `peak_nm` = {peak_nm:g} N·m; lower it"
@@ -249,18 +300,25 @@ def _check(joint: Joint) -> None:
         )
 
 
-def _check_all(joints: Sequence[Joint]) -> None:
-    lags = [joint.motor.response_time_s > 0 for joint in joints]
-    if any(lags) and not all(lags):
+def _check_response_times(joints: Sequence[Joint]) -> None:
+    """Raise ValueError if some joints have a motor lag, and others have none."""
+    without_lag = [joint for joint in joints if joint.motor.response_time_s <= 0]
+    if without_lag and len(without_lag) < len(joints):
         raise ValueError(
-            f"{joints[lags.index(False)].name}: `response_time_s` = 0 s, and other joints have more; give all of them "
+            f"{without_lag[0].name}: `response_time_s` = 0 s, and other joints have more; give all of them "
             f"some, or none"
         )
-    at = [(joint.drive.driver, joint.drive.port, joint.id) for joint in joints]
-    for (driver_type, port, number), count in Counter(at).items():
-        if count > 1:
-            same = ", ".join(
-                joint.name for joint, one in zip(joints, at, strict=True) if one == (driver_type, port, number)
-            )
+
+
+def _check_ids(joints: Sequence[Joint]) -> None:
+    """Raise ValueError if several drives on one bus have the same id."""
+    names_by_address: dict[tuple[str, str, int], list[str]] = {}
+    for joint in joints:
+        address = (joint.drive.driver, joint.drive.port, joint.id)
+        names_by_address.setdefault(address, []).append(joint.name)
+    for (_, port, number), names in names_by_address.items():
+        if len(names) > 1:
             where = f"port {port!r}" if port else "one bus"
-            raise ValueError(f"{same}: all have the id {number} on {where}; without an `id` a joint has its number")
+            raise ValueError(
+                f"{', '.join(names)}: all have the id {number} on {where}; without an `id` a joint has its number"
+            )

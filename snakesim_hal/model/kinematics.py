@@ -1,7 +1,7 @@
 """Forward kinematics: poses of all links from base pose and joint angles. Pure; shared by both sides of the HAL.
 
 Link i's frame has its origin at the joint at its rear and x along the link; link 0's origin is the tail end, and its
-frame is the base. A yaw joint turns about z of its link, a pitch joint about y.
+frame is the base. A yaw joint rotates about z of its link, a pitch joint about y.
 """
 
 import math
@@ -16,8 +16,9 @@ from snakesim_hal.wire.quantities import Vector
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
-    """Rotation matrix (3, 3) of a unit quaternion."""
-    w, x, y, z = np.asarray(wxyz, dtype=np.float64) / np.linalg.norm(np.asarray(wxyz, dtype=np.float64))
+    """Return the rotation matrix (3, 3) of a quaternion, which is normalized first."""
+    quaternion = np.asarray(wxyz, dtype=np.float64)
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -28,36 +29,56 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
 
 
 def quaternion_from_yaw(yaw_rad: float) -> tuple[float, float, float, float]:
-    """Quaternion wxyz of a turn about the world's z."""
-    return (float(np.cos(yaw_rad / 2)), 0.0, 0.0, float(np.sin(yaw_rad / 2)))
+    """Return the quaternion wxyz of a rotation about the world's z axis."""
+    half_rad = yaw_rad / 2
+    return (float(np.cos(half_rad)), 0.0, 0.0, float(np.sin(half_rad)))
 
 
 def quaternions_from_rotations(rotations: Floats) -> Floats:
-    """Unit quaternions wxyz (n, 4) of rotation matrices (n, 3, 3)."""
+    """Return unit quaternions wxyz (n, 4) of rotation matrices (n, 3, 3).
+
+    The elements of a rotation matrix give all products 4 q_i q_j of two quaternion components. Every row of the
+    matrix of these products is a multiple of the quaternion. The row of the largest component is the most precise one,
+    so it is taken and normalized.
+    """
     r = rotations
     trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
-    squares = np.stack([trace, *(2 * r[:, i, i] - trace for i in range(3))], axis=1)  # 4 q² - 1 of w, x, y, z
+    four_squares_minus_1 = [trace, *(2 * r[:, i, i] - trace for i in range(3))]  # of w, x, y, z
+    squares = np.stack(four_squares_minus_1, axis=1)
     w, x, y, z = np.sqrt(np.maximum(1 + squares, 0)).T / 2
-    signed = np.stack([w, x, y, z], axis=1)
-    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]  # 4 w x, 4 w y, 4 w z
-    d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]  # 4 x y, 4 x z, 4 y z
-    products = [(4 * w * w, a, b, c), (a, 4 * x * x, d, e), (b, d, 4 * y * y, f), (c, e, f, 4 * z * z)]
-    by_maximum = np.stack([np.stack(row, axis=1) for row in products], axis=1)  # row i: 4 q_i q
-    found = by_maximum[np.arange(len(r)), np.argmax(signed, axis=1)]
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    magnitudes = np.stack([w, x, y, z], axis=1)  # (n, 4)
+
+    four_wx = r[:, 2, 1] - r[:, 1, 2]
+    four_wy = r[:, 0, 2] - r[:, 2, 0]
+    four_wz = r[:, 1, 0] - r[:, 0, 1]
+    four_xy = r[:, 1, 0] + r[:, 0, 1]
+    four_xz = r[:, 0, 2] + r[:, 2, 0]
+    four_yz = r[:, 2, 1] + r[:, 1, 2]
+    product_rows = [
+        (4 * w * w, four_wx, four_wy, four_wz),
+        (four_wx, 4 * x * x, four_xy, four_xz),
+        (four_wy, four_xy, 4 * y * y, four_yz),
+        (four_wz, four_xz, four_yz, 4 * z * z),
+    ]
+    products = np.stack([np.stack(row, axis=1) for row in product_rows], axis=1)  # (n, 4, 4)
+
+    largest = np.argmax(magnitudes, axis=1)
+    multiples = products[np.arange(len(r)), largest]
+    return multiples / np.linalg.norm(multiples, axis=1, keepdims=True)
 
 
 def yaw_of(rotation: Floats) -> float:
-    """Heading of a frame's x axis on the ground."""
+    """Return the heading of a frame's x axis on the ground, in rad."""
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
 def joint_rotation(axis: str, angle_rad: float) -> Floats:
-    """Rotation (3, 3) of one joint about its own axis."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    """Return the rotation (3, 3) of one joint about its own axis."""
+    cosine = np.cos(angle_rad)
+    sine = np.sin(angle_rad)
     if axis == "yaw":
-        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
 
 def link_frames(
@@ -67,12 +88,23 @@ def link_frames(
     axes: Sequence[str],
     link_lengths_m: Sequence[float],
 ) -> tuple[Floats, Floats]:
-    """Origins (n_links, 3) and rotations world_from_link (n_links, 3, 3), tail to head."""
-    count = len(axes) + 1
+    """Return the frames of all links in the world, tail to head.
+
+    Args:
+        base_position_w: (3,) the tail end, m.
+        base_rotation: (3, 3) world_from_base.
+        angles_rad: (n_joints,) joint angles, tail to head.
+        axes: axis of every joint, tail to head.
+        link_lengths_m: n_joints + 1 lengths, tail to head.
+
+    Returns:
+        Origins (n_links, 3) in m, and rotations world_from_link (n_links, 3, 3).
+    """
     if "pitch" not in axes:
         return _yaw_only_frames(np.asarray(base_position_w), base_rotation, np.asarray(angles_rad), link_lengths_m)
-    origins = np.empty((count, 3))
-    rotations = np.empty((count, 3, 3))
+    link_count = len(axes) + 1
+    origins = np.empty((link_count, 3))
+    rotations = np.empty((link_count, 3, 3))
     origins[0] = base_position_w
     rotations[0] = base_rotation
     for i, axis in enumerate(axes):
@@ -82,32 +114,51 @@ def link_frames(
 
 
 def nodes_w(robot: Description, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats) -> Floats:
-    """Tail end, joints and head end in the world, (joints + 2, 3), of one pose."""
+    """Return tail end, joints and head end of one pose in the world, (joints + 2, 3).
+
+    Args:
+        robot: gives the lengths of the links and the axes of the joints.
+        position_w: (3,) the tail end, m.
+        wxyz: orientation of the base.
+        angles_rad: (n_joints,) joint angles, tail to head.
+    """
     lengths_m = [link.length_m for link in robot.links]
     axes = [joint.axis for joint in robot.joints]
     origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), angles_rad, axes, lengths_m)
-    return np.vstack([origins, origins[-1] + lengths_m[-1] * rotations[-1][:, 0]])
+    head_end_w = origins[-1] + lengths_m[-1] * rotations[-1][:, 0]
+    return np.vstack([origins, head_end_w])
 
 
 def _yaw_only_frames(
     base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
 ) -> tuple[Floats, Floats]:
-    """All joints turn about the same axis, so angles add up; the loop over links becomes a sum."""
-    turn = np.concatenate(([0.0], np.cumsum(angles_rad)))
-    c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    x, y, z = base_rotation.T
-    forward = c * x + s * y
-    rotations = np.stack([forward, c * y - s * x, np.broadcast_to(z, forward.shape)], axis=2)
+    """Compute the frames without a loop: all joints rotate about the same axis, so their angles add up."""
+    yaw_rad = np.concatenate(([0.0], np.cumsum(angles_rad)))  # of each link, relative to the base
+    cosine = np.cos(yaw_rad)[:, None]
+    sine = np.sin(yaw_rad)[:, None]
+    base_x, base_y, base_z = base_rotation.T
+    forward = cosine * base_x + sine * base_y
+    left = cosine * base_y - sine * base_x
+    up = np.broadcast_to(base_z, forward.shape)
+    rotations = np.stack([forward, left, up], axis=2)
+
+    link_vectors = forward[:-1] * np.asarray(link_lengths_m)[:-1, None]
     origins = np.empty_like(forward)
     origins[0] = base_w
-    origins[1:] = base_w + np.cumsum(forward[:-1] * np.asarray(link_lengths_m)[:-1, None], axis=0)
+    origins[1:] = base_w + np.cumsum(link_vectors, axis=0)
     return origins, rotations
 
 
 def tangents(normal: Vector) -> tuple[Vector, Vector]:
-    """Two unit tangents of a contact: the one closest to the link's x axis, and the cross product of normal and it."""
+    """Return two unit tangents of a contact, in the link's frame.
+
+    The first is the tangent that is closest to the link's x axis, and the second is the cross product of the normal
+    and the first. If the normal is along x, the y axis is the first.
+    """
     x, y, z = normal
     across = math.sqrt(max(1.0 - x * x, 0.0))
     if across < 1e-6:
         return (0.0, 1.0, 0.0), (0.0, 0.0, math.copysign(1.0, x))
-    return (across, -x * y / across, -x * z / across), (0.0, z / across, -y / across)
+    along_link = (across, -x * y / across, -x * z / across)
+    around_link = (0.0, z / across, -y / across)
+    return along_link, around_link

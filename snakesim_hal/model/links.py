@@ -9,61 +9,89 @@ from snakesim_hal.wire.quantities import above, bounded
 
 Offset = Annotated[float, bounded(-10, 10, "m")]
 Moment = Annotated[float, bounded(-100, 100, "kg·m²")]
+ROUNDING_TOLERANCE = 1e-6  # relative; a thin plate has moments of which one is exactly the sum of the other two
 Inertia = tuple[Moment, Moment, Moment, Moment, Moment, Moment]
 
 
 class Link(FileStruct, frozen=True, kw_only=True):
-    """A rigid link: from the joint at its rear to the next one, along x; of the tail and the head, to their ends.
+    """A rigid link. It extends along x from the joint at its rear to the next joint; tail and head, to their ends.
 
     Its outline is a capsule of that length and of the modules' radius.
     """
 
     length_m: Annotated[float, above(2, "m")]
     mass_kg: Annotated[float, above(100, "kg")]
-    center_m: tuple[Offset, Offset, Offset] | None = None  # center of mass, in the link's frame; none: the middle
-    inertia_kg_m2: Inertia | None = None  # ixx, iyy, izz, ixy, ixz, iyz about it; none: a solid capsule's
+
+    # Center of mass in the link's frame; none: the middle of the link.
+    center_m: tuple[Offset, Offset, Offset] | None = None
+
+    # ixx, iyy, izz, ixy, ixz, iyz about the center of mass; none: the inertia of a solid capsule.
+    inertia_kg_m2: Inertia | None = None
 
     def __post_init__(self) -> None:
-        """An inertia must be that of a body. Raises ValueError, which the file reader explains."""
+        """Check that a rigid body can have this inertia. Raises ValueError, which the file reader explains."""
         if self.inertia_kg_m2 is None:
             return
-        least, middle, most = principal_moments(self.inertia_kg_m2)
-        if least <= 0 or least + middle < most * (1 - 1e-6):
+        smallest, middle, largest = principal_moments(self.inertia_kg_m2)
+        if smallest <= 0 or smallest + middle < largest * (1 - ROUNDING_TOLERANCE):
             raise ValueError(
-                f"`inertia_kg_m2` has the principal moments {least:.3g}, {middle:.3g} and {most:.3g} kg·m², and no "
-                f"body does: each must be above 0, and at most the sum of the other two"
+                f"`inertia_kg_m2` has the principal moments {smallest:.3g}, {middle:.3g} and {largest:.3g} kg·m², and "
+                f"no body does: each must be above 0, and at most the sum of the other two"
             )
 
     @property
     def has_inertia(self) -> bool:
-        """Whether mass is distributed otherwise than in the capsule."""
+        """Return whether the file gives a mass distribution that differs from that of a solid capsule."""
         return self.center_m is not None or self.inertia_kg_m2 is not None
 
     @property
     def center(self) -> tuple[float, float, float]:
-        """Centre of mass, in the link's frame, in m."""
-        return (self.length_m / 2, 0.0, 0.0) if self.center_m is None else self.center_m
+        """Return the center of mass in the link's frame, in m."""
+        if self.center_m is None:
+            return (self.length_m / 2, 0.0, 0.0)
+        return self.center_m
 
     def inertia(self, radius_m: float) -> tuple[float, ...]:
-        """About the center of mass, along the link's axes: ixx, iyy, izz, ixy, ixz, iyz in kg·m². radius_m: of it."""
+        """Return ixx, iyy, izz, ixy, ixz, iyz about the center of mass, along the link's axes, in kg·m².
+
+        Args:
+            radius_m: radius of the link, for the inertia of a capsule.
+        """
         if self.inertia_kg_m2 is not None:
             return self.inertia_kg_m2
         return capsule_inertia(self.length_m, radius_m, self.mass_kg)
 
 
 def principal_moments(inertia: tuple[float, ...]) -> tuple[float, float, float]:
-    """Of ixx, iyy, izz, ixy, ixz, iyz, in ascending order, in kg·m²."""
+    """Return the principal moments of ixx, iyy, izz, ixy, ixz, iyz, in ascending order, in kg·m²."""
     xx, yy, zz, xy, xz, yz = inertia
-    least, middle, most = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])).tolist()
-    return least, middle, most
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    smallest, middle, largest = np.linalg.eigvalsh(matrix).tolist()
+    return smallest, middle, largest
 
 
 def capsule_inertia(length_m: float, radius_m: float, mass_kg: float) -> tuple[float, ...]:
-    """Of a solid capsule along x, `length_m` without its caps: ixx, iyy, izz, ixy, ixz, iyz in kg·m²."""
-    tube, ball = length_m, 4 * radius_m / 3  # in volumes of a cross-section
-    tube_kg, ball_kg = mass_kg * tube / (tube + ball), mass_kg * ball / (tube + ball)
-    about = (tube_kg / 2 + ball_kg * 2 / 5) * radius_m**2
-    # A hemisphere's center is 3/8 of the radius from its flat side.
+    """Return the inertia of a solid capsule along x about its center: ixx, iyy, izz, ixy, ixz, iyz in kg·m².
+
+    A capsule is a tube (a solid cylinder) with a hemisphere at each end; both have the same density. With the radius r,
+    the tube's length l and mass m_t, and the mass m_b of both hemispheres:
+
+        ixx = (m_t / 2 + 2/5 m_b) r²
+        iyy = izz = m_t (r² / 4 + l² / 12) + m_b (2/5 r² + l² / 4 + 3/8 l r)
+
+    The center of a hemisphere is 3/8 of the radius from its flat side.
+
+    Args:
+        length_m: without the caps.
+        radius_m: of tube and caps.
+        mass_kg: of the whole capsule.
+    """
+    # Volumes, divided by the area of the cross-section.
+    tube = length_m
+    ball = 4 * radius_m / 3
+    tube_kg = mass_kg * tube / (tube + ball)
+    ball_kg = mass_kg * ball / (tube + ball)
+    along = (tube_kg / 2 + ball_kg * 2 / 5) * radius_m**2
     across = tube_kg * (radius_m**2 / 4 + length_m**2 / 12)
     across += ball_kg * (2 * radius_m**2 / 5 + length_m**2 / 4 + 3 * length_m * radius_m / 8)
-    return about, across, across, 0.0, 0.0, 0.0
+    return along, across, across, 0.0, 0.0, 0.0

@@ -1,7 +1,7 @@
-"""Obstacles and links as seen from above: their outlines, and distances to them. Pure geometry.
+"""Outlines of obstacles and links as seen from above, and distances to them. Pure geometry.
 
-Every outline is a rounded box: points within `rounding_m` of a rectangle. A cylinder's rectangle is its center. Spheres
-count with their radius.
+Every outline is a rounded box: all points within `rounding_m` of a rectangle. The rectangle of a cylinder or a sphere
+is a single point, its center, and its rounding is its radius.
 """
 
 import math
@@ -17,9 +17,13 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
-SHARES = (np.arange(5) + 0.5) / 5  # of a link: where it is held against obstacles
+# Positions along a link, as fractions of its length, at which its distance to obstacles is computed.
+SHARES = (np.arange(5) + 0.5) / 5
+
+# Corners and edge middles of a rectangle, in units of its half length and half width.
 CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
 
+MIN_SEGMENT_M = 1e-12  # avoids a division by zero for a segment whose ends coincide
 
 Coordinate = Annotated[float, bounded(-1000, 1000, "m")]
 Size = Annotated[float, above(1000, "m")]
@@ -31,111 +35,170 @@ Point = tuple[Coordinate, Coordinate]
 
 @dataclass(frozen=True)
 class Outlines:
-    """The outlines of many obstacles, for distances by the batch."""
+    """The outlines of m obstacles as arrays, so that distances to all of them are computed at once."""
 
-    center_w: Floats  # (m, 2)
+    center_w: Floats  # (m, 2), m
     turn: Floats  # (m, 2): cosine and sine of the rectangle's yaw
-    half_m: Floats  # (m, 2): half its length and width
+    half_m: Floats  # (m, 2): half of the rectangle's length and width
     rounding_m: Floats  # (m,)
 
     @classmethod
     def of(cls, obstacles: Sequence[Obstacle]) -> Self:
-        """Of obstacles, in their order."""
-        boxes = np.array([o.shape == "box" for o in obstacles], dtype=bool)
-        yaw = np.array([o.yaw_rad for o in obstacles], dtype=np.float64)
-        half = np.array([o.half_size_m[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2)
+        """Return the outlines of obstacles, in their order."""
+        is_box = np.array([obstacle.shape == "box" for obstacle in obstacles], dtype=bool)
+        center_w = np.array([obstacle.position_w[:2] for obstacle in obstacles], dtype=np.float64)
+        yaw_rad = np.array([obstacle.yaw_rad for obstacle in obstacles], dtype=np.float64)
+        half_m = np.array([obstacle.half_size_m[:2] for obstacle in obstacles], dtype=np.float64)
+        radius_m = [obstacle.radius_m for obstacle in obstacles]
         return cls(
-            center_w=np.array([o.position_w[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2),
-            turn=np.column_stack([np.cos(yaw), np.sin(yaw)]),
-            half_m=np.where(boxes[:, None], half, 0.0),
-            rounding_m=np.where(boxes, 0.0, [o.radius_m for o in obstacles]),
+            center_w=center_w.reshape(-1, 2),
+            turn=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
+            half_m=np.where(is_box[:, None], half_m.reshape(-1, 2), 0.0),
+            rounding_m=np.where(is_box, 0.0, radius_m),
         )
 
     @classmethod
     def of_segments(cls, from_w: Floats, to_w: Floats, rounding_m: float = 0.0) -> Self:
-        """Of straight segments (m, 2) to (m, 2), as thick as twice the rounding."""
+        """Return the outlines of straight segments.
+
+        Args:
+            from_w: (m, 2) first ends, m.
+            to_w: (m, 2) second ends, m.
+            rounding_m: half of the thickness of every segment.
+        """
         run = to_w - from_w
         length = np.hypot(*run.T)
-        ahead = np.where(length[:, None] > 0, run / np.maximum(length, 1e-12)[:, None], [1.0, 0.0])
-        half = np.column_stack([0.5 * length, np.zeros_like(length)])
-        return cls(0.5 * (from_w + to_w), ahead, half, np.full(len(run), rounding_m))
+        direction = run / np.maximum(length, MIN_SEGMENT_M)[:, None]
+        half_m = np.column_stack([0.5 * length, np.zeros_like(length)])
+        return cls(
+            center_w=0.5 * (from_w + to_w),
+            turn=np.where(length[:, None] > 0, direction, [1.0, 0.0]),
+            half_m=half_m,
+            rounding_m=np.full(len(run), rounding_m),
+        )
 
     def __len__(self) -> int:
         return len(self.center_w)
 
     @property
     def reach_m(self) -> Floats:
-        """(m,): the farthest that an outline gets from its center."""
+        """Return the distance from each center to the farthest point of its outline, (m,)."""
         return np.hypot(*self.half_m.T) + self.rounding_m
 
     @property
     def rims_w(self) -> Floats:
-        """(m, 8, 2): corners and middles of the edges of the rectangles."""
+        """Return the corners and edge middles of the rectangles in the world, (m, 8, 2)."""
         local = CORNERS * self.half_m[:, None, :]
-        c, s = self.turn[:, None, 0], self.turn[:, None, 1]
-        x, y = local[..., 0], local[..., 1]
-        return self.center_w[:, None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+        x = local[..., 0]
+        y = local[..., 1]
+        cosine = self.turn[:, None, 0]
+        sine = self.turn[:, None, 1]
+        rotated = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+        return self.center_w[:, None, :] + rotated
 
     def distance_m(self, points_w: Floats) -> Floats:
-        """Distances from points (..., 2) to every outline, (..., m); negative inside."""
-        x, y = self._local(points_w)
-        over_x, over_y = np.abs(x) - self.half_m[:, 0], np.abs(y) - self.half_m[:, 1]
+        """Return the distances from points (..., 2) to every outline, (..., m); negative inside.
+
+        With q = |p| - h, where p is the point in the rectangle's frame and h its half size, the distance is
+        |max(q, 0)| + min(max(q_x, q_y), 0) - rounding.
+        """
+        local_x, local_y = self._in_local_frames(points_w)
+        over_x = np.abs(local_x) - self.half_m[:, 0]
+        over_y = np.abs(local_y) - self.half_m[:, 1]
         outside = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
         return outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m
 
     def towards(self, points_w: Floats, which: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """Distances (...) of points (..., 2) from the outline `which` (...) of each, and normals (..., 2) out of it."""
-        c, s = self.turn[which, 0], self.turn[which, 1]
-        dx, dy = points_w[..., 0] - self.center_w[which, 0], points_w[..., 1] - self.center_w[which, 1]
-        local_x, local_y = c * dx + s * dy, c * dy - s * dx
-        over_x, over_y = np.abs(local_x) - self.half_m[which, 0], np.abs(local_y) - self.half_m[which, 1]
-        out_x, out_y = np.maximum(over_x, 0.0), np.maximum(over_y, 0.0)
+        """Return the distance of each point from one outline, and the outward normal there.
+
+        The normal points away from the nearest point of the rectangle; inside of the rectangle, out of its nearest
+        edge.
+
+        Args:
+            points_w: (..., 2) points in the world, m.
+            which: (...) index of the outline for each point.
+
+        Returns:
+            Distances (...) in m, negative inside, and unit normals (..., 2) in the world.
+        """
+        cosine = self.turn[which, 0]
+        sine = self.turn[which, 1]
+        dx = points_w[..., 0] - self.center_w[which, 0]
+        dy = points_w[..., 1] - self.center_w[which, 1]
+        local_x = cosine * dx + sine * dy
+        local_y = cosine * dy - sine * dx
+
+        over_x = np.abs(local_x) - self.half_m[which, 0]
+        over_y = np.abs(local_y) - self.half_m[which, 1]
+        out_x = np.maximum(over_x, 0.0)
+        out_y = np.maximum(over_y, 0.0)
         outside = np.hypot(out_x, out_y)
         distance = outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m[which]
-        free = outside > 0
-        length = np.where(free, outside, 1.0)
-        nx = np.where(free, out_x / length, over_x >= over_y) * np.where(local_x < 0, -1.0, 1.0)
-        ny = np.where(free, out_y / length, over_x < over_y) * np.where(local_y < 0, -1.0, 1.0)
-        return distance, np.stack([c * nx - s * ny, s * nx + c * ny], axis=-1)
 
-    def _local(self, points_w: Floats) -> tuple[Floats, Floats]:
+        is_outside = outside > 0
+        length = np.where(is_outside, outside, 1.0)
+        sign_x = np.where(local_x < 0, -1.0, 1.0)
+        sign_y = np.where(local_y < 0, -1.0, 1.0)
+        normal_x = np.where(is_outside, out_x / length, over_x >= over_y) * sign_x
+        normal_y = np.where(is_outside, out_y / length, over_x < over_y) * sign_y
+        normal_w = np.stack([cosine * normal_x - sine * normal_y, sine * normal_x + cosine * normal_y], axis=-1)
+        return distance, normal_w
+
+    def _in_local_frames(self, points_w: Floats) -> tuple[Floats, Floats]:
+        """Return x and y of points (..., 2) in the frame of every rectangle, each (..., m)."""
         offset_x = points_w[..., None, 0] - self.center_w[:, 0]
         offset_y = points_w[..., None, 1] - self.center_w[:, 1]
-        c, s = self.turn[:, 0], self.turn[:, 1]
-        return c * offset_x + s * offset_y, c * offset_y - s * offset_x
+        cosine = self.turn[:, 0]
+        sine = self.turn[:, 1]
+        local_x = cosine * offset_x + sine * offset_y
+        local_y = cosine * offset_y - sine * offset_x
+        return local_x, local_y
 
 
-def gaps_m(one: Outlines, others: Outlines) -> Floats:
-    """Gaps (m,) between one outline and each of the others; exact while they do not overlap."""
-    from_one = others.distance_m(one.rims_w[0]).min(axis=0) - one.rounding_m[0]
-    from_others = one.distance_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
-    return np.minimum(from_one, from_others)
+def gaps_m(single: Outlines, others: Outlines) -> Floats:
+    """Return the gaps (m,) between a single outline and each of the others; exact while they do not overlap."""
+    from_single = others.distance_m(single.rims_w[0]).min(axis=0) - single.rounding_m[0]
+    from_others = single.distance_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
+    return np.minimum(from_single, from_others)
 
 
 def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Where a chain with nodes (n, 2) is nearest to each outline: which of `SHARES` of all links, point, distance."""
-    rear, run = nodes_w[:-1, None], np.diff(nodes_w, axis=0)[:, None]
+    """Return the point of a chain that is nearest to each outline, among the positions `SHARES` along every link.
+
+    Args:
+        nodes_w: (n, 2) tail end, joints and head end, m.
+        outlines: m outlines.
+
+    Returns:
+        Index of the point among all `SHARES` of all links (m,), the point itself (m, 2), and its distance (m,).
+    """
+    rear = nodes_w[:-1, None]
+    run = np.diff(nodes_w, axis=0)[:, None]
     points = (rear + SHARES[:, None] * run).reshape(-1, 2)
     distances = outlines.distance_m(points)
-    best = distances.argmin(axis=0)
-    return best, points[best], distances[best, np.arange(len(outlines))]
+    nearest = distances.argmin(axis=0)
+    return nearest, points[nearest], distances[nearest, np.arange(len(outlines))]
 
 
 class Capsule(FileStruct, frozen=True, kw_only=True):
     """Outline of a link on the ground, from above."""
 
     name: str
-    rear_m: tuple[float, float]
-    front_m: tuple[float, float]
+    rear_m: tuple[float, float]  # center of the rear cap
+    front_m: tuple[float, float]  # center of the front cap
     radius_m: float
 
 
 def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
-    """Distance from a point on the ground to an obstacle's outline from above; negative inside."""
+    """Return the distance from a point on the ground to an obstacle's outline from above; negative inside."""
     offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
     if obstacle.shape != "box":
         return float(np.hypot(*offset)) - obstacle.radius_m
-    c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
-    local = np.abs([c * offset[0] + s * offset[1], c * offset[1] - s * offset[0]])
-    beyond = local - np.array(obstacle.half_size_m[:2])
-    return float(np.hypot(*np.maximum(beyond, 0.0)) + min(float(beyond.max()), 0.0))
+    cosine = math.cos(obstacle.yaw_rad)
+    sine = math.sin(obstacle.yaw_rad)
+    local_x = cosine * offset[0] + sine * offset[1]
+    local_y = cosine * offset[1] - sine * offset[0]
+    beyond = np.abs([local_x, local_y]) - np.array(obstacle.half_size_m[:2])
+    outside = np.hypot(*np.maximum(beyond, 0.0))
+    inside = min(float(beyond.max()), 0.0)
+    return float(outside + inside)

@@ -1,7 +1,7 @@
-"""Find backends, controllers and services by name: an entry point of an installed package, or a file.
+"""Find backends, controllers and services by name: an entry point of an installed package, or a class in a file.
 
-`wave` is looked up among the entry points; `./wave.py:Wave` is the object `Wave` of that file, for development.
-A program that runs everything in one process may offer objects of its own.
+`wave` is looked up among the entry points. `./wave.py:Wave` is the object `Wave` of that file, for development. A
+program that runs everything in one process may also offer its own objects by name.
 """
 
 import ast
@@ -21,6 +21,7 @@ from snakesim_hal.model.files import Table, decode, expanded
 from snakesim_hal.model.sibling_modules import find_siblings_of
 from snakesim_hal.model.textfiles import read_bytes
 
+# Groups of entry points.
 BACKENDS = "snakesim.backends"
 COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
@@ -33,7 +34,15 @@ _offered: dict[tuple[str, str], Any] = {}
 
 @contextlib.contextmanager
 def offered(group: str, name: str, plugin: Any) -> Iterator[None]:
-    """Have a name stand for an object, in this process and as long as the context lives, whatever is installed."""
+    """Let a name stand for an object, even if a plugin of that name is installed.
+
+    This holds in this process, and as long as the context is open.
+
+    Args:
+        group: one of the groups of entry points.
+        name: of the plugin.
+        plugin: the object that `find_plugin` returns for the name.
+    """
     before = _offered.copy()
     _offered[group, name] = plugin
     try:
@@ -44,90 +53,118 @@ def offered(group: str, name: str, plugin: Any) -> Iterator[None]:
 
 
 def anything_offered() -> bool:
-    """Whether this process has a plugin that no other one could find."""
+    """Return whether this process has a plugin that no other process could find."""
     return bool(_offered)
 
 
 def installed(group: str) -> list[str]:
-    """Names of all installed plugins of a group."""
+    """Return the names of all installed plugins of a group."""
     return sorted({entry.name for entry in _installed(*sys.path).select(group=group)})
 
 
 @cache
 def _installed(*_path: str) -> EntryPoints:
-    """Every entry point on a path: reading them anew takes 7 ms, and a run looks up a dozen."""
-    found: Any = entry_points()  # before Python 3.12 of another class, which has the same `select`
-    return found
+    """Return every entry point on a path. Reading them takes 7 ms, and a run looks up a dozen, so they are cached."""
+    all_entries: Any = entry_points()  # before Python 3.12 of another class, which has the same `select`
+    return all_entries
 
 
 def find_plugin(group: str, name: str) -> Any:
-    """Load the plugin of a name. Raises ConfigError that lists the installed ones."""
+    """Return the plugin of a name. A file is loaded, which runs its code.
+
+    Args:
+        group: one of the groups of entry points.
+        name: of an entry point, or `./file.py:Class`.
+
+    Raises:
+        ConfigError: There is no such plugin, or it cannot be loaded. The error lists the installed plugins.
+    """
     kind = _kind(group)
     if (group, name) in _offered:
         return _offered[group, name]
     if in_file(name):
         return _from_file(name, kind)
-    found = list(_installed(*sys.path).select(group=group, name=name))
-    if not found:
+    entry = _find_entry(group, name, kind)
+    try:
+        return entry.load()
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_install_hint(entry)}") from error
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}") from error
+
+
+def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
+    """Return the only entry point of a name. Raises ConfigError if there is none, or if packages disagree."""
+    entries = list(_installed(*sys.path).select(group=group, name=name))
+    if not entries:
         raise ConfigError(
             f"no {kind} called {short(name)!r} is installed; {did_you_mean(name, installed(group))}installed are "
             f"{', '.join(installed(group)) or 'none'}. "
             f"A package adds one by an entry point in the group {group!r}"
         )
-    entry = found[0]
-    if len({one.value for one in found}) > 1:
-        packages = " and ".join(f"{_package(one)} ({one.value})" for one in found)
+    different_objects = {entry.value for entry in entries}
+    if len(different_objects) > 1:
+        packages = " and ".join(f"{_package(entry)} ({entry.value})" for entry in entries)
         raise ConfigError(
             f"{kind} {name!r} is in several installed packages: {packages}; uninstall all but one, or name a file "
             f"and a class in it, ./file.py:Class"
         )
-    try:
-        return entry.load()
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_extras_of(entry)}") from error
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}") from error
+    return entries[0]
 
 
 def _package(entry: EntryPoint) -> str:
     return entry.dist.name if entry.dist is not None else "an unknown package"
 
 
-def _extras_of(entry: EntryPoint) -> str:
-    """How to install what a plugin needs, if its entry point names its extras: `module:Class [extra]`."""
+def _install_hint(entry: EntryPoint) -> str:
+    """Return how to install what a plugin needs, if its entry point names its extras: `module:Class [extra]`."""
     if entry.dist is None or not entry.extras:
         return ""
     return f" Install it with: {pip_install(*entry.extras, package=entry.dist.name)}"
 
 
 def pip_install(*extras: str, package: str = "snakesim") -> str:
-    """The command that adds extras to this very environment."""
+    """Return the command that installs extras of a package in the environment of this process."""
     return f"{sys.executable} -m pip install '{package}[{','.join(extras)}]'"
 
 
 def in_file(name: str) -> bool:
-    """Whether a name is the path of a Python file, with or without a class; loading it runs its code."""
+    """Return whether a name is the path of a Python file, with or without a class; loading it runs its code."""
     return ".py:" in name or name.endswith(".py")
 
 
 def find_installed(group: str, name: str) -> Any | None:
-    """Like `find_plugin`; but for a file it only checks that the class exists, without running it, and returns None."""
+    """Return an installed plugin; for a file only check that the class exists, without running it, and return None.
+
+    Raises:
+        ConfigError: There is no such plugin, or it cannot be loaded.
+    """
     if not in_file(name):
         return find_plugin(group, name)
     kind = _kind(group)
-    _, attribute, tree = _parsed(name, kind)
-    if not {attribute, "*"} & set(_names(tree)):
-        raise _not_there(name, kind, tree)
+    _, attribute, tree = _parse_file(name, kind)
+    defined = set(_names(tree))
+    if attribute not in defined and "*" not in defined:  # `from x import *` may define any name
+        raise _missing_class_error(name, kind, tree)
     return None
 
 
 def _kind(group: str) -> str:
+    """Return what a plugin of a group is called in messages, such as `controller`."""
     return group.rpartition(".")[2].removesuffix("s")
 
 
-def _parsed(name: str, kind: str) -> tuple[Path, str, ast.Module]:
-    """The file, the name in it, and its parsed code, which is not run."""
-    path_text, _, attribute = (name if ".py:" in name else f"{name}:").rpartition(":")
+def _split_name(name: str) -> tuple[str, str]:
+    """Return file and class of `./file.py:Class`; the class is empty if the name has none."""
+    if ".py:" not in name:
+        return name, ""
+    path, _, attribute = name.rpartition(":")
+    return path, attribute
+
+
+def _parse_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
+    """Return the file, the class name, and the parsed code, which is not run. Raises ConfigError."""
+    path_text, attribute = _split_name(name)
     try:
         path = expanded(path_text).absolute()
         tree = ast.parse(read_bytes(path), str(path))
@@ -135,21 +172,26 @@ def _parsed(name: str, kind: str) -> tuple[Path, str, ast.Module]:
         why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         raise ConfigError(f"{kind} {short(name)!r} cannot be loaded: {why}") from None
     if not attribute:
-        raise _not_there(name, kind, tree)
+        raise _missing_class_error(name, kind, tree)
     return path, attribute, tree
 
 
-def _not_there(name: str, kind: str, tree: ast.Module) -> ConfigError:
-    path, _, attribute = (name if ".py:" in name else f"{name}:").rpartition(":")
-    classes = [part.name for part in tree.body if isinstance(part, ast.ClassDef)]
-    what = f"the file has no {attribute!r}" if attribute else "the name of a class must follow"
-    has = f"the classes in it are {', '.join(classes)}" if classes else "there is no class in it"
-    example = f"{path}:{classes[0] if classes else 'Class'}"
-    return ConfigError(f"{kind} {short(name)!r}: {what}, as in {short(example)}; {short(has, 400)}")
+def _missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
+    """Return the error for a file without the class that a name asks for; it lists the classes in the file."""
+    path, attribute = _split_name(name)
+    classes = [statement.name for statement in tree.body if isinstance(statement, ast.ClassDef)]
+    problem = f"the file has no {attribute!r}" if attribute else "the name of a class must follow"
+    if classes:
+        example = f"{path}:{classes[0]}"
+        available = f"the classes in it are {', '.join(classes)}"
+    else:
+        example = f"{path}:Class"
+        available = "there is no class in it"
+    return ConfigError(f"{kind} {short(name)!r}: {problem}, as in {short(example)}; {short(available, 400)}")
 
 
 def _names(tree: ast.Module) -> Iterator[str]:
-    """All names that the file may define."""
+    """Yield all names that a file may define."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             yield node.name
@@ -160,7 +202,8 @@ def _names(tree: ast.Module) -> Iterator[str]:
 
 
 def _from_file(name: str, kind: str) -> Any:
-    path, attribute, tree = _parsed(name, kind)
+    """Run a Python file, and return the object that a name asks for. Raises ConfigError."""
+    path, attribute, tree = _parse_file(name, kind)
     spec = importlib.util.spec_from_file_location(f"snakesim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python")
@@ -172,16 +215,24 @@ def _from_file(name: str, kind: str) -> Any:
     except (Exception, SystemExit) as error:
         raise ConfigError(f"{kind} {short(name)!r} cannot be loaded: {type(error).__name__}: {error}") from error
     if not hasattr(module, attribute):
-        raise _not_there(name, kind, tree)
+        raise _missing_class_error(name, kind, tree)
     return getattr(module, attribute)
 
 
 def plugin_settings(
     plugin: Any, section: dict[str, Any], source: str, where: str, origin: dict[str, str] | None = None
 ) -> Any:
-    """A plugin's section of the configuration, checked by its own `Settings`.
+    """Return a plugin's section of the configuration, checked by the plugin's own `Settings`.
 
-    source, origin: the file, and the known origin of each of its dotted keys.
+    Args:
+        plugin: a class with a Struct `Settings`.
+        section: the values as read.
+        source: file that contains them, for errors.
+        where: dotted key of the section, for errors.
+        origin: file or flag of each dotted key, as far as known.
+
+    Raises:
+        ConfigError: The plugin has no `Settings`, or a value is not allowed.
     """
     settings = getattr(plugin, "Settings", None)
     if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):

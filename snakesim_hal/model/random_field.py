@@ -11,41 +11,59 @@ from numpy.random import Generator
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.solids import MOST_LEAN_RAD, Solid, Upright, block, made_of, peg
+from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, block, made_of, peg
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
-TRIES = 200  # for each obstacle that is wanted
-LEANING = 1  # seeds the draw of it, which leaves the places as they are
+TRIES = 200  # random positions for each obstacle that is wanted
+LEANING = 1  # third part of the seed of the leans, so that they do not change the positions
 
 
 class RandomField(Solid, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
-    min_corner_m: Point  # corners of the area in which their centers are
+
+    # Corners of the rectangle that contains the centers of all obstacles.
+    min_corner_m: Point
     max_corner_m: Point
     density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
-    radius_m: tuple[Size, Size]  # of a peg, smallest and largest
-    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of all obstacles, on average; the others are pegs
-    box_size_m: tuple[Size, Size] = (0.06, 0.18)  # length and width of a block, smallest and largest
-    clearance_m: Clearance  # least gap between the surfaces of any two
-    route_clearance_m: Clearance | None = None  # least gap between the route and a surface
+
+    # Sizes: minimum and maximum.
+    radius_m: tuple[Size, Size]  # of a peg
+    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0  # mean fraction of blocks; the other obstacles are pegs
+    box_size_m: tuple[Size, Size] = (0.06, 0.18)  # length and width of a block
+
+    clearance_m: Clearance  # minimum gap between the surfaces of two obstacles
+    route_clearance_m: Clearance | None = None  # minimum gap between the route and a surface; none: no such gap
     height_m: Size = 0.2
-    # Each leans by up to so much, in a direction of its own.
-    lean_up_to_rad: Annotated[float, Meta(ge=0, le=MOST_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
+
+    # Each obstacle leans by a random angle of at most this, in a random direction.
+    lean_up_to_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
 
     @property
     def wanted(self) -> int:
-        """Number of obstacles."""
-        return round(self.density_per_m2 * math.prod(np.subtract(self.max_corner_m, self.min_corner_m).tolist()))
+        """Return the number of obstacles that the density asks for on this area."""
+        min_x, min_y = self.min_corner_m
+        max_x, max_y = self.max_corner_m
+        area_m2 = (max_x - min_x) * (max_y - min_y)
+        return round(self.density_per_m2 * area_m2)
 
 
 def solids_of(field: RandomField, index: int, count: int) -> list[Upright]:
-    """What the obstacles of a field are made of, and how each leans. index: of the field in the scene."""
+    """Return the material and the random lean of every obstacle of a field.
+
+    Args:
+        field: the random field.
+        index: its number in the scene, which is part of the seed.
+        count: number of its obstacles.
+    """
     random = np.random.default_rng([field.seed, index, LEANING])
-    drawn = random.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
-    return [Upright(**made_of(field), lean_rad=lean, lean_towards_rad=towards) for lean, towards in drawn.tolist()]
+    leans = random.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
+    material = made_of(field)
+    return [
+        Upright(**material, lean_rad=lean_rad, lean_towards_rad=towards_rad) for lean_rad, towards_rad in leans.tolist()
+    ]
 
 
 def random_obstacles(
@@ -56,27 +74,34 @@ def random_obstacles(
     standing: Sequence[Obstacle],
     keep_clear: Sequence[Capsule],
 ) -> list[Obstacle]:
-    """The obstacles of a field. where: the field, for errors; index: its number in the scene, which also seeds it.
+    """Place the obstacles of a random field by rejection sampling.
 
-    standing: obstacles that are there already; keep_clear: the snake at its start.
+    Args:
+        field: the random field.
+        where: names the field in errors.
+        index: number of the field in the scene, which is part of the seed.
+        route: route of the scene.
+        standing: obstacles that are placed already.
+        keep_clear: outlines of the snake at its start.
+
+    Raises:
+        ConfigError: A value of the field is not allowed, or too few obstacles fit.
     """
     _check(field, where, route)
     random = np.random.default_rng([field.seed, index])
-    kept = [_snake(keep_clear, field.clearance_m)] if keep_clear else []
-    if route is not None and field.route_clearance_m is not None:
-        kept.append(Outlines.of_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+    free_areas = _areas_to_keep_free(field, route, keep_clear)
     placed: list[Obstacle] = []
     others = Outlines.of(standing)
     for _ in range(TRIES * field.wanted):
         if len(placed) == field.wanted:
             return placed
-        tried = _draw(field, random, f"random_{index}_{len(placed)}")
-        outline = Outlines.of([tried])
+        candidate = _random_obstacle(field, random, f"random_{index}_{len(placed)}")
+        outline = Outlines.of([candidate])
         if len(others) and gaps_m(outline, others).min() < field.clearance_m:
             continue
-        if any(gaps_m(outline, free).min() < 0.0 for free in kept):
+        if any(gaps_m(outline, area).min() < 0.0 for area in free_areas):
             continue
-        placed.append(tried)
+        placed.append(candidate)
         others = Outlines.of([*standing, *placed])
     if len(placed) < field.wanted:
         raise ConfigError(
@@ -86,12 +111,21 @@ def random_obstacles(
     return placed
 
 
-def _snake(links: Sequence[Capsule], clearance_m: float) -> Outlines:
-    from_w, to_w = np.array([c.rear_m for c in links]), np.array([c.front_m for c in links])
-    return Outlines.of_segments(from_w, to_w, max(c.radius_m for c in links) + clearance_m)
+def _areas_to_keep_free(field: RandomField, route: Route | None, snake: Sequence[Capsule]) -> list[Outlines]:
+    """Return the outlines that no obstacle may overlap: snake and route, each grown by its clearance."""
+    areas: list[Outlines] = []
+    if snake:
+        rear_w = np.array([link.rear_m for link in snake])
+        front_w = np.array([link.front_m for link in snake])
+        radius_m = max(link.radius_m for link in snake)
+        areas.append(Outlines.of_segments(rear_w, front_w, radius_m + field.clearance_m))
+    if route is not None and field.route_clearance_m is not None:
+        areas.append(Outlines.of_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+    return areas
 
 
 def _check(field: RandomField, where: str, route: Route | None) -> None:
+    """Raise ConfigError for values that are wrong together. `where` names the field."""
     if not np.all(np.array(field.max_corner_m) > np.array(field.min_corner_m)):
         raise ConfigError(
             f"{where}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
@@ -110,10 +144,15 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
         )
 
 
-def _draw(field: RandomField, random: Generator, name: str) -> Obstacle:
+def _random_obstacle(field: RandomField, random: Generator, name: str) -> Obstacle:
+    """Return a peg or a block at a random position in the field.
+
+    The order of the random numbers is part of the result: a scene is the same for the same seed.
+    """
     x, y = random.uniform(field.min_corner_m, field.max_corner_m).tolist()
     radius_m = float(random.uniform(*field.radius_m))
     if field.box_fraction == 0 or random.uniform() >= field.box_fraction:
         return peg(name, (x, y), radius_m, field.height_m)
     length_m, width_m = random.uniform(*field.box_size_m, size=2).tolist()
-    return block(name, (x, y), (length_m, width_m, field.height_m), float(random.uniform(0.0, math.pi)))
+    yaw_rad = float(random.uniform(0.0, math.pi))
+    return block(name, (x, y), (length_m, width_m, field.height_m), yaw_rad)

@@ -1,7 +1,7 @@
 """The robot file: the parameters of a chain of joint modules. A module is one joint with half a body on either side.
 
-Chained modules are bolted together, so n modules make n joints and n + 1 rigid links; tail and head link are half as
-long as the others. A robot whose links differ otherwise lists them in `[[links]]`.
+Chained modules are bolted together, so n modules make n joints and n + 1 rigid links. The tail link and the head link
+are half as long as the others. A robot whose links differ in another way lists them in `[[links]]`.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ class Chain(FileStruct, frozen=True, kw_only=True):
     """Number of modules, and axes of their joints."""
 
     modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
-    axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]  # repeated from tail to head
+    axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]  # a pattern, repeated from tail to head
 
 
 class Module(FileStruct, frozen=True, kw_only=True):
@@ -52,9 +52,9 @@ class Module(FileStruct, frozen=True, kw_only=True):
 class Safety(FileStruct, frozen=True, kw_only=True):
     """Behaviour of the joints in a fault, and limits of commands."""
 
-    action: StopMode = "damp"
-    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # of a position target from the measured
-    max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # isolated, before the robot stops
+    action: StopMode = "damp"  # what the joints do in a fault
+    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # from the measured angle to a position target
+    max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # with more isolated joints the robot stops
 
 
 class RobotFile(FileStruct, frozen=True, kw_only=True):
@@ -62,117 +62,143 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     about: str = ""
+
+    # Body.
     chain: Chain
     module: Module
     links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []  # tail to head; none: made of the modules
-    limits: Limits  # from here to `supply`: of all joints, but for `joints`
+
+    # All joints.
+    limits: Limits
     motor: Motor
     drive: Drive = Drive()
     heat: Heat = Heat()
     supply: Supply = Supply()
-    joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}  # name -> what differs in it
+
+    # What differs in single joints, by name.
+    joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}
+
     safety: Safety = Safety()
     sensors: Sensors = Sensors()
-    checked: Checked | None = None  # by whom its joints were found to be as this file says
+    checked: Checked | None = None  # record of the last start check
 
     def __post_init__(self) -> None:
-        """Links and joints must be those there are; sensors sit on a link, and not inside of it. Raises ValueError."""
-        _ = self.joint_table
-        last = self.chain.modules
-        if self.links and len(self.links) != last + 1:
+        """Check joints, links and sensors against each other. Raises ValueError, which the file reader explains."""
+        _ = self.joint_table  # raises for joints that are not possible
+        joint_count = self.chain.modules
+        if self.links and len(self.links) != joint_count + 1:
             raise ValueError(
-                f"[[links]] has {len(self.links)} entries, and {last} joints connect {last + 1} links; list each, "
-                f"tail to head, or none"
+                f"[[links]] has {len(self.links)} entries, and {joint_count} joints connect {joint_count + 1} links; "
+                f"list each, tail to head, or none"
             )
         for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.own):
-            link = self.link_index(sensor.link)
-            if link > last:
-                raise ValueError(
-                    f"sensor {sensor.name!r} is on link {link}, and the links are 0 (tail) to {last} (head)"
-                )
-            if sensor.position_m is None and link != last:
-                raise ValueError(
-                    f"sensor {sensor.name!r} is on link {link}: give `position_m`; only the tip of the head "
-                    f"is the default"
-                )
+            self._check_place(sensor)
+
+    def _check_place(self, sensor: Mounted) -> None:
+        """Raise ValueError if a sensor is on a link that does not exist, or would be inside of its link."""
+        link = self.link_index(sensor.link)
+        head = self.chain.modules
+        if link > head:
+            raise ValueError(f"sensor {sensor.name!r} is on link {link}, and the links are 0 (tail) to {head} (head)")
+        if sensor.position_m is None and link != head:
+            raise ValueError(
+                f"sensor {sensor.name!r} is on link {link}: give `position_m`; only the tip of the head is the default"
+            )
 
     def link_index(self, link: LinkName) -> int:
-        """The number of a link, from 0 at the tail."""
-        return {"tail": 0, "head": self.chain.modules}[link] if isinstance(link, str) else link
+        """Return the number of a link, from 0 at the tail."""
+        match link:
+            case "tail":
+                return 0
+            case "head":
+                return self.chain.modules
+            case number:
+                return number
 
     @property
     def axes(self) -> list[Axis]:
-        """Axis of every joint, tail to head."""
+        """Return the axis of every joint, tail to head."""
         pattern = self.chain.axes
         return [pattern[i % len(pattern)] for i in range(self.chain.modules)]
 
     @property
     def joint_table(self) -> list[Joint]:
-        """Every joint as built, tail to head."""
+        """Return every joint as built, tail to head."""
         return table(self.axes, self.joints, self.limits, self.motor, self.drive, self.heat, self.supply)
 
     @property
     def link_lengths_m(self) -> list[float]:
-        """Length of every link, tail to head."""
+        """Return the length of every link, tail to head."""
         if self.links:
             return [link.length_m for link in self.links]
-        return [self.module.length_m * share for share in self._shares]
+        return [self.module.length_m * part for part in self._module_parts]
 
     @property
     def link_masses_kg(self) -> list[float]:
-        """Mass of every link, tail to head."""
+        """Return the mass of every link, tail to head."""
         if self.links:
             return [link.mass_kg for link in self.links]
-        return [self.module.mass_kg * share for share in self._shares]
+        return [self.module.mass_kg * part for part in self._module_parts]
 
     @property
     def length_m(self) -> float:
-        """Length of the straight robot, without the caps of tail and head."""
+        """Return the length of the straight robot, without the caps of tail and head."""
         if self.links:
             return math.fsum(self.link_lengths_m)
         return self.chain.modules * self.module.length_m
 
     @property
-    def _shares(self) -> list[float]:
+    def _module_parts(self) -> list[float]:
+        """Return how many modules make up each link: half a module the tail and the head, and one module the others."""
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
 
 
 def described(robot: RobotFile) -> list[JointDescription]:
-    """The joints, tail to head."""
-    return [
-        JointDescription(
-            name=joint.name,
-            axis=joint.axis,
-            angle_min_rad=joint.limits.lower_rad,
-            angle_max_rad=joint.limits.upper_rad,
-            speed_limit_rad_s=joint.limits.speed_rad_s,
-            acceleration_limit_rad_s2=joint.limits.acceleration_rad_s2,
-            torque_limit_nm=joint.limits.torque_nm,
-            torque_rate_limit_nm_s=joint.limits.torque_rate_nm_s,
-            stiffness_nm_per_rad=joint.motor.stiffness_nm_per_rad,
-            damping_nm_s_per_rad=joint.motor.damping_nm_s_per_rad,
-            velocity_gain_nm_s_per_rad=joint.motor.velocity_gain_nm_s_per_rad,
-            rotor_kg_m2=joint.motor.armature_kg_m2,
-            derate_from_c=joint.limits.derate_from_c,
-            stop_at_c=joint.limits.stop_at_c,
-            min_voltage_v=joint.limits.min_voltage_v,
-            modes=[Mode.PASSIVE, *(mode for mode in Mode if mode.name.lower() in joint.drive.modes)],
-            measures=[one for one in get_args(Measurement) if one in joint.drive.measures],
-        )
-        for joint in robot.joint_table
-    ]
+    """Return the descriptions of all joints, tail to head."""
+    return [_describe_joint(joint) for joint in robot.joint_table]
+
+
+def _describe_joint(joint: Joint) -> JointDescription:
+    """Return what the HAL publishes of one joint."""
+    limits = joint.limits
+    motor = joint.motor
+    drive_modes = [mode for mode in Mode if mode.name.lower() in joint.drive.modes]
+    measures: list[Measurement] = [quantity for quantity in get_args(Measurement) if quantity in joint.drive.measures]
+    return JointDescription(
+        name=joint.name,
+        axis=joint.axis,
+        # Limits.
+        angle_min_rad=limits.lower_rad,
+        angle_max_rad=limits.upper_rad,
+        speed_limit_rad_s=limits.speed_rad_s,
+        acceleration_limit_rad_s2=limits.acceleration_rad_s2,
+        torque_limit_nm=limits.torque_nm,
+        torque_rate_limit_nm_s=limits.torque_rate_nm_s,
+        derate_from_c=limits.derate_from_c,
+        stop_at_c=limits.stop_at_c,
+        min_voltage_v=limits.min_voltage_v,
+        # Motor.
+        stiffness_nm_per_rad=motor.stiffness_nm_per_rad,
+        damping_nm_s_per_rad=motor.damping_nm_s_per_rad,
+        velocity_gain_nm_s_per_rad=motor.velocity_gain_nm_s_per_rad,
+        rotor_kg_m2=motor.armature_kg_m2,
+        # Drive.
+        modes=[Mode.PASSIVE, *drive_modes],
+        measures=measures,
+    )
 
 
 def with_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
-    """The robot on drives that have these modes alone, whatever else its file says of its joints."""
-    drive = msgspec.structs.replace(robot.drive, modes=[mode for mode in robot.drive.modes if mode in modes])
-    joints = {
-        name: own
-        if own.modes is None
-        else msgspec.structs.replace(own, modes=[mode for mode in own.modes if mode in modes])
-        for name, own in robot.joints.items()
-    }
-    return msgspec.structs.replace(robot, drive=drive, joints=joints)
+    """Return the robot with drives that have at most these modes, whatever else its file gives for its joints."""
+    all_drives = msgspec.structs.replace(robot.drive, modes=[mode for mode in robot.drive.modes if mode in modes])
+    joints: dict[str, JointExceptions] = {}
+    for name, differing in robot.joints.items():
+        if differing.modes is None:
+            joints[name] = differing
+        else:
+            common_modes = [mode for mode in differing.modes if mode in modes]
+            joints[name] = msgspec.structs.replace(differing, modes=common_modes)
+    return msgspec.structs.replace(robot, drive=all_drives, joints=joints)
 
 
 def describe(
@@ -185,41 +211,73 @@ def describe(
     emulated: bool = False,
     simulated_time: bool = False,
 ) -> Description:
-    """The description that the HAL publishes, from a robot file. Raises ConfigError for the class of a sensor in it.
+    """Return the description of a robot that the HAL publishes.
 
-    emulated: nothing real moves; simulated_time: and between two ticks any time may pass.
+    Args:
+        robot: the robot file.
+        backend: name of the backend.
+        period_ns: of the control cycle.
+        lease_ns: term of a lease.
+        config_hash: of the whole configuration.
+        emulated: whether no real motor moves.
+        simulated_time: whether any wall-clock time may pass between two ticks.
+
+    Raises:
+        ConfigError: The class of a custom sensor cannot be loaded, or has no message.
     """
     joints = described(robot)
-    links = [
-        LinkDescription(name=f"link_{i}", length_m=length, radius_m=robot.module.radius_m, mass_kg=mass)
-        for i, (length, mass) in enumerate(zip(robot.link_lengths_m, robot.link_masses_kg, strict=True))
-    ]
-    rate_hz = 1e9 / period_ns
-    sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=robot.sensors.joints.delay_s)]
-    for key, sensor in robot.sensors.published():
-        delay_s = max(sensor.delay_s, period_ns * 1e-9) if isinstance(sensor, Mounted) else sensor.delay_s
-        sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=delay_s))
     return Description(
         robot=robot.name,
+        # Host and run.
         backend=backend,
         layout=layout_hash(joints),
         config_hash=config_hash,
         period_ns=period_ns,
         lease_ns=lease_ns,
+        emulated=emulated,
+        simulated_time=simulated_time,
+        # Safety.
         max_step_rad=robot.safety.max_step_rad,
         stop_mode=robot.safety.action,
         max_isolated_joints=robot.safety.max_isolated_joints,
-        emulated=emulated,
-        simulated_time=simulated_time,
+        # Parts.
         joints=joints,
-        links=links,
-        sensors=sensors,
+        links=_describe_links(robot),
+        sensors=_describe_sensors(robot, period_ns),
         own={keys.own(sensor.name): _own_schema(sensor) for sensor in robot.sensors.own},
     )
 
 
+def _describe_links(robot: RobotFile) -> list[LinkDescription]:
+    """Return what the HAL publishes of the links, tail to head."""
+    radius_m = robot.module.radius_m
+    links: list[LinkDescription] = []
+    for i, (length_m, mass_kg) in enumerate(zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)):
+        links.append(LinkDescription(name=f"link_{i}", length_m=length_m, radius_m=radius_m, mass_kg=mass_kg))
+    return links
+
+
+def _describe_sensors(robot: RobotFile, period_ns: int) -> list[SensorDescription]:
+    """Return what the HAL publishes of the sensors. No sensor has a higher rate than the control cycle."""
+    cycle_rate_hz = 1e9 / period_ns
+    joint_sensor = SensorDescription(key=keys.JOINTS, rate_hz=cycle_rate_hz, delay_s=robot.sensors.joints.delay_s)
+    sensors = [joint_sensor]
+    for key, sensor in robot.sensors.published():
+        delay_s = sensor.delay_s
+        if isinstance(sensor, Mounted):  # its sample arrives at least one period after the measurement
+            delay_s = max(delay_s, period_ns * 1e-9)
+        sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, cycle_rate_hz), delay_s=delay_s))
+    return sensors
+
+
 def identified(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
-    """A description in which every joint's drive says who it is, tail to head."""
+    """Return a description with the serial number and the firmware version of every drive.
+
+    Args:
+        robot: the description without them.
+        serials: serial numbers, tail to head.
+        firmware: versions, tail to head.
+    """
     joints = [
         msgspec.structs.replace(joint, serial=serial, firmware=version)
         for joint, serial, version in zip(robot.joints, serials, firmware, strict=True)
@@ -228,12 +286,13 @@ def identified(robot: Description, serials: Sequence[str], firmware: Sequence[st
 
 
 def _own_schema(sensor: OwnSensor) -> str:
-    """Of the message that the sensor's class names. Raises ConfigError."""
+    """Return the schema of a custom sensor's message. Raises ConfigError if its class cannot be loaded or has none."""
     model = find_plugin(SENSORS, sensor.model)
-    return schema_of(getattr(model, "message", None), f"sensor {sensor.name!r}: model {short(sensor.model)}")
+    message = getattr(model, "message", None)
+    return schema_of(message, f"sensor {sensor.name!r}: model {short(sensor.model)}")
 
 
 def layout_hash(joints: list[JointDescription]) -> str:
-    """Hash of names, order and axes: two robots with the same hash take the same vectors."""
+    """Return a hash of names, order and axes of the joints: robots with the same hash take the same vectors."""
     text = ";".join(f"{joint.name}:{joint.axis}" for joint in joints)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -21,6 +21,7 @@ from snakesim_hal.base.errors import ConfigError, short
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
 from snakesim_hal.model.fitting import fitted
+from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
 from snakesim_hal.model.robot import RobotFile, describe
@@ -31,18 +32,35 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ClockMode, Description, Obstacle
 from snakesim_hal.wire.quantities import above
 
-SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
-SENSOR = "sensor"  # the service of cameras, motion capture and other sensors that the backend does not have
-POLICY = "policy:"  # a controller that begins so names its model behind it
-CHOSEN = ("control.", "backend.")  # --set control.x=1 changes the chosen controller, --set backend.x=1 the backend
+# Second part of the seed of the survey errors, so that they differ from other random numbers of the run's seed.
+SURVEY = 0x5EED
+
+# Name of the service that publishes cameras, motion capture and other sensors which the backend does not have.
+SENSOR = "sensor"
+
+# Prefix of a controller name that is followed by the model of a policy.
+POLICY = "policy:"
+POLICY_CONTROLLER = POLICY[:-1]
+
+# Prefixes of --set keys: `control.x` is a parameter of the chosen controller, `backend.x` one of the chosen backend.
+CHOSEN = ("control.", "backend.")
+
+NS_PER_S = 1e9
+LEASE_PERIODS = 5  # a lease outlasts a few lost commands
+MIN_LEASE_NS = 50_000_000
+MAX_LEASE_NS = 100_000_000  # a robot whose controller is gone moves no longer than this
 
 
 class Start(FileStruct, frozen=True, kw_only=True):
     """Start pose of the snake: along the scene's route, or straight at a pose."""
 
     on_route: bool = True
+
+    # Used on the route: arc length of the tail end.
     tail_s_m: Annotated[float, Meta(ge=-100, le=1000, extra_json_schema={"unit": "m"})] = 0.0
-    position_m: Point = (0.0, 0.0)  # of the tail end, when not on the route
+
+    # Used off the route.
+    position_m: Point = (0.0, 0.0)  # of the tail end
     yaw_rad: Heading = 0.0
 
 
@@ -50,7 +68,7 @@ class HeadingGoal(FileStruct, frozen=True, kw_only=True, tag="heading", tag_fiel
     """Advance the whole body in one direction."""
 
     heading_rad: Heading = 0.0
-    distance_m: Size = 3.0  # from where it starts
+    distance_m: Size = 3.0  # from the start pose
 
 
 class WaypointGoal(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
@@ -65,19 +83,26 @@ class Mission(FileStruct, frozen=True, kw_only=True):
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
     goal: HeadingGoal | WaypointGoal | None = None
-    until_goal: bool = False  # the run ends when the goal is reached, rather than with its time
-    map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors measure
-    # Of a known map: standard deviation of each obstacle's place, drawn from the run's seed, once for all services.
+    until_goal: bool = False  # true: the run ends when the goal is reached, even before `duration_s`
+
+    # known: the obstacles of the scene, as from a survey; perceived: only what the sensors measure.
+    map: Literal["known", "perceived"] = "known"
+
+    # Standard deviation of each obstacle's position in a known map. The errors follow from the run's seed, so that all
+    # services have the same map.
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
-    # Of obstacles, as navigation reckons with it where it plans, and the controller where it pushes.
+
+    # Friction of obstacles that navigation assumes when it plans, and the controller when it pushes.
     peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
-    # Of a known map: a robot whose joints turn up and down, too, climbs a `step` of the scene up to this height.
+
+    # Highest `step` of a known map that a robot with pitch joints climbs.
     max_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1
-    # By the pose sensor where there is one; or by joints, IMU, contacts and the map alone.
+
+    # pose_sensor: from the pose sensor if there is one; dead_reckoning: from joints, IMU, contacts and the map alone.
     localization: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
 
     def __post_init__(self) -> None:
-        """Only a map that is known has errors of a survey; only a goal can be reached."""
+        """Check that survey errors come with a known map, and `until_goal` with a goal. Raises ValueError."""
         if self.map_error_m > 0 and self.map == "perceived":
             raise ValueError('`map_error_m` is of a survey; with map = "perceived" there is none')
         if self.until_goal and self.goal is None:
@@ -85,34 +110,42 @@ class Mission(FileStruct, frozen=True, kw_only=True):
 
 
 class Service(FileStruct, frozen=True, kw_only=True):
-    """A process of the run that acts every `decimation`.
+    """A process of the run that acts every `decimation` ticks.
 
-    In lockstep its output for tick t is used from tick t + latency_ticks on, whenever it really arrived, so that a slow
-    service does not break determinism, and runs in parallel to the simulator. For control, a lag of 1 is a
-    command that acts in the period after its state; 2 adds a period of latency, in which control and physics overlap.
+    In lockstep, the output that a service computes for tick t is used from tick t + latency_ticks on, no matter when
+    it arrived. So a slow service does not break determinism, and it runs in parallel to the simulator. For control, a
+    latency of 1 means that a command acts in the period after the state that it answers. A latency of 2 adds a period,
+    in which control and physics overlap.
     """
 
-    decimation: Annotated[int, Meta(ge=1, le=1000)] = 1
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 1  # acts on every n-th tick
     latency_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
-    restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
-    external: bool = False  # a process that the run waits for, but does not start
-    place: Literal["process", "host"] = "process"  # `host`: beside the driver, in a thread of the host's process
-    code: str = ""  # an installed service, or ./file.py:Class; empty: the installed service of the section's name
+
+    # With `snakesim run --stay`, true: the run starts its process again when it ends; false: the run ends with it.
+    restart: bool = True
+
+    external: bool = False  # true: the run waits for its process, but does not start it
+
+    # process: a process of its own; host: a thread in the process of the HAL host, beside the driver.
+    place: Literal["process", "host"] = "process"
+
+    # The name of an installed service, or ./file.py:Class; empty: the installed service of the section's name.
+    code: str = ""
 
     def used_output_tick(self, tick: int) -> int:
-        """The newest tick whose output is used at `tick`. That of tick 0 is used from the start."""
-        due = max(tick - self.latency_ticks, 0)
-        return due - due % self.decimation
+        """Return the newest tick whose output is used at `tick`; at the start, the output of tick 0 is used early."""
+        due_tick = max(tick - self.latency_ticks, 0)
+        return due_tick - due_tick % self.decimation
 
 
 Seconds = Annotated[float, above(60, "s")]
 
 
 class MaxAge(FileStruct, frozen=True, kw_only=True):
-    """Maximum age of control's inputs, in robot time; the defaults follow from rates, delays and schedules.
+    """Maximum age of the inputs of control, in robot time; the defaults follow from rates, delays and schedules.
 
-    With older joint states control sends no command, so that the lease ends and the robot stops. With an older pose,
-    contacts, image, world or trajectory the controller holds, and resumes when the stream is back.
+    If the joint states are older, control sends no command, so the lease ends and the robot stops. If a pose, contacts,
+    an image, a world or a trajectory is older, the controller holds, and resumes when the stream is back.
     """
 
     joints_s: Seconds | None = None
@@ -128,83 +161,111 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
     title: str = ""
+
+    # What runs.
     robot: RobotFile
     scene: SceneFile
     backend: str = "sim"
     controller: str
+
+    # Time.
     clock_mode: ClockMode = "lockstep"
-    rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
-    duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
+    rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0  # of the control cycle
+    duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0  # robot time
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.model.fault_kinds
-    allow_fault_injection: bool = False  # also where something real moves
+
+    # Injected faults, at times since the first arming: see snakesim_hal.model.fault_kinds.
+    faults: list[str] = []
+    allow_fault_injection: bool = False  # true: also on a robot whose motors really move
+
+    # In lockstep: the time for which the host waits for the output of a service, before it continues without it.
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
+
+    # The time within which all services must be ready to arm.
     start_limit_s: Annotated[float, Meta(gt=0, le=3600, extra_json_schema={"unit": "s"})] = 60.0
+
+    # What the parts of the run do.
     start: Start = Start()
     mission: Mission = Mission()
-    services: dict[str, Service]
+    services: dict[str, Service]  # by name
     max_age: MaxAge = MaxAge()
-    controllers: dict[str, dict[str, Any]] = {}  # settings of each controller, checked by the controller
-    backends: dict[str, dict[str, Any]] = {}  # settings of each backend, checked by the backend
+
+    # Parameters of each controller and settings of each backend, by name. The plugins check them.
+    controllers: dict[str, dict[str, Any]] = {}
+    backends: dict[str, dict[str, Any]] = {}
 
     @property
     def control_section(self) -> str:
-        """Section with the settings of the chosen controller; for `./file.py:Wave` that is `controllers.Wave`."""
-        return f"controllers.{self.controller.rpartition(':')[2]}"
+        """Return the section with the parameters of the chosen controller: `controllers.Wave` for `./file.py:Wave`."""
+        return f"controllers.{_section_name(self.controller)}"
 
     @property
     def control_settings(self) -> dict[str, Any]:
-        """The settings of the chosen controller."""
-        return self.controllers.get(self.controller.rpartition(":")[2], {})
+        """Return the parameters of the chosen controller."""
+        return self.controllers.get(_section_name(self.controller), {})
 
     @property
     def backend_section(self) -> str:
-        """Section with the settings of the chosen backend; for `./file.py:Bench` that is `backends.Bench`."""
-        return f"backends.{self.backend.rpartition(':')[2]}"
+        """Return the section with the settings of the chosen backend: `backends.Bench` for `./file.py:Bench`."""
+        return f"backends.{_section_name(self.backend)}"
 
     @property
     def backend_settings(self) -> dict[str, Any]:
-        """The settings of the chosen backend."""
-        return self.backends.get(self.backend.rpartition(":")[2], {})
+        """Return the settings of the chosen backend."""
+        return self.backends.get(_section_name(self.backend), {})
 
     @property
     def own_services(self) -> dict[str, Service]:
-        """The services that the run starts itself."""
+        """Return the services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
 
     @property
     def beside(self) -> list[str]:
-        """Those of them that run in the host's process."""
+        """Return the names of the services that run in the process of the HAL host, beside the driver."""
         return [name for name, service in self.own_services.items() if service.place == "host"]
 
     @property
     def has_own_control(self) -> bool:
-        """Whether the run has its own controller; otherwise the external one also arms the robot."""
+        """Return whether the run starts a controller; otherwise an external controller also arms the robot."""
         return CONTROL in self.own_services
 
     @property
     def commander(self) -> str:
-        """The controller, with its model if it is a policy, or `external` when the run starts none."""
+        """Return the name of the controller, with the model of a policy; `external` if the run starts no controller."""
         if not self.has_own_control:
             return "external"
-        model = self.control_settings.get("model") if self.controller == POLICY[:-1] else None
-        return f"{POLICY}{model}" if model else self.controller
+        if self.controller == POLICY_CONTROLLER:
+            model = self.control_settings.get("model")
+            if model:
+                return f"{POLICY}{model}"
+        return self.controller
 
     def dead_reckons(self, robot: Description) -> bool:
-        """Whether guidance reckons the pose: it was told to, or neither the robot nor a service tells it."""
-        described = any(sensor.key == keys.POSE for sensor in robot.sensors)
-        told = described or self.robot.sensors.pose is not None or SENSOR in self.services
-        return self.mission.localization == "dead_reckoning" or not told
+        """Return whether guidance estimates the pose by dead reckoning.
+
+        It does if the mission says so, and also if neither the robot nor a service measures the pose.
+        """
+        if self.mission.localization == "dead_reckoning":
+            return True
+        robot_publishes_pose = any(sensor.key == keys.POSE for sensor in robot.sensors)
+        has_pose_sensor = robot_publishes_pose or self.robot.sensors.pose is not None or SENSOR in self.services
+        return not has_pose_sensor
 
     @property
     def period_ns(self) -> int:
-        """One control period."""
-        return round(1e9 / self.rate_hz)
+        """Return the duration of one control period."""
+        return round(NS_PER_S / self.rate_hz)
 
     @property
     def lease_ns(self) -> int:
-        """Term of a lease: five periods or 50 ms, whichever is longer, at most 100 ms."""
-        return min(max(5 * self.period_ns, 50_000_000), 100_000_000)
+        """Return the term of a lease: five periods or 50 ms, whichever is longer, but at most 100 ms."""
+        term_ns = max(LEASE_PERIODS * self.period_ns, MIN_LEASE_NS)
+        return min(term_ns, MAX_LEASE_NS)
+
+
+def _section_name(plugin_name: str) -> str:
+    """Return the name of a plugin's section: the class, for a plugin in a file such as `./file.py:Wave`."""
+    return plugin_name.rpartition(":")[2]
 
 
 @dataclass(frozen=True)
@@ -215,22 +276,28 @@ class Loaded:
     table: Table
 
     def explain(self) -> list[tuple[str, Any, str]]:
-        """Every effective value as (dotted key, value, file or flag or `default`)."""
+        """Return every effective value as (dotted key, value, file or flag or `default`)."""
         effective = msgspec.to_builtins(self.config)
         return [(key, value, self.table.origin_of(key)) for key, value in leaves(effective)]
 
 
 @dataclass(frozen=True)
 class Override:
-    """A value given on the command line."""
+    """A value that the command line gives for one key."""
 
-    key: str
+    key: str  # dotted
     value: Any
-    flag: str
+    flag: str  # as written on the command line, for error messages
 
 
 def parse_set(text: str) -> Override:
-    """`section.key=value` of --set; the value is parsed as TOML, else taken as plain text."""
+    """Parse the `section.key=value` of a --set option.
+
+    The value is read as TOML. If it is not valid TOML, it is taken as plain text.
+
+    Raises:
+        ConfigError: The key or the equals sign is missing.
+    """
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -243,7 +310,15 @@ def parse_set(text: str) -> Override:
 
 
 def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
-    """Read a scenario (shipped name or path), its robot and scene, and the flags. Raises ConfigError."""
+    """Read a scenario with its robot and scene, apply the flags, and check the result.
+
+    Args:
+        scenario: the name of a shipped scenario, or the path of a file.
+        overrides: values from the command line.
+
+    Raises:
+        ConfigError: A file cannot be read, or a value is not allowed.
+    """
     table = compose(scenario, overrides)
     config = decode(table, RunConfig)
     check(config)
@@ -251,80 +326,122 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
 
 
 def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
-    """All values of a scenario, not checked yet. Raises ConfigError for files that cannot be read."""
+    """Return all values of a scenario, its robot and its scene, with the flags applied, but not checked yet.
+
+    Raises:
+        ConfigError: A file cannot be read.
+    """
     path = find(scenario, "scenarios")
     table = read_table(path)
     table.values.setdefault("name", path.stem)
     _split_policy(table, table.values.get("controller"), table.source)
-    picks = [o for o in overrides if o.key in ("robot", "scene")]
-    for pick in picks:
-        table.put(pick.key, pick.value, pick.flag)
+
+    # Another robot or scene is chosen before its single values are changed.
+    file_choices = [override for override in overrides if override.key in ("robot", "scene")]
+    for choice in file_choices:
+        table.put(choice.key, choice.value, choice.flag)
+    chosen_by_flag = {choice.key for choice in file_choices}
     for part, kind in (("robot", "robots"), ("scene", "scenes")):
-        named = table.values.get(part)
-        if isinstance(named, str):
-            from_flag = any(o.key == part for o in picks)
-            inner = read_part(named, kind, None if from_flag else path.parent)
-            table.put(part, inner.values, inner.source)
-            table.origin |= {f"{part}.{key}": origin for key, origin in inner.origin.items()}  # with `extends`, of two
-    for override in sorted(overrides, key=lambda o: o.key.startswith(CHOSEN)):
-        if override in picks:
-            continue
-        key = override.key
-        for alias, choice, section in (
-            (CHOSEN[0], "controller", "controllers"),
-            (CHOSEN[1], "backend", "backends"),
-        ):
-            if key.startswith(alias):
-                chosen = str(table.values.get(choice, "sim")).rpartition(":")[2]
-                key = f"{section}.{chosen}.{key.removeprefix(alias)}"
-        table.put(key, override.value, override.flag)
-        if key == "controller":
-            _split_policy(table, override.value, override.flag)
+        relative_to = None if part in chosen_by_flag else path.parent
+        _include_file(table, part, kind, relative_to)
+
+    # A controller or backend is chosen before the keys that refer to the chosen one.
+    value_overrides = [override for override in overrides if override not in file_choices]
+    for override in sorted(value_overrides, key=lambda override: override.key.startswith(CHOSEN)):
+        _apply_override(table, override)
+
     scene = table.values.get("scene")
     if isinstance(scene, dict) and "reference_robot" in scene:
-        _fit(table, {override.flag for override in overrides if override not in picks})
+        _fit_scene(table, flags={override.flag for override in value_overrides})
     return table
 
 
-def _fit(table: Table, flags: set[str]) -> None:
-    """Change a scene that was made for another robot; see fitting.py."""
+def _include_file(table: Table, part: str, kind: str, relative_to: Path | None) -> None:
+    """Replace the name of a robot or scene by the contents of its file; do nothing if the contents are there."""
+    name = table.values.get(part)
+    if not isinstance(name, str):
+        return
+    included = read_part(name, kind, relative_to)
+    table.put(part, included.values, included.source)
+    # With `extends`, the values of one part come from two files.
+    table.origin |= {f"{part}.{key}": origin for key, origin in included.origin.items()}
+
+
+def _apply_override(table: Table, override: Override) -> None:
+    """Put a value from the command line into the table."""
+    key = _expand_chosen(table, override.key)
+    table.put(key, override.value, override.flag)
+    if key == "controller":
+        _split_policy(table, override.value, override.flag)
+
+
+def _expand_chosen(table: Table, key: str) -> str:
+    """Return the key in the section of the chosen controller or backend, for `control.KEY` or `backend.KEY`."""
+    control_prefix, backend_prefix = CHOSEN
+    if key.startswith(control_prefix):
+        prefix = control_prefix
+        chosen = table.values.get("controller", "sim")
+        section = "controllers"
+    elif key.startswith(backend_prefix):
+        prefix = backend_prefix
+        chosen = table.values.get("backend", "sim")
+        section = "backends"
+    else:
+        return key
+    return f"{section}.{_section_name(str(chosen))}.{key.removeprefix(prefix)}"
+
+
+def _fit_scene(table: Table, flags: set[str]) -> None:
+    """Change a scene that was laid out for another robot, except for the values that a flag gives; see fitting.py."""
     config = decode(table, RunConfig)
-    changed = fitted(config.scene, config.robot, lambda key: table.origin_of(f"scene.{key}") in flags)
+
+    def is_given_by_flag(key: str) -> bool:
+        return table.origin_of(f"scene.{key}") in flags
+
+    changed = fitted(config.scene, config.robot, is_given_by_flag)
     for key, value in changed.items():
         table.put(f"scene.{key}", value, f"fitted to robot {config.robot.name!r}")
 
 
 def _split_policy(table: Table, controller: Any, origin: str) -> None:
-    """Of `policy:MODEL` the controller `policy`, and the setting that has its model."""
+    """Replace the controller `policy:MODEL` by the controller `policy` and its parameter `model`."""
     if isinstance(controller, str) and controller.startswith(POLICY):
-        table.put("controller", POLICY[:-1], origin)
-        table.put(f"controllers.{POLICY[:-1]}.model", controller.removeprefix(POLICY), origin)
+        table.put("controller", POLICY_CONTROLLER, origin)
+        table.put(f"controllers.{POLICY_CONTROLLER}.model", controller.removeprefix(POLICY), origin)
 
 
 def check(config: RunConfig) -> None:
-    """Checks that need more than one field. Raises ConfigError."""
-    start = config.start
-    if start.on_route and config.scene.route is None:
+    """Check what more than one field decides: the start pose, and that no obstacle overlaps it.
+
+    Raises:
+        ConfigError: The robot cannot lie at the start pose, or an obstacle is in its place.
+    """
+    if config.start.on_route and config.scene.route is None:
         raise ConfigError(
             f"scenario {config.name!r}: `start.on_route` is true but scene {config.scene.name!r} has no route; "
             f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene"
         )
-    angles = start_of(config).angles_rad
-    for joint, angle_rad in zip(config.robot.joint_table, angles.tolist(), strict=True):
-        if joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad:
-            continue
-        if not start.on_route:
-            raise ConfigError(
-                f"robot {config.robot.name!r}: {joint.name} may turn from {joint.limits.lower_rad:g} to "
-                f"{joint.limits.upper_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
-                f"start it on a route that suits them"
-            )
-        raise ConfigError(
-            f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
-            f"{config.robot.name!r} allows {joint.limits.lower_rad:g} to {joint.limits.upper_rad:g} rad. Choose a "
-            f"smoother route"
-        )
+    angles_rad = start_of(config).angles_rad.tolist()
+    for joint, angle_rad in zip(config.robot.joint_table, angles_rad, strict=True):
+        if not joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad:
+            raise _start_angle_error(config, joint, angle_rad)
     place_all(config)
+
+
+def _start_angle_error(config: RunConfig, joint: Joint, angle_rad: float) -> ConfigError:
+    """Return the error for a start angle outside of a joint's limits."""
+    limits = joint.limits
+    if not config.start.on_route:
+        return ConfigError(
+            f"robot {config.robot.name!r}: {joint.name} may turn from {limits.lower_rad:g} to "
+            f"{limits.upper_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
+            f"start it on a route that suits them"
+        )
+    return ConfigError(
+        f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
+        f"{config.robot.name!r} allows {limits.lower_rad:g} to {limits.upper_rad:g} rad. Choose a "
+        f"smoother route"
+    )
 
 
 @dataclass(frozen=True)
@@ -337,17 +454,26 @@ class StartPose:
 
 
 def start_of(config: RunConfig) -> StartPose:
-    """Start pose of the snake."""
-    robot, start = config.robot, config.start
+    """Return the pose of the snake at tick 0: on the scene's route, or straight."""
+    robot = config.robot
+    start = config.start
     route = route_of(config.scene)
     if not start.on_route or route is None:
-        return StartPose(start.position_m, start.yaw_rad, np.zeros(robot.chain.modules))
-    lay = lay_chain(route, start.tail_s_m, yaw_segments_m(robot.axes, robot.link_lengths_m))
-    return StartPose(lay.tail_w, lay.heading_rad, chain_angles(robot.axes, lay.angles_rad))
+        straight_rad = np.zeros(robot.chain.modules)
+        return StartPose(start.position_m, start.yaw_rad, straight_rad)
+    segments_m = yaw_segments_m(robot.axes, robot.link_lengths_m)
+    chain = lay_chain(route, start.tail_s_m, segments_m)
+    return StartPose(chain.tail_w, chain.heading_rad, chain_angles(robot.axes, chain.angles_rad))
 
 
 def description_of(config: RunConfig, backend: str = "", *, emulated: bool = False) -> Description:
-    """The robot in it. backend: its name for itself, where that may be another than the scenario's for it."""
+    """Return the description that the HAL publishes of the configured robot.
+
+    Args:
+        config: of the run.
+        backend: the name that the backend has for itself; empty: the name in the scenario.
+        emulated: whether no real motor moves.
+    """
     return describe(
         config.robot,
         backend=backend or config.backend,
@@ -359,23 +485,30 @@ def description_of(config: RunConfig, backend: str = "", *, emulated: bool = Fal
 
 
 def capsules_at_start(config: RunConfig) -> list[Capsule]:
-    """Outlines of the links at tick 0, from above."""
-    robot, pose = config.robot, start_of(config)
-    rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
-    origins, rotations = link_frames(
-        (*pose.position_w, robot.module.radius_m), rotation, pose.angles_rad, robot.axes, robot.link_lengths_m
-    )
+    """Return the outlines of the links at tick 0 as seen from above, tail to head."""
+    robot = config.robot
+    pose = start_of(config)
+    radius_m = robot.module.radius_m
+    base_w = (*pose.position_w, radius_m)
+    base_rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
+    origins, rotations = link_frames(base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m)
     capsules: list[Capsule] = []
-    for i, length in enumerate(robot.link_lengths_m):
-        front = origins[i] + length * rotations[i][:, 0]
-        rear_m = (float(origins[i][0]), float(origins[i][1]))
-        front_m = (float(front[0]), float(front[1]))
-        capsules.append(Capsule(name=f"link_{i}", rear_m=rear_m, front_m=front_m, radius_m=robot.module.radius_m))
+    for i, length_m in enumerate(robot.link_lengths_m):
+        front_w = origins[i] + length_m * rotations[i][:, 0]
+        rear_x, rear_y, _ = origins[i].tolist()
+        front_x, front_y, _ = front_w.tolist()
+        capsules.append(
+            Capsule(name=f"link_{i}", rear_m=(rear_x, rear_y), front_m=(front_x, front_y), radius_m=radius_m)
+        )
     return capsules
 
 
 def place_all(config: RunConfig) -> list[Placed]:
-    """The scene's obstacles, expanded, and checked against the snake's start pose."""
+    """Return all obstacles of the scene, placed.
+
+    Raises:
+        ConfigError: An obstacle cannot be placed, or overlaps the snake's start pose.
+    """
     snake = capsules_at_start(config)
     placed = place(config.scene, snake)
     check_clear(config.scene, placed, snake)
@@ -383,35 +516,42 @@ def place_all(config: RunConfig) -> list[Placed]:
 
 
 def surveyed(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
-    """The obstacles that stand in the way, or what a snake may lie on, where the survey has it: off by its error."""
-    known = [placed.obstacle for placed in place_all(config) if placed.walkable == walkable]
+    """Return the obstacles at the positions that the survey gives, which differ from the true ones by its error.
+
+    Args:
+        config: of the run; its seed decides the errors.
+        walkable: true: the platforms that the snake may lie on; false: the obstacles that it pushes against.
+    """
+    obstacles = [placed.obstacle for placed in place_all(config) if placed.walkable == walkable]
     error_m = config.mission.map_error_m
     if error_m == 0.0:
-        return known
-    found: list[Obstacle] = []
-    errors = np.random.default_rng((config.seed, SURVEY + walkable)).normal(0.0, error_m, (len(known), 2))
-    for obstacle, (off_x, off_y) in zip(known, errors.tolist(), strict=True):
+        return obstacles
+    random = np.random.default_rng((config.seed, SURVEY + walkable))
+    errors_m = random.normal(0.0, error_m, (len(obstacles), 2))
+    displaced: list[Obstacle] = []
+    for obstacle, (error_x, error_y) in zip(obstacles, errors_m.tolist(), strict=True):
         x, y, z = obstacle.position_w
-        found.append(msgspec.structs.replace(obstacle, position_w=(x + off_x, y + off_y, z)))
-    return found
+        position_w = (x + error_x, y + error_y, z)
+        displaced.append(msgspec.structs.replace(obstacle, position_w=position_w))
+    return displaced
 
 
 def config_hash(config: RunConfig) -> str:
-    """Hash of everything that the run's outcome depends on."""
+    """Return a hash of everything that the outcome of a run depends on."""
     plain = json.dumps(msgspec.to_builtins(config), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
 def written(config: RunConfig) -> bytes:
-    """The effective configuration as JSON; `snakesim run` accepts it like a scenario file."""
+    """Return the effective configuration as JSON; `snakesim run` accepts it like a scenario file."""
     return msgspec.json.format(msgspec.json.encode(config), indent=2)
 
 
 def write(config: RunConfig, path: Path) -> None:
-    """Save the effective configuration."""
+    """Save the effective configuration as JSON."""
     write_whole(path, written(config))
 
 
 def read(path: Path) -> RunConfig:
-    """Read back a file saved by `write`, whatever its name."""
+    """Read a file that `write` saved, whatever its name."""
     return decode(read_table(path), RunConfig)

@@ -1,7 +1,7 @@
 """The scene file: ground, obstacles, and the route of the snake through them.
 
-The simulator builds it, guidance uses it as its map, the report draws it. `place` expands peg rows and random
-fields into plain obstacles; `check_clear` rejects a scene in which one of them overlaps the snake's start pose.
+The simulator builds the scene, guidance uses it as its map, and the report draws it. `place` expands peg rows and
+random fields into plain obstacles. `check_clear` rejects a scene in which an obstacle overlaps the snake's start pose.
 """
 
 import math
@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Capsule, Coordinate, Friction, Heading, Outlines, Point, Size
@@ -25,9 +26,9 @@ from snakesim_hal.wire.quantities import Name, above
 class Heightfield(FileStruct, frozen=True, kw_only=True):
     """Smooth random hills."""
 
-    height_m: Annotated[float, above(1, "m")]  # from lowest to highest point
+    height_m: Annotated[float, above(1, "m")]  # from the lowest to the highest point
     wavelength_m: Annotated[float, above(100, "m")]  # typical distance between two hills
-    area_m: Annotated[float, above(200, "m")] = 20.0  # edge of the square around the origin
+    area_m: Annotated[float, above(200, "m")] = 20.0  # edge length of the square around the origin
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
 
@@ -80,7 +81,7 @@ class Sphere(Solid, frozen=True, kw_only=True):
 
 
 class Wall(Upright, frozen=True, kw_only=True):
-    """A straight wall from point to point."""
+    """A straight wall between two points."""
 
     from_m: Point
     to_m: Point
@@ -108,21 +109,21 @@ class PegsAlongRoute(Upright, frozen=True, kw_only=True):
     """
 
     corridor_m: Size
-    radius_m: Size
-    count: Annotated[int, Meta(ge=1, le=2000)]
+    radius_m: Size  # of a peg
+    count: Annotated[int, Meta(ge=1, le=2000)]  # pegs
     first: Annotated[int, Meta(ge=0, le=2000)] = 0  # inflections to skip at the start
     height_m: Size = 0.2
 
 
-SAMPLES = 24  # of a link's axis, of which the nearest to a box counts
-OVERLAP_M = 1e-4  # of an obstacle and a link, that is let pass
+SAMPLES = 24  # points along a link's axis at which the distance to obstacles is computed
+OVERLAP_M = 1e-4  # a smaller overlap of an obstacle and a link is a rounding error
 MAX_OBSTACLES = 4096  # bound of the message World
 
 
 class Body(FileStruct, frozen=True, kw_only=True):
-    """The body that a scene was laid out for: another robot gets the scene in proportion, see fitting.py."""
+    """The body that a scene was laid out for; for another robot the scene is scaled in proportion, see fitting.py."""
 
-    spacing_m: Size  # between neighboring yaw joints
+    spacing_m: Size  # longest distance between two neighboring yaw joints
     radius_m: Size
 
 
@@ -132,8 +133,10 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     about: str = ""
     ground: Ground
-    reference_robot: Body | None = None
+    reference_robot: Body | None = None  # none: the scene is the same for every robot
     route: SineRoute | WaypointRoute | None = None
+
+    # Obstacles.
     cylinder: list[Cylinder] = []
     box: list[Box] = []
     sphere: list[Sphere] = []
@@ -144,7 +147,11 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
 
 
 def route_of(scene: SceneFile) -> Route | None:
-    """The scene's route as a curve, or None when it has none."""
+    """Return the scene's route as a curve, or None if the scene has no route.
+
+    Raises:
+        ConfigError: The waypoints are not a line.
+    """
     match scene.route:
         case None:
             return None
@@ -161,114 +168,197 @@ class Placed(Upright, frozen=True, kw_only=True):
     """A placed obstacle, with parameters that only the simulator needs."""
 
     obstacle: Obstacle
-    walkable: bool = False  # a step is part of the ground: contacts with it are not for pushing off
-
-
-def _placed(obstacle: Obstacle, solid: Solid) -> Placed:
-    return Placed(obstacle=obstacle, **made_of(solid))
+    walkable: bool = False  # a step: part of the ground, so the snake does not push off from it
 
 
 def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:
-    """All obstacles of a scene, expanded, each with a unique name.
+    """Return all obstacles of a scene, with peg rows and random fields expanded, each with a unique name.
 
-    keep_clear: capsules (the snake at its start) that random fields stay away from.
+    Args:
+        scene: the scene file.
+        keep_clear: links of the snake at its start, from which random obstacles keep a distance.
+
+    Raises:
+        ConfigError: There are too many obstacles, one cannot be placed, or two have the same name.
     """
     _check_count(scene)
-    placed: list[Placed] = []
-    for i, c in enumerate(scene.cylinder):
-        placed.append(_placed(peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m), c))
-    for i, b in enumerate(scene.box):
-        placed.append(_placed(block(b.name or f"box_{i}", b.position_m, b.size_m, b.yaw_rad), b))
-    for i, s in enumerate(scene.sphere):
-        ball = Obstacle(
-            name=s.name or f"sphere_{i}",
-            shape="sphere",
-            position_w=(*s.position_m, s.center_height_m),
-            radius_m=s.radius_m,
-            height_m=2 * s.radius_m,
-        )
-        placed.append(_placed(ball, s))
-    for i, w in enumerate(scene.wall):
-        run = (w.to_m[0] - w.from_m[0], w.to_m[1] - w.from_m[1])
-        length = math.hypot(*run)
-        if length == 0:
-            raise ConfigError(f"scene {scene.name!r}: `wall.{i}`: `from_m` and `to_m` are the same point")
-        middle = ((w.from_m[0] + w.to_m[0]) / 2, (w.from_m[1] + w.to_m[1]) / 2)
-        size = (length, w.thickness_m, w.height_m)
-        placed.append(_placed(block(w.name or f"wall_{i}", middle, size, math.atan2(run[1], run[0])), w))
-    for i, p in enumerate(scene.step):
-        size = (*p.size_m, p.height_m)
-        platform = block(p.name or f"step_{i}", p.position_m, size, p.yaw_rad)
-        placed.append(Placed(obstacle=platform, friction=p.friction, walkable=True))
+    placed: list[Placed] = [
+        *(_placed_cylinder(i, cylinder) for i, cylinder in enumerate(scene.cylinder)),
+        *(_placed_box(i, box) for i, box in enumerate(scene.box)),
+        *(_placed_sphere(i, sphere) for i, sphere in enumerate(scene.sphere)),
+        *(_placed_wall(scene, i, wall) for i, wall in enumerate(scene.wall)),
+        *(_placed_step(i, step) for i, step in enumerate(scene.step)),
+    ]
     route = route_of(scene)
     for i, row in enumerate(scene.pegs_along_route):
-        placed.extend(_pegs_along(scene, i, row, route))
+        placed += _pegs_along_route(scene, i, row, route)
     for i, field in enumerate(scene.random_field):
-        standing = [p.obstacle for p in placed if not p.walkable]
-        found = random_obstacles(
-            field, f"scene {scene.name!r}: `random_field.{i}`", i, route, standing, keep_clear or []
-        )
-        placed.extend(map(_placed, found, solids_of(field, i, len(found))))
-    names = Counter(p.obstacle.name for p in placed)
-    twice = sorted(name for name, count in names.items() if count > 1)
-    if twice:
-        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {twice[0]!r}; rename one")
+        placed += _obstacles_of_field(scene, i, field, route, placed, keep_clear or [])
+    _check_names(scene, placed)
     return placed
 
 
 def _check_count(scene: SceneFile) -> None:
-    given = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
-    count = sum(len(kind) for kind in given) + sum(row.count for row in scene.pegs_along_route)
+    """Raise ConfigError if the scene has more obstacles than a message can hold."""
+    single_obstacles = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
+    count = sum(len(obstacles) for obstacles in single_obstacles)
+    count += sum(row.count for row in scene.pegs_along_route)
     count += sum(min(field.wanted, MAX_RANDOM_OBSTACLES) for field in scene.random_field)
     if count > MAX_OBSTACLES:
         raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
 
 
-def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:
+def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
+    """Raise ConfigError if two obstacles have the same name."""
+    counts = Counter(item.obstacle.name for item in placed)
+    duplicates = sorted(name for name, count in counts.items() if count > 1)
+    if duplicates:
+        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {duplicates[0]!r}; rename one")
+
+
+def _with_material(obstacle: Obstacle, solid: Solid) -> Placed:
+    """Return a placed obstacle with the material and the lean that its section in the scene file gives."""
+    return Placed(obstacle=obstacle, **made_of(solid))
+
+
+def _placed_cylinder(index: int, cylinder: Cylinder) -> Placed:
+    name = cylinder.name or f"cylinder_{index}"
+    obstacle = peg(name, cylinder.position_m, cylinder.radius_m, cylinder.height_m)
+    return _with_material(obstacle, cylinder)
+
+
+def _placed_box(index: int, box: Box) -> Placed:
+    name = box.name or f"box_{index}"
+    obstacle = block(name, box.position_m, box.size_m, box.yaw_rad)
+    return _with_material(obstacle, box)
+
+
+def _placed_sphere(index: int, sphere: Sphere) -> Placed:
+    obstacle = Obstacle(
+        name=sphere.name or f"sphere_{index}",
+        shape="sphere",
+        position_w=(*sphere.position_m, sphere.center_height_m),
+        radius_m=sphere.radius_m,
+        height_m=2 * sphere.radius_m,
+    )
+    return _with_material(obstacle, sphere)
+
+
+def _placed_wall(scene: SceneFile, index: int, wall: Wall) -> Placed:
+    """Return a wall as a block whose length is along the wall."""
+    from_x, from_y = wall.from_m
+    to_x, to_y = wall.to_m
+    run_x = to_x - from_x
+    run_y = to_y - from_y
+    length_m = math.hypot(run_x, run_y)
+    if length_m == 0:
+        raise ConfigError(f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point")
+    name = wall.name or f"wall_{index}"
+    middle_m = ((from_x + to_x) / 2, (from_y + to_y) / 2)
+    size_m = (length_m, wall.thickness_m, wall.height_m)
+    obstacle = block(name, middle_m, size_m, math.atan2(run_y, run_x))
+    return _with_material(obstacle, wall)
+
+
+def _placed_step(index: int, step: Step) -> Placed:
+    name = step.name or f"step_{index}"
+    size_m = (*step.size_m, step.height_m)
+    platform = block(name, step.position_m, size_m, step.yaw_rad)
+    return Placed(obstacle=platform, friction=step.friction, walkable=True)
+
+
+def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:
+    """Return the pegs of one `[[pegs_along_route]]`: one at each inflection, on the side from which it pushes forward.
+
+    Raises:
+        ConfigError: The scene has no route, or the route has too few inflections.
+    """
     where = f"scene {scene.name!r}: `pegs_along_route.{index}`"
     if route is None:
         raise ConfigError(f"{where}: the scene has no route; add a [route] section")
-    spots = route.inflections_s_m()[row.first : row.first + row.count]
-    if len(spots) < row.count:
-        have = len(route.inflections_s_m())
+    inflections_s_m = route.inflections_s_m()
+    used_s_m = inflections_s_m[row.first : row.first + row.count]
+    if len(used_s_m) < row.count:
+        available = len(inflections_s_m)
         raise ConfigError(
-            f"{where}: `count` = {row.count} pegs from inflection {row.first} on, but the route has {have} "
-            f"inflections; make the route longer or `count` at most {max(have - row.first, 0)}"
+            f"{where}: `count` = {row.count} pegs from inflection {row.first} on, but the route has {available} "
+            f"inflections; make the route longer or `count` at most {max(available - row.first, 0)}"
         )
-    ends = route.position_w(np.array([0.0, route.length_m]))
-    forward = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    start_w, end_w = route.position_w(np.array([0.0, route.length_m]))
+    forward = (end_w - start_w) / np.linalg.norm(end_w - start_w)
     pegs: list[Placed] = []
-    for k, s in enumerate(spots):
-        tangent = route.tangent_w(s)
+    for number, s_m in enumerate(used_s_m, start=row.first):
+        tangent = route.tangent_w(s_m)
         left = np.array([-tangent[1], tangent[0]])
-        push = left if left @ forward > 0 else -left  # from the peg into the body
-        center = route.position_w(s) - push * (row.corridor_m + row.radius_m)
-        name = f"peg_{index}_{row.first + k}"
-        pegs.append(_placed(peg(name, (float(center[0]), float(center[1])), row.radius_m, row.height_m), row))
+        push = left if left @ forward > 0 else -left  # direction of the force from the peg on the body
+        center = route.position_w(s_m) - push * (row.corridor_m + row.radius_m)
+        center_m = (float(center[0]), float(center[1]))
+        obstacle = peg(f"peg_{index}_{number}", center_m, row.radius_m, row.height_m)
+        pegs.append(_with_material(obstacle, row))
     return pegs
 
 
+def _obstacles_of_field(
+    scene: SceneFile,
+    index: int,
+    field: RandomField,
+    route: Route | None,
+    placed: list[Placed],
+    keep_clear: list[Capsule],
+) -> list[Placed]:
+    """Return the obstacles of one random field, between those that are placed already."""
+    where = f"scene {scene.name!r}: `random_field.{index}`"
+    standing = [item.obstacle for item in placed if not item.walkable]
+    obstacles = random_obstacles(field, where, index, route, standing, keep_clear)
+    solids = solids_of(field, index, len(obstacles))
+    return [_with_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)]
+
+
 def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) -> None:
-    """Raise ConfigError when an obstacle overlaps the snake's start."""
+    """Check that no obstacle overlaps the snake at its start.
+
+    Args:
+        scene: named in the error.
+        placed: all obstacles; the snake may lie on walkable ones.
+        snake: outlines of the links.
+
+    Raises:
+        ConfigError: An obstacle overlaps a link. It names both, and how far they overlap.
+    """
     height_m = max(link.radius_m for link in snake)
-    solid = [_where_it_lies(item, height_m) for item in placed if not item.walkable]
-    obstacles = Outlines.of(solid)
-    rear, front = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
-    along = rear[:, None] + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (front - rear)[:, None]  # (links, SAMPLES, 2)
-    to_middles = Outlines.of_segments(rear, front).distance_m(obstacles.center_w).T - obstacles.rounding_m
-    gaps = np.minimum(obstacles.distance_m(along).min(axis=1), to_middles)  # (links, obstacles), from the links' axes
-    overlaps = np.array([link.radius_m for link in snake])[:, None] - gaps
-    for k, i in np.argwhere(overlaps.T > OVERLAP_M)[:1]:
+    obstacles = [_at_height(item, height_m) for item in placed if not item.walkable]
+    overlaps_m = _overlaps_m(snake, obstacles)
+    for obstacle_index, link_index in np.argwhere(overlaps_m.T > OVERLAP_M)[:1]:
+        overlap_mm = overlaps_m[link_index, obstacle_index] * 1000
         raise ConfigError(
-            f"scene {scene.name!r}: obstacle {solid[k].name!r} overlaps {snake[i].name} of the snake at its start by "
-            f"{overlaps[i, k] * 1000:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or change [start] in "
-            f"the scenario"
+            f"scene {scene.name!r}: obstacle {obstacles[obstacle_index].name!r} overlaps {snake[link_index].name} of "
+            f"the snake at its start by {overlap_mm:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
+            f"change [start] in the scenario"
         )
 
 
-def _where_it_lies(item: Placed, height_m: float) -> Obstacle:
-    """An obstacle where its axis passes this height above the ground."""
+def _overlaps_m(snake: list[Capsule], obstacles: list[Obstacle]) -> Floats:
+    """Return how far every link and obstacle overlap, (links, obstacles); negative where there is a gap.
+
+    The distance of a link's axis from an obstacle's center is exact, which suffices for round obstacles. For boxes the
+    distances from `SAMPLES` points along the axis are taken, too, and the smallest one counts.
+    """
+    outlines = Outlines.of(obstacles)
+    rear_w = np.array([link.rear_m for link in snake])
+    front_w = np.array([link.front_m for link in snake])
+    radius_m = np.array([link.radius_m for link in snake])
+    fractions = np.linspace(0.0, 1.0, SAMPLES)[:, None]
+    points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]  # (links, SAMPLES, 2)
+    from_points_m = outlines.distance_m(points_w).min(axis=1)
+    from_axes_m = Outlines.of_segments(rear_w, front_w).distance_m(outlines.center_w).T - outlines.rounding_m
+    gaps_m = np.minimum(from_points_m, from_axes_m)
+    return radius_m[:, None] - gaps_m
+
+
+def _at_height(item: Placed, height_m: float) -> Obstacle:
+    """Return an obstacle at the position where its axis, which may lean, passes a height above the ground."""
     x, y, z = item.obstacle.position_w
-    aside_m = height_m * math.tan(item.lean_rad)
-    x, y = x + aside_m * math.cos(item.lean_towards_rad), y + aside_m * math.sin(item.lean_towards_rad)
-    return msgspec.structs.replace(item.obstacle, position_w=(x, y, z))
+    offset_m = height_m * math.tan(item.lean_rad)
+    lean_x = x + offset_m * math.cos(item.lean_towards_rad)
+    lean_y = y + offset_m * math.sin(item.lean_towards_rad)
+    return msgspec.structs.replace(item.obstacle, position_w=(lean_x, lean_y, z))

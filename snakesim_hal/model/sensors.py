@@ -1,4 +1,7 @@
-"""The sensors in a robot file. What they publish, and how they are simulated, is described in docs/sensors.md."""
+"""The sensors in a robot file. docs/sensors.md describes what they publish, and how they are simulated.
+
+All noise is given as a standard deviation. A delay is the time from the measurement to the arrival at the host.
+"""
 
 import math
 from collections.abc import Iterator
@@ -20,7 +23,10 @@ from snakesim_hal.wire.quantities import (
     from_zero,
 )
 
-MAX_MOUNTED = 8  # cameras, and as many lidars and range finders: a description has room for 48 keys
+MAX_MOUNTED = 8  # cameras, and also range sensors: a description has room for 48 keys
+COLOR_PIXEL_BYTES = 3  # RGB
+DEPTH_PIXEL_BYTES = 2
+
 Angle = Annotated[float, bounded(-math.pi, math.pi, "rad")]
 Model = Annotated[str, Meta(min_length=1, max_length=500)]
 LinkName = Literal["head", "tail"] | Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
@@ -30,7 +36,7 @@ class JointSensor(FileStruct, frozen=True, kw_only=True):
     """Angle, velocity and torque of every joint. No rate: a sample every tick."""
 
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
-    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0  # standard deviation, as all noise here
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
     velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
     torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
 
@@ -70,47 +76,59 @@ class PowerSensor(FileStruct, frozen=True, kw_only=True):
 
 
 class Mounted(FileStruct, frozen=True, kw_only=True):
-    """A sensor at a place on a link. Several of a kind are told apart by their names.
+    """A sensor at a position on a link; its name distinguishes it from others of the same kind.
 
-    What it measures arrives after `delay_s`, and at least a period later.
+    What it measures arrives after `delay_s`, but not earlier than one control period later.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
-    link: LinkName = "head"
-    position_m: tuple[Offset, Offset, Offset] | None = None  # in the link's frame; none: at the tip of the head
-    yaw_rad: Angle = 0.0  # of its viewing direction from the link's x axis: first about z, positive to the left,
-    pitch_rad: Angle = 0.0  # then about y, positive downwards
+
+    # Pose. The viewing direction is the link's x axis, rotated about z by `yaw_rad` (positive to the left) and then
+    # about y by `pitch_rad` (positive downwards).
+    link: LinkName = "head"  # head, tail, or the number of a link from 0 at the tail
+    position_m: tuple[Offset, Offset, Offset] | None = None  # in the link's frame; none: the tip of the head
+    yaw_rad: Angle = 0.0
+    pitch_rad: Angle = 0.0
+
+    # Time.
     rate_hz: Annotated[float, above(1000, "Hz")] = 20.0
     delay_s: Annotated[float, from_zero(1, "s")] = 0.03
-    settings: dict[str, Any] = {}  # of its model, checked by it
+
+    settings: dict[str, Any] = {}  # of its model, which checks them
 
 
 class Looking(Mounted, frozen=True, kw_only=True):
-    """A sensor that measures distances from there."""
+    """A sensor that measures distances from its position."""
 
     noise_m: Annotated[float, from_zero(1, "m")] = 0.0
-    dropout: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "1"})] = 0.0  # share that measures nothing
+
+    # Fraction of the pixels or beams that measure nothing.
+    dropout: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "1"})] = 0.0
     model: Model = "rays"  # by which the simulator makes its samples
 
 
 class DepthCamera(Looking, frozen=True, kw_only=True):
     """Distances along the optical axis, in an image of square pixels without distortion."""
 
-    width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160
-    height: Annotated[int, Meta(ge=1, le=MAX_IMAGE_HEIGHT)] = 120
-    fov_rad: Annotated[float, above(3, "rad")] = 1.5708  # from the left edge to the right one
+    # Image.
+    width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160  # pixels
+    height: Annotated[int, Meta(ge=1, le=MAX_IMAGE_HEIGHT)] = 120  # pixels
+    fov_rad: Annotated[float, above(3, "rad")] = 1.5708  # from the left edge to the right edge
+
+    # Distances.
     range_min_m: Annotated[float, from_zero(60, "m")] = 0.1
     range_max_m: Annotated[float, above(60, "m")] = 5.0
-    noise_m_per_m2: Annotated[float, from_zero(1, "m/m²")] = 0.0  # more noise, times the square of the distance
-    color: bool = False  # also a color image, which the simulator renders by OpenGL
+    noise_m_per_m2: Annotated[float, from_zero(1, "m/m²")] = 0.0  # additional noise per square of the distance
+
+    color: bool = False  # true: also a color image, which the simulator renders with OpenGL
 
     def __post_init__(self) -> None:
-        """Raises ValueError, which the file reader explains."""
+        """Check the range. Raises ValueError, which the file reader explains."""
         _check_range(self.range_min_m, self.range_max_m)
 
     @property
     def focal_px(self) -> float:
-        """Focal length, of both axes."""
+        """Return the focal length of both axes, in pixels."""
         return self.width / 2 / math.tan(self.fov_rad / 2)
 
 
@@ -118,12 +136,12 @@ class RangeSensor(Looking, frozen=True, kw_only=True):
     """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
-    fov_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0  # from the first beam, on the right, to the last one
+    fov_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0  # from the first beam, on the right, to the last beam
     range_min_m: Annotated[float, from_zero(1000, "m")] = 0.02
     range_max_m: Annotated[float, above(1000, "m")] = 5.0
 
     def __post_init__(self) -> None:
-        """Raises ValueError, which the file reader explains."""
+        """Check range and beams. Raises ValueError, which the file reader explains."""
         _check_range(self.range_min_m, self.range_max_m)
         if (self.beams > 1) != (self.fov_rad > 0):
             raise ValueError(
@@ -132,12 +150,13 @@ class RangeSensor(Looking, frozen=True, kw_only=True):
 
 
 class OwnSensor(Mounted, frozen=True, kw_only=True):
-    """A sensor with a message of its own, which the class in `model` has: see docs/sensors.md."""
+    """A custom sensor: the class in `model` defines its message, see docs/sensors.md."""
 
-    model: Model
+    model: Model  # the name of an installed sensor, or ./file.py:Class
 
 
 def _check_range(min_m: float, max_m: float) -> None:
+    """Raise ValueError if the range of a sensor is empty."""
     if min_m >= max_m:
         raise ValueError(f"`range_min_m` = {min_m:g} m must be below `range_max_m` = {max_m:g} m")
 
@@ -159,7 +178,7 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
     own: Annotated[list[OwnSensor], Meta(max_length=MAX_OWN_SENSORS)] = []
 
     def __post_init__(self) -> None:
-        """Names must tell sensors apart. Raises ValueError, which the file reader explains."""
+        """Check that no two sensors of a kind have the same name. Raises ValueError, which the file reader explains."""
         for kind, sensors in (("depth", self.depth), ("range", self.range), ("own", self.own)):
             names = [sensor.name for sensor in sensors]
             for name in names:
@@ -167,19 +186,19 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
                     raise ValueError(f"two entries of [[sensors.{kind}]] have the name {name!r}; give each its own")
 
     def published(self) -> Iterator[tuple[str, AnySensor]]:
-        """Every sensor but the joints, with its key."""
-        for key, sensor in (
-            (keys.CONTACTS, self.contacts),
-            (keys.IMU, self.imu),
-            (keys.POSE, self.pose),
-            (keys.POWER, self.power),
-        ):
-            if sensor is not None:
-                yield key, sensor
+        """Yield every sensor except for the joint sensor, with the key under which its samples are published."""
+        if self.contacts is not None:
+            yield keys.CONTACTS, self.contacts
+        if self.imu is not None:
+            yield keys.IMU, self.imu
+        if self.pose is not None:
+            yield keys.POSE, self.pose
+        if self.power is not None:
+            yield keys.POWER, self.power
         yield from self.mounted()
 
     def mounted(self) -> Iterator[tuple[str, AnyMounted]]:
-        """The sensors at places on links, with their keys. A camera with color is there twice."""
+        """Yield the sensors at positions on links, with their keys. A color camera has two keys, so it comes twice."""
         for camera in self.depth:
             yield keys.depth(camera.name), camera
             if camera.color:
@@ -191,5 +210,9 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
 
     @property
     def max_image_bytes(self) -> int:
-        """Of the pixels of the largest image; 0 without cameras."""
-        return max((camera.width * camera.height * (3 if camera.color else 2) for camera in self.depth), default=0)
+        """Return the size of the pixels of the largest image; 0 without cameras."""
+        max_bytes = 0
+        for camera in self.depth:
+            bytes_per_pixel = COLOR_PIXEL_BYTES if camera.color else DEPTH_PIXEL_BYTES
+            max_bytes = max(max_bytes, camera.width * camera.height * bytes_per_pixel)
+        return max_bytes

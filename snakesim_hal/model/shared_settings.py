@@ -1,7 +1,7 @@
-"""The settings that the host and the services of a robot must share, in short: for comparing them between machines.
+"""A short form of the settings that the host and the services of a robot must share, to compare them between computers.
 
-Each process reads a scenario of its own, perhaps from another checkout. What only one of them uses may differ: the
-backend, how long a run lasts, injected faults, who starts which service.
+Each process reads its own copy of the scenario, perhaps from another checkout. Settings that only one process uses may
+differ: the backend, the duration of a run, injected faults, and which process starts a service.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ HASH_DIGITS = 12
 
 
 def shared_settings(config: RunConfig) -> dict[str, str]:
-    """Field -> its value, or a hash of a section."""
+    """Return the shared settings: by field, its value as text, or a hash of a section."""
     schedules = {name: (service.decimation, service.latency_ticks) for name, service in config.services.items()}
     return {
         "robot": f"{config.robot.name[:40]} {_hash(config.robot)}",

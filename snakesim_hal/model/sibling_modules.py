@@ -1,8 +1,8 @@
 """Imports of a plugin's file from its own folder: `import helpers` in `./wave.py` finds `helpers.py` beside it.
 
 Python's own search comes first, so a file never replaces a module of Python or of an installed package. Only names
-that the plugin's files import themselves are looked up, not those that a library tries to import because it can do
-without. So a file that another user left in that folder does not run unless the plugin asks for it by name.
+that the plugin's files import themselves are looked up, not optional modules that a library tries to import. So a file
+that another user left in that folder does not run unless the plugin imports it by name.
 """
 
 import ast
@@ -22,7 +22,7 @@ class SiblingFinder(MetaPathFinder):
         self._imported_names: set[str] = set()
 
     def allow_imports_of(self, file: Path) -> None:
-        """Look up from now on what this file imports."""
+        """From now on, also look up the modules that this file imports."""
         self._imported_names.update(_imported_names(file))
 
     def find_spec(
@@ -39,7 +39,7 @@ class SiblingFinder(MetaPathFinder):
 
 
 def find_siblings_of(file: Path) -> None:
-    """Have the imports of a plugin's file find the modules beside it, for as long as this process lives."""
+    """Let the imports of a plugin's file find the modules beside it, until this process ends."""
     folder = file.parent
     for finder in sys.meta_path:
         if isinstance(finder, SiblingFinder) and finder.folder == folder:
@@ -51,7 +51,7 @@ def find_siblings_of(file: Path) -> None:
 
 
 def _source_files(spec: ModuleSpec) -> Iterator[Path]:
-    """The files of a module, or all those of a package."""
+    """Yield the file of a module, or all files of a package."""
     if spec.submodule_search_locations is not None:
         for location in spec.submodule_search_locations:
             yield from Path(location).rglob("*.py")
@@ -60,7 +60,7 @@ def _source_files(spec: ModuleSpec) -> Iterator[Path]:
 
 
 def _imported_names(file: Path) -> Iterator[str]:
-    """The top-level modules that a file imports, anywhere in it; none for a file that is not Python."""
+    """Yield the top-level modules that a file imports, anywhere in it; nothing for a file that is not Python."""
     try:
         tree = ast.parse(file.read_bytes())
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):

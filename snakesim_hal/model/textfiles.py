@@ -19,11 +19,17 @@ from snakesim_hal.base.atomic_write import replaced, write_whole
 from snakesim_hal.base.errors import ConfigError, nearest
 
 MB = 1024 * 1024
-MAX_BYTES, MAX_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML
-MAX_LISTED = 1000  # files of a folder that are looked at for one that may be meant
+
+# A route of 20,000 waypoints has 1.8 MB as formatted JSON, and 0.8 MB as TOML.
+MAX_BYTES = 8 * MB
+MAX_TOML = 2 * MB
+
+MAX_LISTED = 1000  # files of a folder that are searched for a similar name
+MAX_SUGGESTED = 8  # files that an error lists
 MAX_DEPTH = 16  # sections within sections; a run's configuration has 6
 _KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")  # tomllib takes quadratic time for it
+# A key of too many parts; tomllib would need quadratic time for it.
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -36,7 +42,7 @@ _KINDS = {
 
 
 def read_text(path: Path) -> str:
-    """A whole file as text. Raises ConfigError. A UTF-8 byte-order mark is skipped."""
+    """Return a whole file as text, without a byte-order mark. Raises ConfigError if it is not UTF-8 text."""
     data = read_bytes(path)
     if data.startswith(_UTF16) or b"\0" in data:
         raise ConfigError(f"{path}: is UTF-16 text, or not text; save it as UTF-8")
@@ -49,15 +55,16 @@ def read_text(path: Path) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """A whole file. Raises ConfigError."""
+    """Return the bytes of a whole file. Raises ConfigError if it is not a plain file, too large, or not readable."""
     try:
         mode = path.stat().st_mode
         data = b""
         if stat.S_ISREG(mode):  # opening a device may have side effects, opening a pipe blocks
-            with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+            with os.fdopen(descriptor, "rb") as file:
                 data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{_instead_of(path)}") from None
+        raise ConfigError(f"{path}: no such file{_hint_for_missing(path)}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:  # a NUL in the name
@@ -68,42 +75,49 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
-def _instead_of(path: Path) -> str:
-    """What may be meant by the path of a file that is not there."""
+def _hint_for_missing(path: Path) -> str:
+    """Return which file the user may mean by the path of a file that does not exist."""
     try:
-        there = sorted(entry.name for entry in itertools.islice(path.parent.iterdir(), MAX_LISTED))
+        entries = itertools.islice(path.parent.iterdir(), MAX_LISTED)
+        names = sorted(entry.name for entry in entries)
     except OSError as error:
         return f"; its folder {path.parent} cannot be read: {error.strerror}"
-    close = nearest(path.name, there)
-    if close:
-        return f"; did you mean {path.parent / close}?"
+    similar = nearest(path.name, names)
+    if similar:
+        return f"; did you mean {path.parent / similar}?"
     if not path.suffix:
         return ""
-    alike = [name for name in there if name.endswith(path.suffix)][:8]
-    return f"; in {path.parent.absolute()} " + (f"are {', '.join(alike)}" if alike else f"is no file *{path.suffix}")
+    folder = path.parent.absolute()
+    same_suffix = [name for name in names if name.endswith(path.suffix)][:MAX_SUGGESTED]
+    if same_suffix:
+        return f"; in {folder} are {', '.join(same_suffix)}"
+    return f"; in {folder} is no file *{path.suffix}"
 
 
 def _check_plain(path: Path, mode: int) -> None:
+    """Raise ConfigError if a path is a folder, a pipe, a device or a symbolic link."""
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), "something else")
         raise ConfigError(f"{path}: is {kind}, not a file; name a file")
 
 
 def parse_json(text: str, source: str) -> Any:
-    """A JSON text. Raises ConfigError."""
+    """Return the value of a JSON text. Raises ConfigError, which names the source."""
     return _parsed(text, source, json.loads, "JSON")
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """A TOML text. Raises ConfigError."""
+    """Return the values of a TOML text. Raises ConfigError, which names the source."""
     if len(text) > MAX_TOML:
         raise ConfigError(f"{source}: is larger than {MAX_TOML // MB} MB; make it smaller, or write it as JSON")
-    if deep := _DEEP_KEY.search(text):
-        raise ConfigError(f"{source}: key `{deep[0][:40]}...` has more than {MAX_DEPTH} parts")
+    deep_key = _DEEP_KEY.search(text)
+    if deep_key:
+        raise ConfigError(f"{source}: key `{deep_key[0][:40]}...` has more than {MAX_DEPTH} parts")
     return _parsed(text, source, tomllib.loads, "TOML")
 
 
 def _parsed(text: str, source: str, parse: Callable[[str], Any], language: str) -> Any:
+    """Return what a parser makes of a text. Raises ConfigError if the text is not valid, or nested too deep."""
     try:
         value = parse(text)
     except RecursionError:
@@ -115,7 +129,11 @@ def _parsed(text: str, source: str, parse: Callable[[str], Any], language: str) 
 
 
 def check_brackets(text: str, source: str) -> None:
-    """For a text that another library parses: Zenoh overflows its stack on deep nesting. Raises ConfigError."""
+    """Check the nesting of a text that another library parses: Zenoh overflows its stack on deep nesting.
+
+    Raises:
+        ConfigError: The text is nested deeper than MAX_DEPTH.
+    """
     depth = 0
     for bracket in re.findall(r"[][{}]", text):
         depth += 1 if bracket in "[{" else -1
@@ -124,29 +142,29 @@ def check_brackets(text: str, source: str) -> None:
 
 
 def _check_depth(value: Any, source: str) -> None:
-    """After this check, code that walks through the values may recurse once a level."""
-    level: list[Any] = [value]
+    """Raise ConfigError if a value is nested too deep. Later code may then recurse through its levels safely."""
+    containers: list[Any] = [value]
     for _ in range(MAX_DEPTH):
         inner: list[Any] = []
-        for one in level:
-            if isinstance(one, dict):
-                inner += one.values()
-            elif isinstance(one, list):
-                inner += one
-        level = [one for one in inner if isinstance(one, dict | list)]
-        if not level:
+        for container in containers:
+            if isinstance(container, dict):
+                inner += container.values()
+            elif isinstance(container, list):
+                inner += container
+        containers = [part for part in inner if isinstance(part, dict | list)]
+        if not containers:
             return
     raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels")
 
 
 @contextlib.contextmanager
 def exported(path: Path) -> Iterator[Path]:
-    """Yield the path where an export is written, file or folder; it becomes `path` when it is whole.
+    """Yield a temporary path for an export, file or folder; it becomes `path` when it is complete.
 
-    Through a symbolic link, the file that it leads to is replaced.
+    If `path` is a symbolic link, the file that it leads to is replaced.
 
     Raises:
-        ConfigError: It cannot be written, for the disk is full for example. No half of it is left then.
+        ConfigError: It cannot be written, for example because the disk is full. No half-written file is left then.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -160,15 +178,21 @@ def exported(path: Path) -> Iterator[Path]:
 
 
 def _reason(error: OSError) -> str:
-    """Return why it failed; some libraries raise it with a text of their own, and no more."""
-    number = error.errno if error.errno is not None else re.search(r"errno (\d+)", str(error))
-    if isinstance(number, re.Match):
-        number = int(number[1])
-    return str(error) if number is None else os.strerror(number)
+    """Return why an operation failed. Some libraries raise errors without a number, but with one in their text."""
+    if error.errno is not None:
+        return os.strerror(error.errno)
+    match = re.search(r"errno (\d+)", str(error))
+    if match is not None:
+        return os.strerror(int(match[1]))
+    return str(error)
 
 
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
-    """Write a file atomically, or leave it unchanged. Raises ConfigError; also for a link or a device."""
+    """Write a file atomically, or leave it unchanged.
+
+    Raises:
+        ConfigError: The file cannot be written, or the path is a folder, a symbolic link or a device.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):

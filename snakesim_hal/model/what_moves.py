@@ -1,4 +1,4 @@
-"""Whether something real moves: said in the same words by every program that a person watches a robot with."""
+"""Whether real motors move, in the same words for every program with which a person watches a robot."""
 
 from snakesim_hal.wire.messages import Description
 
@@ -8,9 +8,10 @@ UNKNOWN = "UNKNOWN"
 
 
 def describe_what_moves(robot: Description | None) -> str:
-    """Returns one of the three words above, and what it means.
+    """Return one of the three words above, and what it means.
 
-    robot: as its host describes it. None: no description arrived, and then a real robot cannot be excluded.
+    Args:
+        robot: the description from the host; None: no description arrived, so a real robot cannot be excluded.
     """
     if robot is None:
         return f"{UNKNOWN} whether motors move: the host has not described the robot; treat it as a real one"

@@ -1,8 +1,9 @@
 """Physics that simulators, emulated modules and viewers share. Pure; no controller, host or network needs it.
 
-`thermal`   heat of joint modules; its derating curve is also that of `safety`
-`motor`     a joint's actuator      `physics_model`   a model of joints that turn under torques, as emulated joint
-modules use it
-`motors`    all motors of a robot as vectors: the power stages of emulated drives
-`hills`     heights of uneven ground
+`thermal`         temperatures of joint modules; their derating curve is also that of `safety`
+`motor`           the motor model of one joint
+`motors`          all motors of a robot as vectors: the power stages of emulated drives
+`physics_model`   the protocol of a model of joints that move under torques, for emulated joint modules
+`backlash`        a physics model whose gears have backlash
+`hills`           heights of uneven ground
 """

@@ -1,7 +1,7 @@
 """A physics model whose drives reach some of its links through gears with backlash, for emulated drives.
 
-An encoder on the motor's side of such a gear turns through the backlash at each reversal, while the link stays where it
-is. The rotor of such a joint therefore has an angle of its own:
+An encoder on the motor's side of such a gear rotates through the backlash at each reversal, while the link stays where
+it is. The rotor of such a joint therefore has an angle of its own:
 
     rotor_inertia * rotor_acceleration = motor torque - rotor friction - tooth torque
 
@@ -22,6 +22,7 @@ from snakesim_hal.wire.messages import Imu, Pose
 TOOTH_STIFFNESS_NM_PER_RAD = 300.0  # softer than most gears; an explicit step of 1 ms integrates it on a light link
 TOOTH_DAMPING_NM_S_PER_RAD = 0.3  # teeth hardly rebound
 LINK_SIDE_INERTIA_RATIO = 0.1  # of the rotor's inertia: the gear's output stage stays on the link
+MIN_ROTOR_KG_M2 = 1e-4  # a rotor without inertia could not be integrated
 
 
 def without_rotors(config: RunConfig, joints: Sequence[Joint], backlash_rad: Mapping[str, float]) -> RunConfig:
@@ -48,85 +49,95 @@ class BacklashPlant:
         """Place every rotor somewhere within its backlash, at rest.
 
         Args:
-            physics model: made from the configuration that `without_rotors` returns.
+            physics_model: made from the configuration that `without_rotors` returns.
             joints: every joint as it is in truth, tail to head.
             backlash_rad: the whole play of a joint, from one tooth flank to the other, by the joint's name.
             seed: decides where within its backlash each rotor starts.
         """
         self._physics_model = physics_model
         self.step_s = physics_model.step_s
+
+        # Joints with backlash, and the parameters of their rotors; every array has one entry for each of them.
         loose = [i for i, joint in enumerate(joints) if joint.name in backlash_rad]
         motors = [joints[i].motor for i in loose]
         self._loose = np.array(loose, dtype=np.intp)
         self._half_rad: Floats = np.array([backlash_rad[joints[i].name] / 2 for i in loose])
-        self._inertia_kg_m2: Floats = np.array([max(motor.armature_kg_m2, 1e-4) for motor in motors])
+        self._inertia_kg_m2: Floats = np.array([max(motor.armature_kg_m2, MIN_ROTOR_KG_M2) for motor in motors])
         self._friction_nm: Floats = np.array([motor.friction_nm for motor in motors])
         self._viscous_nm_s: Floats = np.array([motor.viscous_nm_s_per_rad for motor in motors])
-        offset = np.random.default_rng(seed).uniform(-1.0, 1.0, len(loose)) * self._half_rad
-        self._rotor_rad: Floats = physics_model.angle_rad[self._loose] + offset
+
+        # State of the rotors, at the joint: behind the gear.
+        offset_rad = np.random.default_rng(seed).uniform(-1.0, 1.0, len(loose)) * self._half_rad
+        self._rotor_rad: Floats = physics_model.angle_rad[self._loose] + offset_rad
         self._rotor_rad_s: Floats = np.zeros(len(loose))
         self._tooth_nm: Floats = np.zeros(len(loose))
 
     def advance(self, torque_nm: Floats) -> None:
         """Advance rotors and links by `step_s` under these motor torques."""
-        self._turn_rotors(torque_nm[self._loose])
-        passed_on = torque_nm.copy()
-        passed_on[self._loose] = self._tooth_nm
-        self._physics_model.advance(passed_on)
+        self._advance_rotors(torque_nm[self._loose])
+        link_torque_nm = torque_nm.copy()
+        link_torque_nm[self._loose] = self._tooth_nm
+        self._physics_model.advance(link_torque_nm)
 
-    def _turn_rotors(self, motor_nm: Floats) -> None:
-        """Advance the rotors, implicitly in the spring and the damper; the links keep their velocity for the step."""
-        link_rad, link_rad_s = (
-            self._physics_model.angle_rad[self._loose],
-            self._physics_model.velocity_rad_s[self._loose],
-        )
+    def _advance_rotors(self, motor_nm: Floats) -> None:
+        """Advance the rotors by a step; the links keep their velocity meanwhile.
+
+        The step is implicit in the spring and the damper of the teeth, and in the viscous friction. Coulomb friction
+        is applied afterwards, and at most stops the rotor.
+        """
+        step_s = self.step_s
+        link_rad = self._physics_model.angle_rad[self._loose]
+        link_rad_s = self._physics_model.velocity_rad_s[self._loose]
+
+        # The teeth touch where the rotor is farther from the link than half of the backlash.
         apart_rad = self._rotor_rad - link_rad
         pressed_rad = apart_rad - np.clip(apart_rad, -self._half_rad, self._half_rad)
         touching = pressed_rad != 0.0
         stiffness = np.where(touching, TOOTH_STIFFNESS_NM_PER_RAD, 0.0)
         damping = np.where(touching, TOOTH_DAMPING_NM_S_PER_RAD, 0.0)
-        step_s = self.step_s
+
+        # Velocity: (inertia + step (viscous + damping) + step² stiffness) * change = step * net torque.
         slip_rad_s = self._rotor_rad_s - link_rad_s
         net_nm = motor_nm - self._viscous_nm_s * self._rotor_rad_s
         net_nm = net_nm - stiffness * (pressed_rad + step_s * slip_rad_s) - damping * slip_rad_s
-        opposing = self._inertia_kg_m2 + step_s * (self._viscous_nm_s + damping) + step_s**2 * stiffness
-        self._rotor_rad_s = self._rotor_rad_s + step_s * net_nm / opposing
-        stop_rad_s = step_s * self._friction_nm / opposing
-        self._rotor_rad_s = self._rotor_rad_s - np.clip(self._rotor_rad_s, -stop_rad_s, stop_rad_s)
+        effective_inertia = self._inertia_kg_m2 + step_s * (self._viscous_nm_s + damping) + step_s**2 * stiffness
+        self._rotor_rad_s = self._rotor_rad_s + step_s * net_nm / effective_inertia
+        max_stopped_rad_s = step_s * self._friction_nm / effective_inertia
+        self._rotor_rad_s = self._rotor_rad_s - np.clip(self._rotor_rad_s, -max_stopped_rad_s, max_stopped_rad_s)
         self._rotor_rad = self._rotor_rad + step_s * self._rotor_rad_s
-        tooth_nm = stiffness * (pressed_rad + step_s * (self._rotor_rad_s - link_rad_s))
-        tooth_nm = tooth_nm + damping * (self._rotor_rad_s - link_rad_s)
+
+        # Torque on the links at the end of the step.
+        slip_rad_s = self._rotor_rad_s - link_rad_s
+        tooth_nm = stiffness * (pressed_rad + step_s * slip_rad_s)
+        tooth_nm = tooth_nm + damping * slip_rad_s
         pushes = tooth_nm * pressed_rad > 0.0  # teeth do not pull
         self._tooth_nm = np.where(pushes, tooth_nm, 0.0)
 
     @property
     def angle_rad(self) -> Floats:
-        """Joint angles as the encoders on the rotors measure them, (n_joints,)."""
+        """Return joint angles as the encoders on the rotors measure them, (n_joints,)."""
         angle_rad = self._physics_model.angle_rad.copy()
         angle_rad[self._loose] = self._rotor_rad
         return angle_rad
 
     @property
     def velocity_rad_s(self) -> Floats:
-        """Joint velocities as the encoders on the rotors measure them, (n_joints,)."""
+        """Return joint velocities as the encoders on the rotors measure them, (n_joints,)."""
         velocity_rad_s = self._physics_model.velocity_rad_s.copy()
         velocity_rad_s[self._loose] = self._rotor_rad_s
         return velocity_rad_s
 
     def shaft_torque_nm(self) -> Floats:
-        """Torque through each joint's shaft; behind a gear with backlash, that of its teeth."""
+        """Return the torque through each joint's shaft; behind a gear with backlash, that of its teeth."""
         torque_nm = self._physics_model.shaft_torque_nm()
         torque_nm[self._loose] = self._tooth_nm
         return torque_nm
 
     def loads(self) -> list[LinkLoad]:
-        """Loads of the links in contact."""
         return self._physics_model.loads()
 
     def imu(self) -> Imu | None:
-        """Angular velocity and specific force of the links."""
         return self._physics_model.imu()
 
     def pose(self) -> Pose | None:
-        """Pose of the base."""
         return self._physics_model.pose()

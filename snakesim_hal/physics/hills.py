@@ -1,28 +1,36 @@
-"""The heights of uneven ground, as the simulator builds it and viewers draw it. Pure."""
+"""The heights of uneven ground. The simulator builds the ground from them, and viewers draw it."""
 
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scene import Heightfield
 
-SAMPLES_PER_WAVE = 12
-MAX_SAMPLES = 500  # along an edge
-WAVES = 40
+SAMPLES_PER_WAVE = 12  # in one direction, so that hills are smooth
+MIN_SAMPLES = 16  # along an edge
+MAX_SAMPLES = 500  # along an edge; more would slow down the simulator
+WAVES = 40  # plane waves whose sum is the ground
+WAVELENGTH_SPREAD = (0.7, 1.3)  # wave numbers of the waves, relative to that of the typical wavelength
 
 
 def hills(uneven: Heightfield) -> Floats:
-    """Heights over the square area, (n, n) float64 in metres, row by row along y; from -height/2 to +height/2.
+    """Return the heights over the square area, (n, n) float64 in m, row by row along y.
 
-    A sum of plane waves of about one wavelength, in random directions: smooth, and the same for a seed.
+    The ground is a sum of plane waves in random directions, so it is smooth, and the same for the same seed:
+
+        h(x, y) = sum_i cos(k_i (x cos(d_i) + y sin(d_i)) + phase_i)
+
+    It is then scaled and shifted to the range from -height/2 to +height/2.
     """
     random = np.random.default_rng(uneven.seed)
-    n = int(np.clip(SAMPLES_PER_WAVE * uneven.area_m / uneven.wavelength_m, 16, MAX_SAMPLES))
+    samples = SAMPLES_PER_WAVE * uneven.area_m / uneven.wavelength_m
+    n = int(np.clip(samples, MIN_SAMPLES, MAX_SAMPLES))
     x = np.linspace(-uneven.area_m / 2, uneven.area_m / 2, n)
     heights = np.zeros((n, n))
     for _ in range(WAVES):
         direction, phase = random.uniform(0, 2 * np.pi, 2)
-        number = 2 * np.pi / uneven.wavelength_m * random.uniform(0.7, 1.3)
-        along_x, along_y = number * np.cos(direction) * x, number * np.sin(direction) * x
+        wave_number = 2 * np.pi / uneven.wavelength_m * random.uniform(*WAVELENGTH_SPREAD)
+        along_x = wave_number * np.cos(direction) * x
+        along_y = wave_number * np.sin(direction) * x
         heights += np.cos(along_x[None, :] + along_y[:, None] + phase)
     heights -= heights.min()
     return uneven.height_m * (heights / heights.max() - 0.5)

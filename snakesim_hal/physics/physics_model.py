@@ -16,45 +16,53 @@ from snakesim_hal.wire.quantities import Vector
 class LinkLoad:
     """The resultant of all contacts of one link with obstacles, in the link's frame: what its force sensor measures."""
 
-    link: int
-    position_l: Vector  # m; mean of the contacts, weighted by force
+    link: int  # index from the tail
+    position_l: Vector  # m; mean position of the contacts, weighted by force
     force_l: Vector  # N, on the body
 
 
 class PhysicsModel(Protocol):
-    """Joints that turn under motor torques, with or without a world around them. Time advances only in `advance`.
+    """Joints that move under motor torques, with or without a world around them. Time advances only in `advance`.
 
-    Its class has `Settings`, a Struct, and is made from a `RunConfig` and those: at the run's start pose, at rest.
+    A class of this kind has `Settings`, which is a Struct. It is constructed from a `RunConfig` and these settings, and
+    then the robot is at rest, at the start pose of the run.
     """
 
     step_s: float  # the longest time for which torques may be held constant
 
     def advance(self, torque_nm: Floats) -> None:
-        """Advance by `step_s` under these motor torques, (n_joints,). Raises BackendError if the state diverges."""
+        """Advance by `step_s` under constant motor torques.
+
+        Args:
+            torque_nm: (n_joints,), tail to head.
+
+        Raises:
+            BackendError: The state has diverged.
+        """
         ...
 
     @property
     def angle_rad(self) -> Floats:
-        """Joint angles now, (n_joints,), tail to head. May be a view of the physics_model's state."""
+        """Return the joint angles now, (n_joints,), tail to head. It may be a view of the state of the model."""
         ...
 
     @property
     def velocity_rad_s(self) -> Floats:
-        """Joint velocities now, (n_joints,)."""
+        """Return the joint velocities now, (n_joints,), tail to head."""
         ...
 
     def shaft_torque_nm(self) -> Floats:
-        """Torque through each joint's shaft, as its strain gauge measures it, (n_joints,)."""
+        """Return the torque through each joint's shaft, as its strain gauge measures it, (n_joints,)."""
         ...
 
     def loads(self) -> list[LinkLoad]:
-        """Loads of the links in contact; empty in a physics model without a world."""
+        """Return the loads of the links in contact; empty in a physics model without a world."""
         ...
 
     def imu(self) -> Imu | None:
-        """Angular velocity and specific force of the links; None in a physics model without a world. Its tick is 0."""
+        """Return angular velocity and specific force of the links; None without a world. The tick of it is 0."""
         ...
 
     def pose(self) -> Pose | None:
-        """Pose of the base, as from motion capture; None in a physics model without a world. Its tick is 0."""
+        """Return the pose of the base, as from motion capture; None without a world. The tick of it is 0."""
         ...

@@ -1,15 +1,15 @@
 """Winding temperatures of joint modules, and their supply currents. For the simulator and emulated modules.
 
-First order: copper losses are proportional to torque squared, and the housing dissipates them.
+The model is of first order: copper losses are proportional to torque squared, and the housing dissipates them.
 
     time constant * d(temperature)/dt = ambient + rise * (torque / rated)^2 - temperature
 
-The robot file's `[heat]` has the numbers, by default typical of a small geared servo: rated torque is available at
-stall for seconds, half of it continuously (80 °C at 20 °C ambient, so 240 K at rated torque); the time constant is a
-minute.
+The robot file's `[heat]` has the numbers. The defaults are typical of a small geared servo: rated torque is available
+at stall for seconds, and half of it continuously (80 °C at 20 °C ambient, so 240 K at rated torque). The time constant
+is a minute.
 
-`HeatLimits` is the only derating curve: the host uses it, and so do the simulator's motors and emulated modules.
-Each is an upper bound of the torque, so the lower one applies; they never multiply.
+`HeatLimits` is the only derating curve: the host uses it, and so do the simulator's motors and emulated modules. Each
+of them computes an upper bound of the torque, so the lower bound applies; the bounds never multiply.
 """
 
 from collections.abc import Sequence
@@ -20,66 +20,99 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 
-MIN_SHARE = 0.2  # of its torque, left to the hottest winding
-INJECTED_ABOVE_STOP_K = 5.0  # by an injected fault
+MIN_SHARE = 0.2  # fraction of its torque that the hottest winding may still use
+INJECTED_ABOVE_STOP_K = 5.0  # how far above its `stop_at_c` an injected fault heats a winding
 
 
 @dataclass(frozen=True)
 class HeatLimits:
-    """Temperatures at which derating begins, and the robot stops: the robot file's `derate_from_c` and `stop_at_c`."""
+    """Winding temperatures at which derating begins, and at which the robot stops; from the robot file."""
 
     derate_from_c: float
     stop_at_c: float
 
     def remaining_fraction(self, winding_c: float) -> float:
-        """Share of the rated torque at a temperature: 1 up to `derate_from_c`, a fifth from `stop_at_c` on."""
+        """Return the fraction of the rated torque that a motor may use at a winding temperature.
+
+        It is 1 up to `derate_from_c`, `MIN_SHARE` from `stop_at_c` on, and falls linearly between the two.
+        """
         over = (winding_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
         return 1.0 - (1.0 - MIN_SHARE) * min(max(over, 0.0), 1.0)
 
 
 class Thermal:
-    """Winding temperatures of all motors, and the power that they take."""
+    """Winding temperatures of all motors, and the power that they draw."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
+        """Start with every winding at the ambient temperature."""
+        # Limits, (n_joints,).
         self.limits = [HeatLimits(joint.limits.derate_from_c, joint.limits.stop_at_c) for joint in joints]
         self.stop_at_c: Floats = np.array([limits.stop_at_c for limits in self.limits])
         self._derate_from_c = np.array([limits.derate_from_c for limits in self.limits])
+
+        # Parameters, (n_joints,).
         self._ambient_c = np.array([joint.heat.ambient_c for joint in joints])
-        self.winding_c: Floats = self._ambient_c.copy()
-        self._held = np.zeros(len(joints), dtype=np.bool_)
-        self._derates = False
         self._rated_nm = np.array([joint.rated_nm for joint in joints])
-        self._rise = np.array([joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints])
+        self._rise = np.array([joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints])  # K/(N·m)²
         self._minus_time_s = np.array([-joint.heat.time_constant_s for joint in joints])
         self._loss_w = np.array([joint.heat.loss_at_rated_w for joint in joints])
         self._board_fraction = np.array([joint.heat.board_fraction for joint in joints])
 
+        # State.
+        self.winding_c: Floats = self._ambient_c.copy()
+        self._held = np.zeros(len(joints), dtype=np.bool_)  # an injected fault keeps the temperature
+        self._derates = False  # whether any motor was derated when `remaining_fraction` was last called
+
     def pass_time(self, seconds: float, torque_squared: Floats) -> None:
-        """Heat and cool, under a mean square of torque, N²·m², (n_joints,). Exact for a constant torque."""
-        settles_at = self._ambient_c + self._rise * torque_squared
-        self.winding_c += (settles_at - self.winding_c) * -np.expm1(seconds / self._minus_time_s)
+        """Heat and cool the windings for a time. Exact for a constant torque.
+
+        The temperature changes by (settled - temperature) * (1 - exp(-seconds / time constant)).
+
+        Args:
+            seconds: how long.
+            torque_squared: mean square of each torque in this time, N²·m², (n_joints,).
+        """
+        settled_c = self._ambient_c + self._rise * torque_squared
+        self.winding_c += (settled_c - self.winding_c) * -np.expm1(seconds / self._minus_time_s)
         np.copyto(self.winding_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._held)
 
     def inject(self, motor: int, *, heat: bool, hold: bool) -> None:
-        """Heat one winding as an injected fault; hold: keep that temperature until the fault ends."""
+        """Change the temperature of one winding as an injected fault.
+
+        Args:
+            motor: index of the joint from the tail.
+            heat: whether to heat the winding above its `stop_at_c` now.
+            hold: whether to keep that temperature, until a call with False.
+        """
         if heat:
             self.winding_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
         self._held[motor] = hold
 
     def remaining_fraction(self) -> Floats | None:
-        """Share of its torque that each motor may use, (n_joints,); None while all are cool."""
-        derated, self._derates = self._derates, bool((self.winding_c > self._derate_from_c).any())
-        if not (self._derates or derated):
+        """Return the fraction of its torque that each motor may use, (n_joints,), if it may have changed.
+
+        Returns:
+            None while all windings are cool. When the last one has cooled down, one more array, which is all 1.
+        """
+        was_derated = self._derates
+        self._derates = bool((self.winding_c > self._derate_from_c).any())
+        if not (self._derates or was_derated):
             return None
-        shares = [
-            of.remaining_fraction(celsius) for of, celsius in zip(self.limits, self.winding_c.tolist(), strict=True)
+        fractions = [
+            limits.remaining_fraction(winding_c)
+            for limits, winding_c in zip(self.limits, self.winding_c.tolist(), strict=True)
         ]
-        return np.array(shares)
+        return np.array(fractions)
 
     def board_c(self) -> Floats:
-        """Temperatures of the electronics beside the windings, (n_joints,)."""
+        """Return the temperatures of the electronics beside the windings, (n_joints,)."""
         return self._ambient_c + self._board_fraction * (self.winding_c - self._ambient_c)
 
     def power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
-        """What the motors take, (n_joints,): mechanical power and copper losses; `Supply.idle_a` comes on top."""
-        return torque_nm * speed_rad_s + self._loss_w * (torque_nm / self._rated_nm) ** 2
+        """Return the power that each motor draws, (n_joints,): mechanical power and copper losses.
+
+        The current that a module draws at rest, `Supply.idle_a`, is not included.
+        """
+        mechanical_w = torque_nm * speed_rad_s
+        copper_loss_w = self._loss_w * (torque_nm / self._rated_nm) ** 2
+        return mechanical_w + copper_loss_w
