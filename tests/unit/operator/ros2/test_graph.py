@@ -30,7 +30,7 @@ def test_namespaces_and_quality_of_service() -> None:
 
 
 def test_attachment_is_that_of_zenohs_serializer() -> None:
-    gid = graph.gid_of(TALKER)
+    gid = graph.compute_gid(TALKER)
     theirs = ext.z_serialize((ext.Int64(7), ext.Int64(1_700_000_000_123_456_789), gid))
-    assert graph.attachment(7, 1_700_000_000_123_456_789, gid) == bytes(theirs)
+    assert graph.make_attachment(7, 1_700_000_000_123_456_789, gid) == bytes(theirs)
     assert len(gid) == 16 and len(bytes(theirs)) == 33
