@@ -54,7 +54,7 @@ class _JointStatesTemplate:
         return self._time_only.SerializeToString() + self._pack(*self._parts)
 
 
-class BodyFrames:
+class BodyMessages:
     """Makes the transforms and joint states of one robot."""
 
     def __init__(self, robot: Description) -> None:

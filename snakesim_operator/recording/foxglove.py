@@ -37,7 +37,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyFrames
+from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_topic, ros_name
 from snakesim_operator.recording.state_messages import ContactForces, StateMessages
 
@@ -74,7 +74,7 @@ class FoxgloveChannels:
         # What the robot has published.
         self._newest: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
         self._robot: Description | None = None
-        self._frames: BodyFrames | None = None
+        self._frames: BodyMessages | None = None
         self._custom_types: dict[str, OwnKind] = {}  # messages of the robot's custom sensors, by key
         self._true_obstacles = shapes.draw_obstacles([], "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
 
@@ -123,7 +123,7 @@ class FoxgloveChannels:
         with suppress(SnakesimError, *UNDECODABLE):
             robot: Description = _get_decoder(Description).decode(payload)
             if len(robot.links) == len(robot.joints) + 1:
-                frames = BodyFrames(robot)
+                frames = BodyMessages(robot)
                 custom_types = own_kinds(robot)
                 self._robot = robot
                 self._frames = frames

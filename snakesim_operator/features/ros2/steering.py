@@ -38,7 +38,7 @@ class CmdVelInput:
         self._twists = twists
         self._intents = session.publisher(keys.INTENT, Intent)
         self._say = say
-        self._steering = Steering()
+        self._steering = CmdVelSteering()
         self._senders = SenderClocks()
         self._reported_reason = ""  # the last reason for dropping that the user has seen
 
@@ -62,7 +62,7 @@ class CmdVelInput:
             self._say(f"a message on cmd_vel {self._reported_reason}; it is dropped, with all that are alike")
 
 
-class Steering:
+class CmdVelSteering:
     """Integrates the turn rates of successive Twists into a desired direction of travel."""
 
     def __init__(self) -> None:

@@ -24,7 +24,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage
 from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyFrames
+from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
@@ -107,7 +107,7 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
 
 def test_joint_states_are_to_the_byte_what_the_library_of_their_schema_writes() -> None:
     robot, time_ns = description(), 1_234_567_890_123
-    names, frames = [joint.name for joint in robot.joints], BodyFrames(robot)
+    names, frames = [joint.name for joint in robot.joints], BodyMessages(robot)
     for angle, speed, torque in (([0.1, -0.2, 3.0], 0.5, -1e-300), ([1.0, 2.0, 3.0], 4.0, 0.0)):
         joints = joint_state(robot, angle, speed, torque)
         rows = zip(names, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)

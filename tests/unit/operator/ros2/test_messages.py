@@ -16,7 +16,7 @@ from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import Marker, Transform
-from snakesim_operator.features.ros2.steering import Steering
+from snakesim_operator.features.ros2.steering import CmdVelSteering
 from tests.unit.hal.strategies import messages_of
 from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
 
@@ -226,7 +226,7 @@ class TestSteering:
         return bytes(JAZZY.serialize_cdr(sent, ros.TWIST.name))
 
     def test_speed_and_direction(self) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         first = steering.make_intent(self.twist(0.2, 1.0), 10**9, 0.5)
         assert first is not None
         assert (first.speed_m_s, first.heading_w_rad, first.go, first.valid_for_ns) == (0.2, 0.5, True, 500_000_000)
@@ -236,11 +236,11 @@ class TestSteering:
         assert held is not None and held.heading_w_rad == pytest.approx(0.6)
 
     def test_a_zero_twist_stops(self) -> None:
-        stop = Steering().make_intent(self.twist(), 1, None)
+        stop = CmdVelSteering().make_intent(self.twist(), 1, None)
         assert stop is not None and not stop.go and stop.heading_w_rad is None
 
     def test_a_twist_counts_from_when_it_was_sent_on_and_a_stop_whenever_it_comes(self) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         fresh = steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
         assert fresh is not None and (fresh.timestamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)
         assert steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
@@ -249,24 +249,24 @@ class TestSteering:
         assert stop is not None and not stop.go and stop.timestamp_ns == 2 * 10**9
 
     def test_direction_does_not_run_away_from_the_body(self) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         for i in range(200):
             intent = steering.make_intent(self.twist(0.1, 2.0), i * 100_000_000, 3.0)
             assert intent is not None and intent.heading_w_rad is not None
             assert abs(intent.heading_w_rad - 3.0) <= np.pi / 2 + 1e-9
 
     def test_after_a_silence_it_starts_from_the_body(self) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         steering.make_intent(self.twist(0.1), 0, 1.0)
         anew = steering.make_intent(self.twist(0.1, 1.0), 10**10, 2.0)
         assert anew is not None and anew.heading_w_rad == 2.0
 
     @pytest.mark.parametrize("bad", [b"", b"\0\1\0\0", b"\0\7\0\0" + bytes(48)])
     def test_noise_is_counted(self, bad: bytes) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         assert steering.make_intent(bad, 0, 0.0) is None and steering.rejected == 1
 
     @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
     def test_what_no_snake_does_is_rejected(self, x: float, turn: float) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None and steering.rejected == 1
