@@ -267,16 +267,23 @@ class FoxgloveChannels:
             messages.append(self._encode_scene("body", shapes.draw_body(robot, time_ns)))
             self._true_obstacles.timestamp.CopyFrom(shapes.make_timestamp(time_ns))
             messages.append(self._encode_scene("obstacles", [self._true_obstacles]))
-        if keys.WORLD in self._newest and self._is_due(keys.WORLD, time_ns, SCENE_PERIOD_NS):
-            world: World | None = self._decode_fresh(keys.WORLD, World, time_ns)
-            if world is not None:
-                obstacles = shapes.draw_obstacles(world.obstacles, "map", shapes.MAP_COLOR, time_ns)
-                messages.append(self._encode_scene("map", [obstacles]))
-        if keys.TRAJECTORY in self._newest and self._is_due(keys.TRAJECTORY, time_ns, SCENE_PERIOD_NS):
-            trajectory: Trajectory | None = self._decode_fresh(keys.TRAJECTORY, Trajectory, time_ns)
-            if trajectory is not None:
-                messages.append(self._encode_scene("path", [shapes.draw_path(trajectory.path_w, time_ns)]))
+        world: World | None = self._decode_when_due(keys.WORLD, World, time_ns)
+        if world is not None:
+            obstacles = shapes.draw_obstacles(world.obstacles, "map", shapes.MAP_COLOR, time_ns)
+            messages.append(self._encode_scene("map", [obstacles]))
+        trajectory: Trajectory | None = self._decode_when_due(keys.TRAJECTORY, Trajectory, time_ns)
+        if trajectory is not None:
+            path = shapes.draw_path(trajectory.path_w, time_ns)
+            messages.append(self._encode_scene("path", [path]))
         return messages
+
+    def _decode_when_due(self, key: str, message_type: type[Any], time_ns: int) -> Any:
+        """Return the newest message of a key if the scene is due to show it; else None."""
+        if key not in self._newest:
+            return None
+        if not self._is_due(key, time_ns, SCENE_PERIOD_NS):
+            return None
+        return self._decode_fresh(key, message_type, time_ns)
 
     def _find_base(self, world: PoseAndContacts | None, time_ns: int) -> BasePose | None:
         """Return the pose of link 0: the measured one, else the one that the world model estimates."""

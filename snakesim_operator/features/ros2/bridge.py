@@ -24,6 +24,7 @@ from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.frames import Frames
 from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
+from snakesim_operator.features.ros2.messages import Transform
 from snakesim_operator.features.ros2.relay import Relay, RosTime
 from snakesim_operator.features.ros2.sensor_topics import SensorTopics, StaticFrames
 from snakesim_operator.features.ros2.steering import CmdVelInput
@@ -113,18 +114,22 @@ class Bridge:
     # --- setup
 
     def _declare_topics(self) -> None:
-        """Declare the publishers of the topics that every robot has."""
+        """Declare the publishers of the topics that every robot has. /tf, /diagnostics and /clock have no namespace."""
         self._joint_states = self._declare_publisher("joint_states", ros.JOINT_STATE)
-        self._tf = self._node.declare_publisher(Topic("/tf", ros.TRANSFORMS, depth=100))
-        tf_static = self._node.declare_publisher(Topic("/tf_static", ros.TRANSFORMS, depth=1, latched=True))
-        self._static_frames = StaticFrames(tf_static, self._ros_time)
+        tf_topic = Topic("/tf", ros.TRANSFORMS, depth=100)
+        self._tf = self._node.declare_publisher(tf_topic)
+        static_topic = Topic("/tf_static", ros.TRANSFORMS, depth=1, latched=True)
+        static_publisher = self._node.declare_publisher(static_topic)
+        self._static_frames = StaticFrames(static_publisher, self._ros_time)
         self._robot_description = self._declare_publisher("robot_description", ros.STRING, depth=1, latched=True)
         self._contact_markers = self._declare_publisher("contacts", ros.MARKERS)
         self._obstacle_markers = self._declare_publisher("obstacles", ros.MARKERS)
-        self._diagnostics = self._node.declare_publisher(Topic("/diagnostics", ros.DIAGNOSTICS))
+        diagnostics_topic = Topic("/diagnostics", ros.DIAGNOSTICS)
+        self._diagnostics = self._node.declare_publisher(diagnostics_topic)
         self._ros_clock: RosPublisher | None = None
         if not self._options.wall_time:
-            self._ros_clock = self._node.declare_publisher(Topic("/clock", ros.CLOCK, depth=1, best_effort=True))
+            clock_topic = Topic("/clock", ros.CLOCK, depth=1, best_effort=True)
+            self._ros_clock = self._node.declare_publisher(clock_topic)
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
         return self._node.declare_publisher(Topic(f"/{self.prefix}{name}", ros_type, **quality))
@@ -139,21 +144,26 @@ class Bridge:
         self._frames = Frames(robot, self.prefix)
         self._joint_names = [joint.name for joint in robot.joints]
         self._sensor_topics.set_robot(robot, self._frames)
-        self._robot_description.publish(ros.encode_string(make_urdf(robot, self.prefix)))
+        urdf = make_urdf(robot, self.prefix)
+        self._robot_description.publish(ros.encode_string(urdf))
         self._static_frames.reset(self._frames)
 
     def _make_relays(self, robot: m.Description) -> list[Relay[Any]]:
         """Return the relays of all keys that this robot has."""
+        session = self._session
+        every_cycle = 1
         status_cycles = self._cycles_between(STATUS_HZ)
-        relays: list[Relay[Any]] = [
-            Relay(self._session, keys.JOINTS, m.JointState, 1, self._forward_joints),
-            Relay(self._session, keys.WORLD, m.World, 1, self._forward_world),
-            Relay(self._session, keys.STATUS, m.Status, status_cycles, self._forward_status),
-        ]
-        if any(sensor.key == keys.POSE for sensor in robot.sensors):
-            relays.append(Relay(self._session, keys.POSE, m.Pose, 1, self._forward_pose))
         image_cycles = self._cycles_between(self._options.images_hz)
-        return relays + self._sensor_topics.make_relays(image_cycles)
+        relays: list[Relay[Any]] = [
+            Relay(session, keys.JOINTS, m.JointState, every_cycle, self._forward_joints),
+            Relay(session, keys.WORLD, m.World, every_cycle, self._forward_world),
+            Relay(session, keys.STATUS, m.Status, status_cycles, self._forward_status),
+        ]
+        has_pose_sensor = any(sensor.key == keys.POSE for sensor in robot.sensors)
+        if has_pose_sensor:
+            relays.append(Relay(session, keys.POSE, m.Pose, every_cycle, self._forward_pose))
+        relays += self._sensor_topics.make_relays(image_cycles)
+        return relays
 
     def _cycles_between(self, hz: float) -> int:
         """Return the number of bridge cycles between two messages that come at most at this rate."""
@@ -193,21 +203,24 @@ class Bridge:
     def _forward_joints(self, joints: m.JointState) -> None:
         self._joints = joints
         timestamp_ns = self._ros_time.convert(joints.timestamp_ns)
-        self._joint_states.publish(robot_in_ros.encode_joint_state(timestamp_ns, self._joint_names, joints))
-        self._tf.publish(ros.encode_transforms(timestamp_ns, self._frames.joint_transforms(joints)))
+        message = robot_in_ros.encode_joint_state(timestamp_ns, self._joint_names, joints)
+        self._joint_states.publish(message)
+        self._publish_transforms(joints.timestamp_ns, self._frames.joint_transforms(joints))
 
     def _forward_world(self, world: m.World) -> None:
         self._world = world
         self._undrawn_world = world
         self._world_arrival_s = time.monotonic()
-        timestamp_ns = self._ros_time.convert(_find_pose_time_ns(world))
-        self._tf.publish(ros.encode_transforms(timestamp_ns, [self._frames.base_transform(world)]))
+        self._publish_transforms(_find_pose_time_ns(world), [self._frames.base_transform(world)])
 
     def _forward_pose(self, pose: m.Pose) -> None:
         """Publish the measured pose of the base, while no world model gives an estimate of it."""
         if self._world_is_silent():
-            timestamp_ns = self._ros_time.convert(pose.timestamp_ns)
-            self._tf.publish(ros.encode_transforms(timestamp_ns, [self._frames.base_transform(pose)]))
+            self._publish_transforms(pose.timestamp_ns, [self._frames.base_transform(pose)])
+
+    def _publish_transforms(self, robot_ns: int, transforms: list[Transform]) -> None:
+        timestamp_ns = self._ros_time.convert(robot_ns)
+        self._tf.publish(ros.encode_transforms(timestamp_ns, transforms))
 
     def _forward_status(self, status: m.Status) -> None:
         timestamp_ns = self._ros_time.convert(status.timestamp_ns)
@@ -215,17 +228,16 @@ class Bridge:
 
     def _publish_markers(self, world: m.World) -> None:
         """Publish the contacts and obstacles of a world model."""
+        frame = self._frames.odom
         contacts_ns = world.timestamp_ns
         if world.contacts_timestamp_ns is not None:
             contacts_ns = world.contacts_timestamp_ns
         contacts = robot_in_ros.make_contact_markers(world.contacts)
-        self._contact_markers.publish(
-            ros.encode_markers(self._ros_time.convert(contacts_ns), self._frames.odom, contacts)
-        )
+        timestamp_ns = self._ros_time.convert(contacts_ns)
+        self._contact_markers.publish(ros.encode_markers(timestamp_ns, frame, contacts))
         obstacles = robot_in_ros.make_obstacle_markers(world)
-        self._obstacle_markers.publish(
-            ros.encode_markers(self._ros_time.convert(world.timestamp_ns), self._frames.odom, obstacles)
-        )
+        timestamp_ns = self._ros_time.convert(world.timestamp_ns)
+        self._obstacle_markers.publish(ros.encode_markers(timestamp_ns, frame, obstacles))
 
     def _world_is_silent(self) -> bool:
         return time.monotonic() - self._world_arrival_s > SILENT_S

@@ -193,10 +193,18 @@ def encode_image(timestamp_ns: int, frame: str, width: int, height: int, encodin
         encoding: 16UC1 (mm), 32FC1 (m) or rgb8.
         pixels: Rows without padding, little endian.
     """
-    header = make_header(timestamp_ns, frame)
     is_big_endian = 0
     row_bytes = len(pixels) // height
-    return encode_message(IMAGE, header, height, width, encoding, is_big_endian, row_bytes, _make_octets(pixels))
+    return encode_message(
+        IMAGE,
+        make_header(timestamp_ns, frame),
+        height,
+        width,
+        encoding,
+        is_big_endian,
+        row_bytes,
+        _make_octets(pixels),
+    )
 
 
 def encode_compressed_image(timestamp_ns: int, frame: str, format_: str, data: bytes) -> bytes:

@@ -49,13 +49,17 @@ def encode_joint_state(timestamp_ns: int, names: list[str], joints: JointState) 
     Joints whose state is not valid are left out, because a JointState may name any subset of the joints.
     """
     valid_joints = [i for i, is_valid in enumerate(joints.valid) if is_valid]
+    valid_names = [names[i] for i in valid_joints]
+    angles_rad = [joints.angle_rad[i] for i in valid_joints]
+    velocities_rad_s = [joints.velocity_rad_s[i] for i in valid_joints]
+    torques_nm = [joints.torque_nm[i] for i in valid_joints]
     return ros.encode_message(
         ros.JOINT_STATE,
         ros.make_header(timestamp_ns, ""),
-        [names[i] for i in valid_joints],
-        np.array([joints.angle_rad[i] for i in valid_joints], dtype=np.float64),
-        np.array([joints.velocity_rad_s[i] for i in valid_joints], dtype=np.float64),
-        np.array([joints.torque_nm[i] for i in valid_joints], dtype=np.float64),
+        valid_names,
+        np.array(angles_rad, dtype=np.float64),
+        np.array(velocities_rad_s, dtype=np.float64),
+        np.array(torques_nm, dtype=np.float64),
     )
 
 
@@ -110,10 +114,14 @@ def encode_depth_image(timestamp_ns: int, frame: str, image: DepthImage) -> byte
     meters, where NaN means no return.
     """
     if image.scale_m == MILLIMETER_M:
-        return ros.encode_image(timestamp_ns, frame, image.width, image.height, "16UC1", image.depth)
-    counts = np.frombuffer(image.depth, dtype="<u2")
-    depth_m = np.where(counts == 0, np.nan, counts * image.scale_m).astype("<f4")
-    return ros.encode_image(timestamp_ns, frame, image.width, image.height, "32FC1", depth_m.tobytes())
+        encoding = "16UC1"
+        pixels = image.depth
+    else:
+        encoding = "32FC1"
+        counts = np.frombuffer(image.depth, dtype="<u2")
+        depth_m = np.where(counts == 0, np.nan, counts * image.scale_m)
+        pixels = depth_m.astype("<f4").tobytes()
+    return ros.encode_image(timestamp_ns, frame, image.width, image.height, encoding, pixels)
 
 
 def encode_color_image(timestamp_ns: int, frame: str, image: ColorImage) -> bytes:

@@ -22,6 +22,11 @@ ImageEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame an
 SampleEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and sample to a message in CDR
 
 
+def _sensor_name(key: str) -> str:
+    """Return the sensor's name, the last part of its key."""
+    return key.rpartition("/")[2]
+
+
 class StaticFrames:
     """Publishes the transforms that do not change, again in full whenever one of them is new."""
 
@@ -90,45 +95,44 @@ class SensorTopics:
             # A sample holds the IMUs that have new measurements, so all samples count.
             relays.append(Relay(self._session, keys.IMU, m.Imu, 1, self._forward_imu, forwards_all=True))
         for key in sorted(sensor_keys):
-            _, _, name = key.rpartition("/")
+            name = _sensor_name(key)
             if key == keys.depth(name):
-                relays.append(self._relay_depth_camera(key, name, image_every_cycles))
+                relays.append(self._relay_depth_camera(key, image_every_cycles))
             elif key == keys.color(name):
-                relays.append(self._relay_color_camera(key, name, image_every_cycles))
+                relays.append(self._relay_color_camera(key, image_every_cycles))
             elif key == keys.ranges(name):
                 encode = robot_in_ros.encode_laser_scan
-                relays.append(self._relay_mounted_sensor(key, name, "scan", ros.LASER_SCAN, encode))
-        for key, kind in own_kinds(self._robot).items():
-            _, _, name = key.rpartition("/")
-            for field in kind.units:
-                encode_field = partial(robot_in_ros.encode_numbers, kind, field)
-                relays.append(self._relay_mounted_sensor(key, name, field, ros.NUMBERS, encode_field))
+                relays.append(self._relay_mounted_sensor(key, "scan", ros.LASER_SCAN, encode))
+        for key, custom_type in own_kinds(self._robot).items():
+            for field in custom_type.units:
+                encode_field = partial(robot_in_ros.encode_numbers, custom_type, field)
+                relays.append(self._relay_mounted_sensor(key, field, ros.NUMBERS, encode_field))
         return relays
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
         return self._node.declare_publisher(Topic(f"/{self._prefix}{name}", ros_type, **quality))
 
-    def _relay_depth_camera(self, key: str, name: str, every_cycles: int) -> Relay[Any]:
-        topic = f"{ros_name(name)}/depth"
+    def _relay_depth_camera(self, key: str, every_cycles: int) -> Relay[Any]:
+        """Return the relay of a depth camera; its topics are named as image_transport names them."""
+        topic = f"{ros_name(_sensor_name(key))}/depth/image_raw"
+        raw = self._declare_images(topic, ros.IMAGE)
+        compressed = self._declare_images(f"{topic}/compressedDepth", ros.COMPRESSED_IMAGE)
         outputs = (
-            (self._declare_images(f"{topic}/image_raw", ros.IMAGE), robot_in_ros.encode_depth_image),
-            (
-                self._declare_images(f"{topic}/image_raw/compressedDepth", ros.COMPRESSED_IMAGE),
-                robot_in_ros.encode_compressed_depth,
-            ),
+            (raw, robot_in_ros.encode_depth_image),
+            (compressed, robot_in_ros.encode_compressed_depth),
         )
-        return self._relay_camera(key, name, "depth", m.DepthImage, outputs, every_cycles)
+        return self._relay_camera(key, "depth", m.DepthImage, outputs, every_cycles)
 
-    def _relay_color_camera(self, key: str, name: str, every_cycles: int) -> Relay[Any]:
-        topic = f"{ros_name(name)}/color"
+    def _relay_color_camera(self, key: str, every_cycles: int) -> Relay[Any]:
+        """Return the relay of a color camera; its topics are named as image_transport names them."""
+        topic = f"{ros_name(_sensor_name(key))}/color/image_raw"
+        raw = self._declare_images(topic, ros.IMAGE)
+        compressed = self._declare_images(f"{topic}/compressed", ros.COMPRESSED_IMAGE)
         outputs = (
-            (self._declare_images(f"{topic}/image_raw", ros.IMAGE), robot_in_ros.encode_color_image),
-            (
-                self._declare_images(f"{topic}/image_raw/compressed", ros.COMPRESSED_IMAGE),
-                robot_in_ros.encode_compressed_color,
-            ),
+            (raw, robot_in_ros.encode_color_image),
+            (compressed, robot_in_ros.encode_compressed_color),
         )
-        return self._relay_camera(key, name, "color", m.ColorImage, outputs, every_cycles)
+        return self._relay_camera(key, "color", m.ColorImage, outputs, every_cycles)
 
     def _declare_images(self, topic: str, ros_type: RosType) -> RosPublisher:
         return self._declare_publisher(topic, ros_type, depth=1, images=True)
@@ -136,16 +140,23 @@ class SensorTopics:
     def _relay_camera(
         self,
         key: str,
-        name: str,
         kind: str,
         message_type: type[Any],
         outputs: tuple[tuple[RosPublisher, ImageEncoder], ...],
         every_cycles: int,
     ) -> Relay[Any]:
-        """Return the relay of one camera: its images, raw and compressed as image_transport names them, and intrinsics.
+        """Return the relay of one camera, whose samples become images and intrinsics.
 
         Images are read and encoded only while a ROS node subscribes to them.
+
+        Args:
+            key: Key of the camera.
+            kind: depth or color.
+            message_type: Type of its samples.
+            outputs: Publishers of images, and how each encodes a sample.
+            every_cycles: Number of bridge cycles from one image to the next.
         """
+        name = _sensor_name(key)
         camera_info = self._declare_publisher(f"{ros_name(name)}/{kind}/camera_info", ros.CAMERA_INFO, depth=1)
 
         def forward(image: m.DepthImage | m.ColorImage) -> None:
@@ -164,17 +175,17 @@ class SensorTopics:
 
         return Relay(self._session, key, message_type, every_cycles, forward, is_wanted)
 
-    def _relay_mounted_sensor(
-        self, key: str, name: str, topic: str, ros_type: RosType, encode: SampleEncoder
-    ) -> Relay[Any]:
+    def _relay_mounted_sensor(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
         """Return the relay of one topic of a sensor that is mounted on a link."""
+        name = _sensor_name(key)
         publisher = self._declare_publisher(f"{ros_name(name)}/{topic}", ros_type)
         message_type: Any = message_of(key, self._robot)
 
         def forward(sample: m.MountedSample) -> None:
             self._static_frames.place_sensor(key, self._frames.mount_transforms(name, sample))
             timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
-            publisher.publish(encode(timestamp_ns, self._frames.mount_frame(name), sample))
+            frame = self._frames.mount_frame(name)
+            publisher.publish(encode(timestamp_ns, frame, sample))
 
         return Relay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
 
