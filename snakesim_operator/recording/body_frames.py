@@ -5,6 +5,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from itertools import chain, pairwise
 
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointState_pb2 import JointState as NamedJoint
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
@@ -59,12 +60,12 @@ class BodyMessages:
 
     def __init__(self, robot: Description) -> None:
         """Build the messages. robot: a description with one link more than joints."""
-        links = robot.links
-        link_frames = [
-            shapes.make_frame(0, rear.name, front.name, (rear.length_m, 0.0, 0.0), _NO_ROTATION)
-            for rear, front in pairwise(links)
-        ]
-        base_frame = shapes.make_frame(0, shapes.WORLD_FRAME, links[0].name, (0.0, 0.0, 0.0), _NO_ROTATION)
+        link_frames: list[FrameTransform] = []
+        for rear, front in pairwise(robot.links):
+            rear_end = (rear.length_m, 0.0, 0.0)
+            link_frames.append(shapes.make_frame(0, rear.name, front.name, rear_end, _NO_ROTATION))
+        tail = robot.links[0].name
+        base_frame = shapes.make_frame(0, shapes.WORLD_FRAME, tail, (0.0, 0.0, 0.0), _NO_ROTATION)
         self._chain = FrameTransforms(transforms=link_frames)
         self._chain_in_world = FrameTransforms(transforms=[base_frame, *link_frames])
         self._is_pitch = [joint.axis == "pitch" for joint in robot.joints]

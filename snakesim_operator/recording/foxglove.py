@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any
 
 import msgspec
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -175,7 +176,8 @@ class FoxgloveChannels:
         if frames is None or joints is None or not joints.is_of(frames.joint_count):
             return []
         encoded = frames.encode_joint_states(joints, time_ns)
-        return [FoxgloveMessage(make_topic(self._robot_name, "joint_states"), JointStates, encoded)]
+        topic = make_topic(self._robot_name, "joint_states")
+        return [FoxgloveMessage(topic, JointStates, encoded)]
 
     def _convert_contacts(self, payload: bytes) -> list[FoxgloveMessage]:
         contacts: Contacts | None = _decode(Contacts, payload)
@@ -210,8 +212,9 @@ class FoxgloveChannels:
         messages: list[FoxgloveMessage] = []
         if self._is_due(key, time_ns, MOTION_PERIOD_NS):
             link = robot.links[sample.link].name
-            mount = shapes.make_frame(time_ns, link, f"{name}_frame", sample.position_l, sample.orientation_l_wxyz)
-            messages.append(self._encode_protobuf("tf", FrameTransforms(transforms=[mount])))
+            frame_id = f"{name}_frame"
+            mount = shapes.make_frame(time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz)
+            messages.append(self._encode_frame(mount))
         messages.append(self._encode_json(f"own/{name}", sample))
         return messages
 
@@ -232,10 +235,12 @@ class FoxgloveChannels:
         link = robot.links[image.link].name
         orientation = shapes.rotate_to_optical(image.orientation_l_wxyz)
         mount = shapes.make_frame(time_ns, link, frame_id, image.position_l, orientation)
+        raw_image = shapes.make_raw_image(image, frame_id, time_ns)
+        calibration = shapes.make_calibration(image, frame_id, time_ns)
         return [
-            self._encode_protobuf("tf", FrameTransforms(transforms=[mount])),
-            self._encode_protobuf(f"{topic}/image_raw", shapes.make_raw_image(image, frame_id, time_ns)),
-            self._encode_protobuf(f"{topic}/camera_info", shapes.make_calibration(image, frame_id, time_ns)),
+            self._encode_frame(mount),
+            self._encode_protobuf(f"{topic}/image_raw", raw_image),
+            self._encode_protobuf(f"{topic}/camera_info", calibration),
         ]
 
     def _make_drawings(self, time_ns: int) -> list[FoxgloveMessage]:
@@ -254,7 +259,8 @@ class FoxgloveChannels:
         if base is not None:
             messages.append(self._encode_protobuf("pose", _make_pose(base, time_ns)))
         if world is not None:
-            messages.append(self._encode_scene("forces", [shapes.draw_forces(world.contacts, time_ns)]))
+            forces = shapes.draw_forces(world.contacts, time_ns)
+            messages.append(self._encode_scene("forces", [forces]))
         if self._state_due_ns <= time_ns:  # host and controller are silent, which is shown as well
             messages += self._make_state(time_ns)
         messages += self._make_scene(robot, time_ns)
@@ -264,7 +270,8 @@ class FoxgloveChannels:
         """Return what seldom changes, as far as it is due: body, obstacles, map and path."""
         messages: list[FoxgloveMessage] = []
         if self._is_due("body", time_ns, SCENE_PERIOD_NS):
-            messages.append(self._encode_scene("body", shapes.draw_body(robot, time_ns)))
+            links = shapes.draw_body(robot, time_ns)
+            messages.append(self._encode_scene("body", links))
             self._true_obstacles.timestamp.CopyFrom(shapes.make_timestamp(time_ns))
             messages.append(self._encode_scene("obstacles", [self._true_obstacles]))
         world: World | None = self._decode_when_due(keys.WORLD, World, time_ns)
@@ -298,6 +305,9 @@ class FoxgloveChannels:
 
     def _encode_scene(self, name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
         return self._encode_protobuf(f"scene/{name}", SceneUpdate(entities=entities))
+
+    def _encode_frame(self, frame: FrameTransform) -> FoxgloveMessage:
+        return self._encode_protobuf("tf", FrameTransforms(transforms=[frame]))
 
     def _encode_protobuf(self, name: str, message: Protobuf) -> FoxgloveMessage:
         topic = make_topic(self._robot_name, name)

@@ -85,7 +85,11 @@ class Recorder:
         Returns:
             Why the file is incomplete, or an empty text.
         """
-        about = {"version": version("snakesim"), "began": self._began.isoformat(), "dropped": dropped}
+        about = {
+            "version": version("snakesim"),
+            "began": self._began.isoformat(),
+            "dropped": dropped,
+        }
         self.recording.close(about)
         return self.recording.failure
 

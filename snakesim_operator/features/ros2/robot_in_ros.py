@@ -172,7 +172,13 @@ def encode_imu(timestamp_ns: int, frame: str, sample: Imu, entry: int) -> bytes:
 
 def encode_camera_info(timestamp_ns: int, frame: str, image: DepthImage | ColorImage) -> bytes:
     """Return the sensor_msgs/CameraInfo of a depth or color image, of a camera without distortion."""
-    intrinsics = np.array([[image.fx_px, 0.0, image.cx_px], [0.0, image.fy_px, image.cy_px], [0.0, 0.0, 1.0]])
+    intrinsics = np.array(
+        [
+            [image.fx_px, 0.0, image.cx_px],
+            [0.0, image.fy_px, image.cy_px],
+            [0.0, 0.0, 1.0],
+        ]
+    )
     projection = np.hstack([intrinsics, np.zeros((3, 1))])
     no_binning = 0
     whole_image = ros.make_message("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -222,7 +228,9 @@ def encode_numbers(kind: OwnKind, field: str, _timestamp_ns: int, _frame: str, s
         if field_name == field:
             values.append(value)
     label = f"{field} [{kind.units[field]}]"
-    dimension = ros.make_message("std_msgs/msg/MultiArrayDimension", label, len(values), len(values))
+    size = len(values)
+    stride = len(values)
+    dimension = ros.make_message("std_msgs/msg/MultiArrayDimension", label, size, stride)
     layout = ros.make_message("std_msgs/msg/MultiArrayLayout", [dimension], 0)
     return ros.encode_message(ros.NUMBERS, layout, np.array(values, dtype=np.float64))
 

@@ -53,8 +53,11 @@ class CmdVelInput:
         twist = self._twists.newest()
         if twist is None or robot_ns is None:
             return
-        age_ns = self._senders.measure_age(twist, time.time_ns(), time.monotonic_ns())
-        intent = self._steering.make_intent(twist.payload, robot_ns, find_heading(), age_ns)
+        wall_ns = time.time_ns()
+        monotonic_ns = time.monotonic_ns()
+        age_ns = self._senders.measure_age(twist, wall_ns, monotonic_ns)
+        body_w_rad = find_heading()
+        intent = self._steering.make_intent(twist.payload, robot_ns, body_w_rad, age_ns)
         if intent is not None:
             self._intents.put(intent)
         elif self._steering.reason != self._reported_reason:

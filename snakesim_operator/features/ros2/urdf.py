@@ -30,7 +30,9 @@ def make_urdf(robot: Description, prefix: str = "") -> str:
     _add_joint(root, "base", "fixed", base, prefix + robot.links[0].name, 0.0)
     for link in robot.links:
         _add_link(root, link, prefix)
-    for rear, joint, front in zip(robot.links[:-1], robot.joints, robot.links[1:], strict=True):
+    rear_links = robot.links[:-1]
+    front_links = robot.links[1:]
+    for rear, joint, front in zip(rear_links, robot.joints, front_links, strict=True):
         element = _add_joint(root, joint.name, "revolute", prefix + rear.name, prefix + front.name, rear.length_m)
         _add_limits(element, joint)
     ElementTree.indent(root)
