@@ -37,7 +37,7 @@ class DamagedError(Exception):
     """A record is not what it must be; the text says why."""
 
 
-def chunk_bytes(head: bytes) -> int:
+def read_chunk_length(head: bytes) -> int:
     """Return the length of a chunk's content in bytes, by the lengths that it states.
 
     Args:
@@ -63,7 +63,7 @@ def unpack(content: bytes) -> bytearray:
     Raises:
         DamagedError: Its lengths, its compression, its size or its checksum is wrong.
     """
-    if chunk_bytes(content) != len(content):
+    if read_chunk_length(content) != len(content):
         raise DamagedError("a chunk whose lengths contradict each other")
     _, _, size, crc, name_bytes = _CHUNK_HEAD.unpack_from(content)
     name_end = _CHUNK_HEAD.size + name_bytes
@@ -139,7 +139,7 @@ def parse_chunk(data: bytearray) -> Iterator[McapRecord]:
 
 
 def parse_record(opcode: int, content: memoryview) -> McapRecord:
-    """Return a record.
+    """Decode the content of one record.
 
     Args:
         opcode: MESSAGE, or a key of _RECORD_TYPES.

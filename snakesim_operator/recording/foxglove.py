@@ -39,7 +39,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyMessages
-from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_topic, ros_name
+from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
 from snakesim_operator.recording.state_messages import ContactForces, StateMessages
 
 # Periods of what is shown, in robot time.
@@ -208,7 +208,7 @@ class FoxgloveChannels:
         sample = _decode_custom(self._custom_types[key], payload)
         if robot is None or sample is None or sample.link >= len(robot.links):
             return []
-        name = ros_name(key.rpartition("/")[2])
+        name = make_name_part(key.rpartition("/")[2])
         messages: list[FoxgloveMessage] = []
         if self._is_due(key, time_ns, MOTION_PERIOD_NS):
             link = robot.links[sample.link].name
@@ -230,8 +230,8 @@ class FoxgloveChannels:
         if robot is None or image is None or mismatch(image, robot) is not None:
             return []
         _, kind, camera = key.split("/", 2)
-        topic = f"{ros_name(camera)}/{kind}"
-        frame_id = f"{ros_name(camera)}_{kind}_optical_frame"
+        topic = f"{make_name_part(camera)}/{kind}"
+        frame_id = f"{make_name_part(camera)}_{kind}_optical_frame"
         link = robot.links[image.link].name
         orientation = shapes.rotate_to_optical(image.orientation_l_wxyz)
         mount = shapes.make_frame(time_ns, link, frame_id, image.position_l, orientation)

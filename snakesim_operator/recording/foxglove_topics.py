@@ -59,8 +59,8 @@ class FoxgloveSchema(NamedTuple):
     data: bytes
 
 
-def ros_name(text: str) -> str:
-    """Return a text with every character replaced by _ that ROS does not allow in a name."""
+def make_name_part(text: str) -> str:
+    """Return a text as a part of a topic: every character that ROS does not allow in a name becomes _."""
     return re.sub(r"\W", "_", text, flags=re.ASCII)
 
 
@@ -72,7 +72,7 @@ def make_topic(robot: str, name: str) -> str:
         robot: Name of the robot.
         name: Name below that of the robot, such as `joint_states`.
     """
-    return f"/{ros_name(robot)}/{name}"
+    return f"/{make_name_part(robot)}/{name}"
 
 
 @cache

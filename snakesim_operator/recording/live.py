@@ -25,7 +25,7 @@ class LiveServer:
     """Sends messages to every viewer that has subscribed to their topic; a slow viewer loses the oldest."""
 
     def __init__(self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]) -> None:
-        """Start the server.
+        """Start the server with the topics that every robot has.
 
         Args:
             robot: Name of the robot.

@@ -48,7 +48,7 @@ class McapFile:
     """One file. Everything that is added waits for `flush`; only `flush` and `finish` raise OSError."""
 
     def __init__(self, file: GrowingFile) -> None:
-        """Begin the file."""
+        """Write the beginning of the file. file: an empty one, which the caller closes."""
         self._file = file
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
 
@@ -87,7 +87,7 @@ class McapFile:
         return number
 
     def add(self, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message.
+        """Add a message to the present chunk, which ends when it is large enough.
 
         Args:
             channel: Number of its channel.

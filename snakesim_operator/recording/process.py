@@ -77,7 +77,7 @@ class Recorder:
             self._begin_next_file(self._restarted_clock)
 
     def close(self, dropped: dict[str, int]) -> str:
-        """Finish the file.
+        """Write metadata and index into the file, and close it.
 
         Args:
             dropped: Number of dropped messages by key, which the file then states.

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_operator.recording.chunks import HEAD, MAX_RECORD_BYTES, DamagedError, chunk_bytes, parse_record
+from snakesim_operator.recording.chunks import HEAD, MAX_RECORD_BYTES, DamagedError, parse_record, read_chunk_length
 from snakesim_operator.recording.recording import ABOUT
 
 READ_OPCODES = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
@@ -88,7 +88,7 @@ def _check_length(file: BinaryIO, begin: int, opcode: int, length: int) -> None:
     match opcode:
         case Opcode.CHUNK:
             file.seek(begin)
-            if length != chunk_bytes(file.read(_PATTERN_BYTES)):
+            if length != read_chunk_length(file.read(_PATTERN_BYTES)):
                 raise DamagedError("a chunk whose lengths contradict each other")
         case Opcode.MESSAGE_INDEX:
             file.seek(begin)

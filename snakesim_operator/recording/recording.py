@@ -40,7 +40,7 @@ class Recording:
     """A file that is being written. A full disk ends it (see `failure`), and raises nothing."""
 
     def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:
-        """Create the file.
+        """Create the file and write its beginning.
 
         Args:
             path: The new file.

@@ -205,18 +205,18 @@ class Bridge:
         timestamp_ns = self._ros_time.convert(joints.timestamp_ns)
         message = robot_in_ros.encode_joint_state(timestamp_ns, self._joint_names, joints)
         self._joint_states.publish(message)
-        self._publish_transforms(joints.timestamp_ns, self._frames.joint_transforms(joints))
+        self._publish_transforms(joints.timestamp_ns, self._frames.make_joint_transforms(joints))
 
     def _forward_world(self, world: m.World) -> None:
         self._world = world
         self._undrawn_world = world
         self._world_arrival_s = time.monotonic()
-        self._publish_transforms(_find_pose_time_ns(world), [self._frames.base_transform(world)])
+        self._publish_transforms(_find_pose_time_ns(world), [self._frames.make_base_transform(world)])
 
     def _forward_pose(self, pose: m.Pose) -> None:
         """Publish the measured pose of the base, while no world model gives an estimate of it."""
         if self._world_is_silent():
-            self._publish_transforms(pose.timestamp_ns, [self._frames.base_transform(pose)])
+            self._publish_transforms(pose.timestamp_ns, [self._frames.make_base_transform(pose)])
 
     def _publish_transforms(self, robot_ns: int, transforms: list[Transform]) -> None:
         timestamp_ns = self._ros_time.convert(robot_ns)

@@ -19,7 +19,7 @@ NO_ROTATION: Wxyz = (1.0, 0.0, 0.0, 0.0)
 OPTICAL_IN_CAMERA: Wxyz = (0.5, -0.5, 0.5, -0.5)
 
 
-def ros_name(text: str) -> str:
+def make_ros_name(text: str) -> str:
     """Return a text as a valid ROS name: letters, digits and _, without a leading digit."""
     name = re.sub(r"\W", "_", text, flags=re.ASCII)
     if name[:1].isdigit():
@@ -31,7 +31,7 @@ class Frames:
     """The frames of one robot: their names, and the transforms between them."""
 
     def __init__(self, robot: Description, prefix: str = "") -> None:
-        """Name the frames.
+        """Name the frames of the robot.
 
         Args:
             robot: Description of the robot.
@@ -43,37 +43,37 @@ class Frames:
         self.base = f"{prefix}base_link"
         self.fixed = [
             Transform(MAP, self.odom, ORIGIN, NO_ROTATION),
-            Transform(self.base, self.link_frame(0), ORIGIN, NO_ROTATION),
+            Transform(self.base, self.get_link_frame(0), ORIGIN, NO_ROTATION),
         ]
 
-    def link_frame(self, link: int) -> str:
+    def get_link_frame(self, link: int) -> str:
         """Return the frame name of a link."""
         return self._prefix + self._robot.links[link].name
 
-    def optical_frame(self, kind: str, camera: str) -> str:
+    def get_optical_frame(self, kind: str, camera: str) -> str:
         """Return the frame name of a camera's images. kind: depth or color."""
-        return f"{self._prefix}{ros_name(camera)}_{kind}_optical_frame"
+        return f"{self._prefix}{make_ros_name(camera)}_{kind}_optical_frame"
 
-    def mount_frame(self, sensor: str) -> str:
+    def get_mount_frame(self, sensor: str) -> str:
         """Return the frame name of a lidar, a range finder or a custom sensor."""
-        return f"{self._prefix}{ros_name(sensor)}_frame"
+        return f"{self._prefix}{make_ros_name(sensor)}_frame"
 
-    def imu_frame(self, link: int) -> str:
+    def get_imu_frame(self, link: int) -> str:
         """Return the frame name of the IMU on a link."""
-        return f"{self.link_frame(link)}_imu_frame"
+        return f"{self.get_link_frame(link)}_imu_frame"
 
-    def imu_transform(self, link: int) -> Transform:
+    def make_imu_transform(self, link: int) -> Transform:
         """Return the pose of an IMU, which sits in the middle of its link."""
         middle = (self._robot.links[link].length_m / 2, 0.0, 0.0)
-        return Transform(self.link_frame(link), self.imu_frame(link), middle, NO_ROTATION)
+        return Transform(self.get_link_frame(link), self.get_imu_frame(link), middle, NO_ROTATION)
 
-    def base_transform(self, pose: World | Pose) -> Transform:
+    def make_base_transform(self, pose: World | Pose) -> Transform:
         """Return the pose of the base in `odom`."""
         if isinstance(pose, Pose):
             return Transform(self.odom, self.base, pose.position_w, pose.orientation_wxyz)
         return Transform(self.odom, self.base, pose.base_position_w, pose.base_orientation_wxyz)
 
-    def joint_transforms(self, joints: JointState) -> list[Transform]:
+    def make_joint_transforms(self, joints: JointState) -> list[Transform]:
         """Return the pose of each link in the link behind it, without the links whose joint state is not valid."""
         transforms: list[Transform] = []
         for i, joint in enumerate(self._robot.joints):
@@ -81,20 +81,20 @@ class Frames:
                 continue
             position = (self._robot.links[i].length_m, 0.0, 0.0)
             orientation = _rotate_about(joint.axis, joints.angle_rad[i])
-            transforms.append(Transform(self.link_frame(i), self.link_frame(i + 1), position, orientation))
+            transforms.append(Transform(self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation))
         return transforms
 
-    def camera_transforms(self, kind: str, camera: str, image: DepthImage | ColorImage) -> list[Transform]:
+    def make_camera_transforms(self, kind: str, camera: str, image: DepthImage | ColorImage) -> list[Transform]:
         """Return the pose of a camera on its link, and of its optical frame in the camera frame."""
-        optical_frame = self.optical_frame(kind, camera)
+        optical_frame = self.get_optical_frame(kind, camera)
         camera_frame = optical_frame.replace("_optical_frame", "_frame")
-        mount = Transform(self.link_frame(image.link), camera_frame, image.position_l, image.orientation_l_wxyz)
+        mount = Transform(self.get_link_frame(image.link), camera_frame, image.position_l, image.orientation_l_wxyz)
         return [mount, Transform(camera_frame, optical_frame, ORIGIN, OPTICAL_IN_CAMERA)]
 
-    def mount_transforms(self, sensor: str, sample: MountedSample) -> list[Transform]:
+    def make_mount_transforms(self, sensor: str, sample: MountedSample) -> list[Transform]:
         """Return the pose of a sensor on its link, as its sample states it."""
-        link_frame = self.link_frame(sample.link)
-        return [Transform(link_frame, self.mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
+        link_frame = self.get_link_frame(sample.link)
+        return [Transform(link_frame, self.get_mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
 
 
 def _rotate_about(axis: str, angle_rad: float) -> Wxyz:

@@ -72,12 +72,12 @@ class NodeName:
     namespace: str = "/"
 
 
-def topic_key(domain: int, topic: Topic) -> str:
+def make_topic_key(domain: int, topic: Topic) -> str:
     """Return the Zenoh key of a topic's samples."""
     return f"{domain}/{topic.name.strip('/')}/{topic.type.dds_name}/{topic.type.type_hash}"
 
 
-def token_key(domain: int, zenoh_id: str, entity: int, kind: str, node: NodeName, topic: Topic | None = None) -> str:
+def make_token(domain: int, zenoh_id: str, entity: int, kind: str, node: NodeName, topic: Topic | None = None) -> str:
     """Return the liveliness token of a node (without a topic) or of one of its endpoints."""
     security_enclave = _escape_slashes("/")
     node_names = f"{security_enclave}/{_escape_slashes(node.namespace)}/{node.name}"
@@ -149,13 +149,13 @@ class Node:
         self._domain = domain
         self._name = name
         self._entities: Iterator[int] = count(NODE_ID)  # numbers of the node and its endpoints
-        foreign_network.declare_token(self._make_token(NODE))
+        foreign_network.declare_token(self._make_next_token(NODE))
 
     def declare_publisher(self, topic: Topic) -> RosPublisher:
         """Declare a publisher, which `ros2 topic info` then shows."""
-        key = topic_key(self._domain, topic)
+        key = make_topic_key(self._domain, topic)
         publisher = self._network.publisher(key, latched=topic.latched, background=topic.images)
-        token = self._make_token(PUBLISHER, topic)
+        token = self._make_next_token(PUBLISHER, topic)
         self._network.declare_token(token)
         return RosPublisher(publisher, token)
 
@@ -165,16 +165,16 @@ class Node:
         Returns:
             A reader that keeps the newest messages in CDR with their attachments, as many as the topic's depth.
         """
-        reader = self._network.reader(topic_key(self._domain, topic), topic.depth)
-        self._network.declare_token(self._make_token(SUBSCRIPTION, topic))
+        reader = self._network.reader(make_topic_key(self._domain, topic), topic.depth)
+        self._network.declare_token(self._make_next_token(SUBSCRIPTION, topic))
         return reader
 
     def declare_service(self, service: Topic) -> RawQueryable:
         """Offer a service, which `ros2 service list` then shows, and return the queue of its requests in CDR."""
-        queryable = self._network.queryable(topic_key(self._domain, service))
-        self._network.declare_token(self._make_token(SERVER, service))
+        queryable = self._network.queryable(make_topic_key(self._domain, service))
+        self._network.declare_token(self._make_next_token(SERVER, service))
         return queryable
 
-    def _make_token(self, kind: str, topic: Topic | None = None) -> str:
+    def _make_next_token(self, kind: str, topic: Topic | None = None) -> str:
         """Return the liveliness token of the next entity of this node."""
-        return token_key(self._domain, self._network.id, next(self._entities), kind, self._name, topic)
+        return make_token(self._domain, self._network.id, next(self._entities), kind, self._name, topic)

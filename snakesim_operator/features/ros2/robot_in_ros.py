@@ -248,14 +248,14 @@ def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:
     for i, fault in enumerate(status.faults):
         values[f"fault {i}"] = f"{fault.what}: {fault.cause}"
     pairs = [ros.make_message("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
-    level = _diagnostic_level(status)
+    level = _find_diagnostic_level(status)
     summary = f"{status.lifecycle}: {status.why}"
     hardware_id = status.robot
     entry = ros.make_message("diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, summary, hardware_id, pairs)
     return ros.encode_message(ros.DIAGNOSTICS, ros.make_header(timestamp_ns, ""), [entry])
 
 
-def _diagnostic_level(status: Status) -> int:
+def _find_diagnostic_level(status: Status) -> int:
     if status.lifecycle in ("fault", "estop"):
         return ERROR
     if status.faults or status.isolated or status.derated:

@@ -13,7 +13,7 @@ from snakesim_hal.wire import messages as m
 from snakesim_hal.wire.own_sample import message_of, own_kinds
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
-from snakesim_operator.features.ros2.frames import Frames, ros_name
+from snakesim_operator.features.ros2.frames import Frames, make_ros_name
 from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
 from snakesim_operator.features.ros2.messages import Transform
 from snakesim_operator.features.ros2.relay import Relay, RosTime
@@ -22,7 +22,7 @@ ImageEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame an
 SampleEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and sample to a message in CDR
 
 
-def _sensor_name(key: str) -> str:
+def _get_sensor_name(key: str) -> str:
     """Return the sensor's name, the last part of its key."""
     return key.rpartition("/")[2]
 
@@ -95,7 +95,7 @@ class SensorTopics:
             # A sample holds the IMUs that have new measurements, so all samples count.
             relays.append(Relay(self._session, keys.IMU, m.Imu, 1, self._forward_imu, forwards_all=True))
         for key in sorted(sensor_keys):
-            name = _sensor_name(key)
+            name = _get_sensor_name(key)
             if key == keys.depth(name):
                 relays.append(self._relay_depth_camera(key, image_every_cycles))
             elif key == keys.color(name):
@@ -114,7 +114,7 @@ class SensorTopics:
 
     def _relay_depth_camera(self, key: str, every_cycles: int) -> Relay[Any]:
         """Return the relay of a depth camera; its topics are named as image_transport names them."""
-        topic = f"{ros_name(_sensor_name(key))}/depth/image_raw"
+        topic = f"{make_ros_name(_get_sensor_name(key))}/depth/image_raw"
         raw = self._declare_images(topic, ros.IMAGE)
         compressed = self._declare_images(f"{topic}/compressedDepth", ros.COMPRESSED_IMAGE)
         outputs = (
@@ -125,7 +125,7 @@ class SensorTopics:
 
     def _relay_color_camera(self, key: str, every_cycles: int) -> Relay[Any]:
         """Return the relay of a color camera; its topics are named as image_transport names them."""
-        topic = f"{ros_name(_sensor_name(key))}/color/image_raw"
+        topic = f"{make_ros_name(_get_sensor_name(key))}/color/image_raw"
         raw = self._declare_images(topic, ros.IMAGE)
         compressed = self._declare_images(f"{topic}/compressed", ros.COMPRESSED_IMAGE)
         outputs = (
@@ -156,13 +156,13 @@ class SensorTopics:
             outputs: Publishers of images, and how each encodes a sample.
             every_cycles: Number of bridge cycles from one image to the next.
         """
-        name = _sensor_name(key)
-        camera_info = self._declare_publisher(f"{ros_name(name)}/{kind}/camera_info", ros.CAMERA_INFO, depth=1)
+        name = _get_sensor_name(key)
+        camera_info = self._declare_publisher(f"{make_ros_name(name)}/{kind}/camera_info", ros.CAMERA_INFO, depth=1)
 
         def forward(image: m.DepthImage | m.ColorImage) -> None:
-            frame = self._frames.optical_frame(kind, name)
+            frame = self._frames.get_optical_frame(kind, name)
             timestamp_ns = self._ros_time.convert(image.timestamp_ns)
-            self._static_frames.place_sensor(key, self._frames.camera_transforms(kind, name, image))
+            self._static_frames.place_sensor(key, self._frames.make_camera_transforms(kind, name, image))
             camera_info.publish(robot_in_ros.encode_camera_info(timestamp_ns, frame, image))
             for publisher, encode in outputs:
                 if publisher.has_subscribers():
@@ -177,14 +177,14 @@ class SensorTopics:
 
     def _relay_mounted_sensor(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
         """Return the relay of one topic of a sensor that is mounted on a link."""
-        name = _sensor_name(key)
-        publisher = self._declare_publisher(f"{ros_name(name)}/{topic}", ros_type)
+        name = _get_sensor_name(key)
+        publisher = self._declare_publisher(f"{make_ros_name(name)}/{topic}", ros_type)
         message_type: Any = message_of(key, self._robot)
 
         def forward(sample: m.MountedSample) -> None:
-            self._static_frames.place_sensor(key, self._frames.mount_transforms(name, sample))
+            self._static_frames.place_sensor(key, self._frames.make_mount_transforms(name, sample))
             timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
-            frame = self._frames.mount_frame(name)
+            frame = self._frames.get_mount_frame(name)
             publisher.publish(encode(timestamp_ns, frame, sample))
 
         return Relay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
@@ -194,10 +194,10 @@ class SensorTopics:
         timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
         for entry, link in enumerate(sample.link):
             if link not in self._imu_publishers:
-                link_name = ros_name(self._robot.links[link].name)
+                link_name = make_ros_name(self._robot.links[link].name)
                 self._imu_publishers[link] = self._declare_publisher(f"{link_name}/imu", ros.IMU)
-            self._static_frames.place_sensor(f"{keys.IMU}/{link}", [self._frames.imu_transform(link)])
+            self._static_frames.place_sensor(f"{keys.IMU}/{link}", [self._frames.make_imu_transform(link)])
             publisher = self._imu_publishers[link]
             if publisher.has_subscribers():
-                frame = self._frames.imu_frame(link)
+                frame = self._frames.get_imu_frame(link)
                 publisher.publish(robot_in_ros.encode_imu(timestamp_ns, frame, sample, entry))

@@ -37,7 +37,7 @@ class ServiceServer:
         make_refusal: Callable[[str], bytes] | None = None,
         explain_refusal: Callable[[bytes], str] = _allow_any,
     ) -> None:
-        """Declare the service.
+        """Declare the service in the ROS graph.
 
         Args:
             node: The node that offers it.

@@ -28,7 +28,7 @@ class CmdVelInput:
     """Reads the newest Twist of a ROS topic in each cycle and publishes the intent that it stands for."""
 
     def __init__(self, twists: RawReader, session: Session, say: Say) -> None:
-        """Prepare the input.
+        """Prepare to read the topic and to publish intents.
 
         Args:
             twists: Messages of the ROS topic.

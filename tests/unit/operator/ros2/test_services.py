@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from snakesim_hal.wire.messages import Clock, JointState, LifecycleState, Mode
 from snakesim_operator.features.ros2 import graph
 from snakesim_operator.features.ros2 import service_types as types
-from snakesim_operator.features.ros2.graph import NodeName, Topic, token_key
+from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token
 from snakesim_operator.features.ros2.joint_commands import VALID_NS, RosJointTargets
 from snakesim_operator.features.ros2.parameters import NOT_SET, _encode_value, _make_descriptor
 from snakesim_operator.robot_commands.parameters import Parameter
@@ -30,7 +30,7 @@ def test_a_service_of_the_design_document() -> None:
     two_ints = types.define_service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum")
     topic = Topic("/add_two_ints", two_ints.type)
     zenoh_id = ADDER.split("/")[2]
-    assert token_key(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
+    assert make_token(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
 
 
 def test_hashes_are_those_that_others_have() -> None:
