@@ -63,15 +63,15 @@ class Recorder:
         self._restarted_clock: Arrival | None = None  # the newest clock, if time went back and has no file
 
     def write(self, arrival: Arrival) -> None:
-        """Write one message; before that of a new host, begin a new file."""
+        """Write one message. Once the description and the first clock of a new host have come, begin a new file."""
         if arrival.key in (keys.DESCRIPTION, keys.CONFIG, keys.STATUS):
             self._latched[arrival.key] = arrival
             if arrival.key == keys.DESCRIPTION:
                 self._read_host(arrival.payload)
         self.recording.take(arrival)
         if arrival.key == keys.CLOCK:
-            time_went_back = self._restarted_clock is not None or self.recording.time.went_back
-            if time_went_back:
+            has_restarted = self._restarted_clock is not None or self.recording.time.went_back
+            if has_restarted:
                 self._restarted_clock = arrival
         if self._host_is_new and self._restarted_clock is not None:
             self._begin_next_file(self._restarted_clock)

@@ -71,13 +71,7 @@ class RosJointTargets:
             ros_now_ns = now_ns
         try:
             command = self._decode(payload)
-            age_source = "the times of its sender's messages"
-            if command.timestamp_ns:
-                age_ns = ros_now_ns - command.timestamp_ns
-                age_source = "the stamp of its header"
-            age_refusal = explain_age_refusal(age_ns, age_source)
-            if age_refusal:
-                raise _RefusedMessageError(age_refusal)
+            age_ns = _check_age(command, age_ns, ros_now_ns)
         except _RefusedMessageError as error:
             self.rejected += 1
             self.reason = str(error)
@@ -149,6 +143,27 @@ class RosJointTargets:
         if not joint.has(mode):
             supported = ", ".join(supported_mode.name.lower() for supported_mode in joint.modes)
             raise _RefusedMessageError(f"has {field} for {name}, whose drive takes {supported}")
+
+
+def _check_age(command: _JointCommand, age_ns: int, ros_now_ns: int) -> int:
+    """Return the age of a command in ns.
+
+    Args:
+        command: The command; the timestamp of its header counts, if it has one.
+        age_ns: Its age by the times of its sender's messages.
+        ros_now_ns: Present time in ROS.
+
+    Raises:
+        _RefusedMessageError: The command is too old, or comes from the future.
+    """
+    source = "the times of its sender's messages"
+    if command.timestamp_ns:
+        age_ns = ros_now_ns - command.timestamp_ns
+        source = "the stamp of its header"
+    refusal = explain_age_refusal(age_ns, source)
+    if refusal:
+        raise _RefusedMessageError(refusal)
+    return age_ns
 
 
 def _find_mode(message: Any) -> tuple[Mode, str]:
