@@ -1,10 +1,11 @@
-"""Joint states and transforms of a robot for Foxglove, in messages that are made once and filled again and again."""
+"""Joint states and transforms of a robot for Foxglove, in messages that are built once and filled for each sample."""
 
 import math
 import struct
 from collections.abc import Iterable, Sequence
 from itertools import chain, pairwise
 
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointState_pb2 import JointState as NamedJoint
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
@@ -12,86 +13,111 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from snakesim_hal.wire.messages import Description, JointState
 from snakesim_operator.recording import shapes
 
+Pose = tuple[Sequence[float], Sequence[float]]  # position (3,) in m and orientation wxyz (4,)
+_NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
 
-class _Rows:
-    """Joint states as bytes: only the numbers change, and setting each in a message costs ten times what this does."""
+
+class _JointStatesTemplate:
+    """An encoded JointStates in which only the numbers are replaced.
+
+    Setting each field of a protobuf message takes ten times as long, and this happens for every sample.
+    """
 
     def __init__(self, joints: JointStates) -> None:
-        """joints: with a number of its own in every field that is to be filled, in their order 1.0, 2.0 ..."""
-        data, number, format_ = joints.SerializeToString(), 1.0, "<"
-        self._parts: list[bytes | float] = []
-        while (at := data.find(wanted := struct.pack("<d", number))) >= 0:
-            self._parts += (data[:at], number)
-            format_ += f"{at}sd"
-            data, number = data[at + len(wanted) :], number + 1.0
-        assert not data, "a number ends each joint"
-        self._pack = struct.Struct(format_).pack
-        self._time = JointStates()
+        """Find the numbers in the encoded message.
 
-    def filled(self, numbers: Iterable[float], time_ns: int) -> bytes:
-        """The message. numbers: of all fields, in their order."""
-        stamp = self._time.timestamp
-        stamp.seconds, stamp.nanos = divmod(time_ns, 1_000_000_000)
+        Args:
+            joints: A message with a marker in every field that will be filled: 1.0, 2.0, 3.0 and so on, in the order
+                of the fields.
+        """
+        rest = joints.SerializeToString()
+        marker = 1.0
+        layout = "<"
+        self._parts: list[bytes | float] = []  # bytes between the numbers, number, bytes, number ...
+        while True:
+            encoded_marker = struct.pack("<d", marker)
+            position = rest.find(encoded_marker)
+            if position < 0:
+                break
+            self._parts += (rest[:position], marker)
+            layout += f"{position}sd"
+            rest = rest[position + len(encoded_marker) :]
+            marker += 1.0
+        assert not rest, "a number ends each joint"
+        self._pack = struct.Struct(layout).pack
+        self._time_only = JointStates()
+
+    def fill(self, numbers: Iterable[float], time_ns: int) -> bytes:
+        """Return the encoded message with these numbers, in the order of the markers, at this robot time."""
+        timestamp = self._time_only.timestamp
+        timestamp.seconds, timestamp.nanos = divmod(time_ns, 1_000_000_000)
         self._parts[1::2] = numbers
-        return self._time.SerializeToString() + self._pack(*self._parts)
+        return self._time_only.SerializeToString() + self._pack(*self._parts)
 
 
-class BodyFrames:
-    """What is made is valid until the next call."""
+class BodyMessages:
+    """Makes the transforms and joint states of one robot."""
 
     def __init__(self, robot: Description) -> None:
-        """robot: with one link more than joints."""
-        links = robot.links
-        chained = [
-            shapes.frame(0, rear.name, link.name, (rear.length_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-            for rear, link in pairwise(links)
-        ]
-        placed = shapes.frame(0, shapes.WORLD_FRAME, links[0].name, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        self._chained, self._placed = (
-            FrameTransforms(transforms=chained),
-            FrameTransforms(transforms=[placed, *chained]),
-        )
-        self._pitched = [joint.axis == "pitch" for joint in robot.joints]
-        self.joints = len(robot.joints)
-        names = [joint.name for joint in robot.joints]
-        measured = [
-            NamedJoint(name=name, position=3 * i + 1.0, velocity=3 * i + 2.0, effort=3 * i + 3.0)
-            for i, name in enumerate(names)
-        ]
-        self._measured = _Rows(JointStates(joints=measured))
-        self._wanted = _Rows(JointStates(joints=[NamedJoint(name=n, position=i + 1.0) for i, n in enumerate(names)]))
+        """Build the messages. robot: a description with one link more than joints."""
+        link_frames: list[FrameTransform] = []
+        for rear, front in pairwise(robot.links):
+            rear_end = (rear.length_m, 0.0, 0.0)
+            link_frames.append(shapes.make_frame(0, rear.name, front.name, rear_end, _NO_ROTATION))
+        tail = robot.links[0].name
+        base_frame = shapes.make_frame(0, shapes.WORLD_FRAME, tail, (0.0, 0.0, 0.0), _NO_ROTATION)
+        self._chain = FrameTransforms(transforms=link_frames)
+        self._chain_in_world = FrameTransforms(transforms=[base_frame, *link_frames])
+        self._is_pitch = [joint.axis == "pitch" for joint in robot.joints]
+        self.joint_count = len(robot.joints)
 
-    def transforms(
-        self, angles_rad: Sequence[float], base: tuple[Sequence[float], Sequence[float]] | None, time_ns: int
-    ) -> FrameTransforms:
-        """Each link in the frame of the one behind it; the last one in the world, if that is known.
+        # Markers for the templates: 1.0, 2.0, 3.0 ... in the order of the fields.
+        measured: list[NamedJoint] = []
+        references: list[NamedJoint] = []
+        for i, joint in enumerate(robot.joints):
+            first = 3 * i + 1.0
+            measured.append(NamedJoint(name=joint.name, position=first, velocity=first + 1.0, effort=first + 2.0))
+            references.append(NamedJoint(name=joint.name, position=i + 1.0))
+        self._measured = _JointStatesTemplate(JointStates(joints=measured))
+        self._references = _JointStatesTemplate(JointStates(joints=references))
 
-        angles_rad: (n_joints,), tail to head. base: position_w (3,) and orientation wxyz (4,) of link 0.
+    def fill_transforms(self, angles_rad: Sequence[float], base: Pose | None, time_ns: int) -> FrameTransforms:
+        """Return each link in the frame of the link behind it, and the tail link in the world if that is known.
+
+        The message is valid until the next call, which fills it again.
+
+        Args:
+            angles_rad: (n_joints,), tail to head.
+            base: Position and orientation of link 0 in the world; None if unknown.
+            time_ns: Robot time.
         """
-        made = self._chained if base is None else self._placed
-        frames = list(made.transforms)
+        message = self._chain if base is None else self._chain_in_world
+        frames = list(message.transforms)
         seconds, nanos = divmod(time_ns, 1_000_000_000)
         for frame in frames:
-            frame.timestamp.seconds, frame.timestamp.nanos = seconds, nanos
+            frame.timestamp.seconds = seconds
+            frame.timestamp.nanos = nanos
         if base is not None:
-            frame = frames.pop(0)
-            at, turn = frame.translation, frame.rotation
-            at.x, at.y, at.z = base[0]
-            turn.w, turn.x, turn.y, turn.z = base[1]
-        for frame, angle_rad, pitched in zip(frames, angles_rad, self._pitched, strict=True):
-            turn = frame.rotation
-            turn.w = math.cos(0.5 * angle_rad)
-            if pitched:
-                turn.y = math.sin(0.5 * angle_rad)
+            position_w, orientation_wxyz = base
+            base_frame = frames.pop(0)
+            translation = base_frame.translation
+            rotation = base_frame.rotation
+            translation.x, translation.y, translation.z = position_w
+            rotation.w, rotation.x, rotation.y, rotation.z = orientation_wxyz
+        for frame, angle_rad, is_pitch in zip(frames, angles_rad, self._is_pitch, strict=True):
+            rotation = frame.rotation
+            rotation.w = math.cos(0.5 * angle_rad)
+            if is_pitch:
+                rotation.y = math.sin(0.5 * angle_rad)
             else:
-                turn.z = math.sin(0.5 * angle_rad)
-        return made
+                rotation.z = math.sin(0.5 * angle_rad)
+        return message
 
-    def joint_states(self, joints: JointState, time_ns: int) -> bytes:
-        """Angle, speed and torque of each joint by its name: a JointStates."""
+    def encode_joint_states(self, joints: JointState, time_ns: int) -> bytes:
+        """Return an encoded JointStates with angle, speed and torque of each joint."""
         rows = zip(joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
-        return self._measured.filled(chain.from_iterable(rows), time_ns)
+        return self._measured.fill(chain.from_iterable(rows), time_ns)
 
-    def reference(self, wanted_rad: Sequence[float], time_ns: int) -> bytes:
-        """The angle that the controller wants of each joint: a JointStates. wanted_rad: (n_joints,), tail to head."""
-        return self._wanted.filled(wanted_rad, time_ns)
+    def encode_references(self, reference_rad: Sequence[float], time_ns: int) -> bytes:
+        """Return an encoded JointStates with the angles that the controller wants, (n_joints,), tail to head."""
+        return self._references.fill(reference_rad, time_ns)

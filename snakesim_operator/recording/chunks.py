@@ -1,4 +1,4 @@
-"""Records of an MCAP file, unpacked within bounds: nothing is allocated because a header claims it. Pure.
+"""Unpacks the records of an MCAP file within bounds: no memory is allocated because a header claims that it is needed.
 
 Source: https://mcap.dev/spec.
 """
@@ -15,46 +15,65 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, McapRecord, Message, Metadata, Schema, Statistics
 
-LARGEST_BYTES = 64 * 1024 * 1024  # of a record, and of what is unpacked of a chunk: ours have 1 MB, and an image
-_STEP_BYTES = 1024 * 1024
+MAX_RECORD_BYTES = 64 * 1024 * 1024  # of a record, and of an unpacked chunk: a recorder writes 1 MB, and an image
+UNPACK_STEP_BYTES = 1024 * 1024  # memory grows with what is really unpacked
 HEAD = struct.Struct("<BQ")  # opcode and length of every record
-_CHUNK = struct.Struct("<QQQII")  # begin, end, unpacked size, its CRC, length of the compression's name
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
-_PARSERS: dict[int, type[Channel | Header | Metadata | Schema | Statistics]] = {
+_CHUNK_HEAD = struct.Struct("<QQQII")  # begin, end, unpacked size, its CRC, length of the compression's name
+_PACKED_LENGTH = struct.Struct("<Q")  # behind the compression's name
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
+_RECORD_TYPES: dict[int, type[Channel | Header | Metadata | Schema | Statistics]] = {
     Opcode.CHANNEL: Channel,
     Opcode.HEADER: Header,
     Opcode.METADATA: Metadata,
     Opcode.SCHEMA: Schema,
     Opcode.STATISTICS: Statistics,
 }
+_CHUNK_RECORDS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _UNREADABLE = (mcap.exceptions.McapError, struct.error, ValueError, OverflowError, MemoryError)
+_UNPACKING_ERRORS = (zstandard.ZstdError, RuntimeError, EOFError, MemoryError)
 
 
 class DamagedError(Exception):
-    """A record that is not what it must be; says why."""
+    """A record is not what it must be; the text says why."""
 
 
-def chunk_bytes(head: bytes) -> int:
-    """Length of a chunk's content by the lengths within it. head: the first bytes of it. Raises DamagedError."""
+def read_chunk_length(head: bytes) -> int:
+    """Return the length of a chunk's content in bytes, by the lengths that it states.
+
+    Args:
+        head: The first bytes of the content.
+
+    Raises:
+        DamagedError: These bytes state no lengths.
+    """
     try:
-        width = _CHUNK.unpack_from(head)[-1]
-        (packed,) = struct.unpack_from("<Q", head, _CHUNK.size + width)
+        *_, name_bytes = _CHUNK_HEAD.unpack_from(head)
+        (packed_bytes,) = _PACKED_LENGTH.unpack_from(head, _CHUNK_HEAD.size + name_bytes)
     except struct.error:
         raise DamagedError("a chunk whose lengths cannot be") from None
-    return _CHUNK.size + width + 8 + packed
+    return _CHUNK_HEAD.size + name_bytes + _PACKED_LENGTH.size + packed_bytes
 
 
 def unpack(content: bytes) -> bytearray:
-    """What is in a chunk. Raises DamagedError."""
-    if chunk_bytes(content) != len(content):
+    """Return the records within a chunk, in bytes.
+
+    Args:
+        content: Content of the chunk's record.
+
+    Raises:
+        DamagedError: Its lengths, its compression, its size or its checksum is wrong.
+    """
+    if read_chunk_length(content) != len(content):
         raise DamagedError("a chunk whose lengths contradict each other")
-    _, _, size, crc, width = _CHUNK.unpack_from(content)
-    name, packed = content[_CHUNK.size : _CHUNK.size + width], content[_CHUNK.size + width + 8 :]
-    if size > LARGEST_BYTES:
-        raise DamagedError(f"a chunk of {size / 1e6:.0f} MB, more than {LARGEST_BYTES / 1e6:.0f} MB")
+    _, _, size, crc, name_bytes = _CHUNK_HEAD.unpack_from(content)
+    name_end = _CHUNK_HEAD.size + name_bytes
+    compression = content[_CHUNK_HEAD.size : name_end]
+    packed = content[name_end + _PACKED_LENGTH.size :]
+    if size > MAX_RECORD_BYTES:
+        raise DamagedError(f"a chunk of {size / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
     try:
-        data = _unpacked(name, packed, size)
-    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+        data = _decompress(compression, packed, size)
+    except _UNPACKING_ERRORS as error:
         raise DamagedError(f"a chunk that cannot be unpacked ({error})") from None
     if len(data) != size:
         raise DamagedError(f"a chunk of {len(data)} bytes where {size} should be")
@@ -63,56 +82,92 @@ def unpack(content: bytes) -> bytearray:
     return data
 
 
-def _unpacked(name: bytes, packed: bytes, size: int) -> bytearray:
-    if name == b"zstd":
-        with zstandard.ZstdDecompressor(max_window_size=LARGEST_BYTES).stream_reader(packed) as stream:
-            return _in_steps(stream.read, size)
-    if name == b"lz4":
-        unpacker, given = lz4.frame.LZ4FrameDecompressor(), iter((packed,))
-
-        def read(most: int) -> bytes:
-            return b"" if unpacker.eof else unpacker.decompress(next(given, b""), max_length=most)
-
-        return _in_steps(read, size)
-    if name:
-        raise DamagedError("a chunk of an unknown compression")
-    return bytearray(packed)
+def _decompress(compression: bytes, packed: bytes, size: int) -> bytearray:
+    """Return the unpacked bytes, but at most `size`. Raises DamagedError for an unknown compression."""
+    match compression:
+        case b"zstd":
+            with zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(packed) as stream:
+                return _read_in_steps(stream.read, size)
+        case b"lz4":
+            return _decompress_lz4(packed, size)
+        case b"":
+            return bytearray(packed)
+        case _:
+            raise DamagedError("a chunk of an unknown compression")
 
 
-def _in_steps(read: Callable[[int], bytes], size: int) -> bytearray:
-    found = bytearray()
-    while len(found) < size and (part := read(min(size - len(found), _STEP_BYTES))):
-        found += part
-    return found
+def _decompress_lz4(packed: bytes, size: int) -> bytearray:
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    remaining_input = packed  # the decompressor takes all of it in the first step
+
+    def read(max_bytes: int) -> bytes:
+        nonlocal remaining_input
+        if decompressor.eof:
+            return b""
+        next_input = remaining_input
+        remaining_input = b""
+        return decompressor.decompress(next_input, max_length=max_bytes)
+
+    return _read_in_steps(read, size)
 
 
-def records_in(data: bytearray) -> Iterator[McapRecord]:
-    """Schemas, channels and messages of an unpacked chunk. Raises DamagedError."""
-    view, at = memoryview(data), 0
-    while at < len(data):
-        if at + HEAD.size > len(data):
+def _read_in_steps(read: Callable[[int], bytes], size: int) -> bytearray:
+    """Return up to `size` bytes; fewer if the input ends before."""
+    data = bytearray()
+    while len(data) < size:
+        part = read(min(size - len(data), UNPACK_STEP_BYTES))
+        if not part:
+            break
+        data += part
+    return data
+
+
+def parse_chunk(data: bytearray) -> Iterator[McapRecord]:
+    """Yield schemas, channels and messages of an unpacked chunk. Raises DamagedError."""
+    view = memoryview(data)
+    position = 0
+    while position < len(data):
+        if position + HEAD.size > len(data):
             raise DamagedError("a record that its chunk cuts off")
-        opcode, length = HEAD.unpack_from(data, at)
-        at += HEAD.size
-        if at + length > len(data):
+        opcode, length = HEAD.unpack_from(data, position)
+        position += HEAD.size
+        if position + length > len(data):
             raise DamagedError("a record that is longer than its chunk")
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            yield parsed(opcode, view[at : at + length])
-        at += length
+        if opcode in _CHUNK_RECORDS:
+            yield parse_record(opcode, view[position : position + length])
+        position += length
 
 
-def parsed(opcode: int, content: memoryview) -> McapRecord:
-    """A record that is read. Raises DamagedError, also when it is longer than what it holds."""
+def parse_record(opcode: int, content: memoryview) -> McapRecord:
+    """Decode the content of one record.
+
+    Args:
+        opcode: MESSAGE, or a key of _RECORD_TYPES.
+        content: The record without its head.
+
+    Raises:
+        DamagedError: The content cannot be read, or is longer than what it holds.
+    """
     if opcode == Opcode.MESSAGE:
-        if len(content) < _MESSAGE.size:
-            raise DamagedError("a message without a head")
-        channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
-        return Message(channel, log_ns, bytes(content[_MESSAGE.size :]), publish_ns, sequence)
+        return _parse_message(content)
     stream = ReadDataStream(BytesIO(content))
     try:
-        record = _PARSERS[opcode].read(stream)
+        record = _RECORD_TYPES[opcode].read(stream)
     except _UNREADABLE:
         raise DamagedError(f"a record of kind {opcode} that cannot be read") from None
     if stream.count != len(content):
         raise DamagedError(f"a record of kind {opcode} whose lengths contradict each other")
     return record
+
+
+def _parse_message(content: memoryview) -> Message:
+    if len(content) < _MESSAGE_HEAD.size:
+        raise DamagedError("a message without a head")
+    channel, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(content)
+    return Message(
+        channel_id=channel,
+        log_time=log_ns,
+        data=bytes(content[_MESSAGE_HEAD.size :]),
+        publish_time=publish_ns,
+        sequence=sequence,
+    )

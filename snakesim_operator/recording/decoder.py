@@ -1,4 +1,4 @@
-"""Our messages for `mcap`'s own reader: `make_reader(file, decoder_factories=[DecoderFactory()])`."""
+"""Decodes the robot's messages in `mcap`'s own reader: `make_reader(file, decoder_factories=[DecoderFactory()])`."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,28 +12,32 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire.messages import VERSIONS
 from snakesim_hal.wire.own_sample import own_kind
 
-PREFIX = "snakesim."
-OWN = f"{PREFIX}own."  # of sensors with a message of their own
+PREFIX = "snakesim."  # of the names of all schemas of the robot's messages
+CUSTOM_PREFIX = f"{PREFIX}own."  # of the schemas of custom sensors
 
 
 class DecoderFactory(McapDecoderFactory):
-    """Decodes the messages of a recording, as their struct; those that this version does not know, as dict.
+    """Decodes the messages of a recording into their structs, and messages unknown to this version into dicts.
 
     A payload that does not fit its message raises `msgspec.DecodeError`.
     """
 
     def __init__(self) -> None:
-        kinds: dict[str, Any] = {f"{PREFIX}{message.__name__}": message for message in VERSIONS}
-        self._decoders = {name: msgspec.msgpack.Decoder(message) for name, message in kinds.items()}
+        self._decoders: dict[str, msgspec.msgpack.Decoder[Any]] = {}  # by name of the schema
+        for message_type in VERSIONS:
+            self._decoders[f"{PREFIX}{message_type.__name__}"] = msgspec.msgpack.Decoder(message_type)
 
     def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
-        """The decoder of a channel; None if it is not one of ours."""
+        """Return the decoder of a channel, or None if its messages are none of the robot's."""
         if schema is None or not schema.name.startswith(PREFIX):
             return None
         if message_encoding == "json":  # made for viewers, such as `/planar13/state`
             return msgspec.json.decode
-        if schema.name.startswith(OWN):
+        if schema.name.startswith(CUSTOM_PREFIX):
             with suppress(WireError):
-                return msgspec.msgpack.Decoder(own_kind(schema.data.decode(errors="replace")).message).decode
-        known = self._decoders.get(schema.name)
-        return msgspec.msgpack.decode if known is None else known.decode
+                custom_type = own_kind(schema.data.decode(errors="replace"))
+                return msgspec.msgpack.Decoder(custom_type.message).decode
+        decoder = self._decoders.get(schema.name)
+        if decoder is None:
+            return msgspec.msgpack.decode
+        return decoder.decode

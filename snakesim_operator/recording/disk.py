@@ -1,4 +1,4 @@
-"""The bytes of a file that grows: kept in memory until `flush`, and cut back to the last flush when a disk is full."""
+"""A file that grows: its bytes stay in memory until `flush`, and a full disk leaves it as it was at the last flush."""
 
 import contextlib
 import errno
@@ -7,46 +7,55 @@ from pathlib import Path
 
 
 class GrowingFile:
-    """What an MCAP writer needs of a file. Raises OSError from `flush` alone."""
+    """The part of a file that an MCAP writer needs. After the creation, only `flush` raises OSError."""
 
     def __init__(self, path: Path) -> None:
-        """Raises OSError, FileExistsError when there is such a file."""
+        """Create the file. Raises OSError; FileExistsError if the file exists."""
         self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._written = 0
+        self._written_bytes = 0
         self._waiting = bytearray()
 
     @property
     def waiting_bytes(self) -> int:
-        """Not yet given to the disk."""
+        """Return the number of bytes that the disk does not have."""
         return len(self._waiting)
 
     def write(self, data: bytes) -> int:
-        """Add bytes."""
+        """Add bytes, and return their number."""
         self._waiting += data
         return len(data)
 
     def tell(self) -> int:
-        """Where the next byte goes."""
-        return self._written + len(self._waiting)
+        """Return the position of the next byte."""
+        return self._written_bytes + len(self._waiting)
 
     def flush(self) -> None:
-        """Give everything to the disk. Raises OSError; then the file ends where it ended before."""
+        """Give the waiting bytes to the disk.
+
+        Raises:
+            OSError: The disk does not take all of them. The file then ends where it ended before, and the waiting
+                bytes are lost.
+        """
         done = 0
         try:
             while done < len(self._waiting):
                 count = os.write(self._handle, self._waiting[done:])
-                if not count:
+                if count == 0:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 done += count
         except OSError:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._handle, self._written)
-                os.lseek(self._handle, self._written, os.SEEK_SET)
+            self._cut_back()
             raise
         finally:
             self._waiting.clear()
-        self._written += done
+        self._written_bytes += done
+
+    def _cut_back(self) -> None:
+        """Remove the bytes behind the last complete flush."""
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._handle, self._written_bytes)
+            os.lseek(self._handle, self._written_bytes, os.SEEK_SET)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the file; waiting bytes are not written."""
         os.close(self._handle)

@@ -1,26 +1,21 @@
-"""Channels that Foxglove, PlotJuggler and Rerun show as they are, beside the raw ones, named as ROS users expect.
+"""Makes the messages for Foxglove, PlotJuggler and Rerun from the robot's messages as they arrive.
 
-Numbers at the rate of the messages that they are made of: `/ROBOT/joint_states`, `/ROBOT/joint_references`,
-`/ROBOT/contact_forces`, `/ROBOT/state`, and `/ROBOT/log` of its changes. What is drawn, a few times a second:
-`/ROBOT/tf` (a chain: each link in the frame of the one behind it), `/ROBOT/pose`, `/ROBOT/scene/...` (body, obstacles,
-map, forces, path), `/ROBOT/CAMERA/depth/image_raw` and `color`.
-Forces and state are JSON with a schema, all else Foxglove's protobuf.
+Numbers are converted at once, one message for each sample. What is drawn is made from the newest samples, a few times
+a second, when the robot's clock says that it is due. The topics are listed in `foxglove_topics`.
 """
 
-import re
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.base.errors import SnakesimError
@@ -36,7 +31,6 @@ from snakesim_hal.wire.messages import (
     DepthImage,
     Description,
     JointState,
-    OwnSample,
     Pose,
     Trajectory,
     World,
@@ -44,252 +38,305 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyFrames
-from snakesim_operator.recording.state_messages import ContactForces, State, StateMessages
+from snakesim_operator.recording.body_frames import BodyMessages
+from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
+from snakesim_operator.recording.state_messages import ContactForces, StateMessages
 
-MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
-IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
+# Periods of what is shown, in robot time.
+MOTION_PERIOD_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
+IMAGE_PERIOD_NS = 200_000_000  # 5 Hz: all images are in the raw channels
+SCENE_PERIOD_NS = 1_000_000_000  # what seldom changes is repeated, so that it is found wherever a viewer starts
 SILENCE_NS = 5_000_000_000  # older messages are not shown as if they were current
-_STATE = "state"  # a name in what is due
-STILL_NS = 1_000_000_000  # what seldom changes, so that it is there wherever one begins to look
+
+DEPTH_PREFIX = "sensor/depth/"
+COLOR_PREFIX = "sensor/color/"
+_KEPT_KEYS = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
+
+BasePose = tuple[Sequence[float], Sequence[float]]  # position (3,) in m and orientation wxyz (4,) of link 0
+
+_get_decoder: Any = cache(msgspec.msgpack.Decoder)  # by message type
 
 
 class PoseAndContacts(msgspec.Struct, frozen=True):
-    """What is shown of a world model at every turn: not its obstacles, which may be many."""
+    """The part of a world model that is shown at MOTION_PERIOD_NS: not its obstacles, which may be many."""
 
     base_position_w: tuple[float, float, float]
     base_orientation_wxyz: tuple[float, float, float, float]
     contacts: list[WorldContact]
 
 
-_decoder: Any = cache(msgspec.msgpack.Decoder)  # of a message, by its type
-
-Kind = type[Protobuf] | type[State] | type[ContactForces] | type[OwnSample]
-ALWAYS: dict[str, Kind] = {  # topics below the robot's, but for those of images, of which a robot may have none
-    "tf": FrameTransforms,
-    "joint_states": JointStates,
-    "joint_references": JointStates,
-    "contact_forces": ContactForces,
-    "state": State,
-    "log": Log,
-    "pose": PoseInFrame,
-    **{f"scene/{part}": SceneUpdate for part in ("body", "obstacles", "map", "forces", "path")},
-}
-_KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
-
-
-@cache
-def topic(robot: str, name: str) -> str:
-    """A topic as ROS would name it. name: such as `joint_states`, below the robot's."""
-    return f"/{_ros_name(robot)}/{name}"
-
-
-class FoxgloveMessage(NamedTuple):
-    """One message for Foxglove."""
-
-    topic: str
-    kind: Kind
-    payload: bytes
-
-
-class FoxgloveSchema(NamedTuple):
-    """How a kind of message is encoded."""
-
-    name: str
-    message_encoding: str
-    encoding: str  # of the schema
-    data: bytes
-
-
-@cache
-def schema_of(kind: Kind) -> FoxgloveSchema:
-    """As MCAP wants it: of a protobuf message its file and all that it imports."""
-    if issubclass(kind, State | ContactForces | OwnSample):
-        schema = msgspec.json.schema(kind)["$defs"][kind.__name__]
-        return FoxgloveSchema(f"snakesim.shown.{kind.__name__}", "json", "jsonschema", msgspec.json.encode(schema))
-    files: dict[str, Any] = {}
-
-    def add(file: Any) -> None:
-        for needed in file.dependencies:
-            add(needed)
-        files.setdefault(file.name, file)
-
-    add(kind.DESCRIPTOR.file)
-    found = FileDescriptorSet()
-    for file in files.values():
-        file.CopyToProto(found.file.add())
-    return FoxgloveSchema(kind.DESCRIPTOR.full_name, "protobuf", "protobuf", found.SerializeToString())
-
-
 class FoxgloveChannels:
-    """Makes messages of numbers as they come, and of the newest payloads when the clock says that they are due."""
+    """Converts one robot's messages for viewers."""
 
-    def __init__(self, robot: str) -> None:
-        """robot: its name in the topics."""
-        self._named = robot
-        self._newest: dict[str, tuple[bytes, int]] = {}  # payload and its robot time in ns
-        self._due_ns: dict[str, int] = {}
+    def __init__(self, robot_name: str) -> None:
+        """Start without any knowledge of the robot. robot_name: its name in the topics."""
+        self._robot_name = robot_name
+
+        # What the robot has published.
+        self._newest: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
         self._robot: Description | None = None
-        self._frames: BodyFrames | None = None
-        self._own: dict[str, OwnKind] = {}  # messages of the robot's own sensors, by key
+        self._frames: BodyMessages | None = None
+        self._custom_types: dict[str, OwnKind] = {}  # messages of the robot's custom sensors, by key
+        self._true_obstacles = shapes.draw_obstacles([], "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
+
+        # What has been shown.
+        self._due_ns: dict[str, int] = {}  # when something is shown next
+        self._state_due_ns = 0
         self._state_messages = StateMessages()
-        self._truth = shapes.obstacles([], "obstacles", shapes.TRUTH, 0)
 
-    def take(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
-        """What is due with this message. One that cannot be decoded makes nothing."""
-        if key in _KEPT:
+    def convert(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
+        """Return the messages that are due with a message of the robot; none if that cannot be decoded.
+
+        Args:
+            key: Key of the robot's message.
+            payload: The message as on the wire.
+            time_ns: Its robot time.
+        """
+        if key in _KEPT_KEYS:
             self._newest[key] = payload, time_ns
-            if key == keys.JOINTS:
-                return self._joint_states(payload, time_ns)
-            return list(self._state(time_ns, key)) if key in (keys.STATUS, keys.CONTROL_STATE) else []
-        if key == keys.CONTACTS:
-            return self._contact_forces(payload)
-        if key == keys.CLOCK:
-            return self._at_clock(time_ns) if self._is_due("moving", time_ns, MOVING_NS) else []
-        if key.startswith(("sensor/depth/", "sensor/color/")):
-            return list(self._image(key, payload, time_ns)) if self._is_due(key, time_ns, IMAGES_NS) else []
-        if key in self._own:
-            return list(self._own_sample(key, payload, time_ns))
-        if key in (keys.DESCRIPTION, keys.CONFIG):
-            self._meet(key, payload)
-        return []
+        match key:
+            case keys.JOINTS:
+                return self._convert_joints(payload, time_ns)
+            case keys.STATUS:
+                return self._make_state(time_ns)
+            case keys.CONTROL_STATE:
+                return self._make_state(time_ns, with_reference=True)
+            case keys.CONTACTS:
+                return self._convert_contacts(payload)
+            case keys.CLOCK:
+                return self._make_drawings(time_ns)
+            case keys.DESCRIPTION:
+                self._set_robot(payload)
+                return []
+            case keys.CONFIG:
+                self._set_true_obstacles(payload)
+                return []
+            case _ if key.startswith((DEPTH_PREFIX, COLOR_PREFIX)):
+                return self._convert_image(key, payload, time_ns)
+            case _ if key in self._custom_types:
+                return self._convert_custom_sample(key, payload, time_ns)
+            case _:
+                return []
 
-    def _meet(self, key: str, payload: bytes) -> None:
+    # --- what the robot is
+
+    def _set_robot(self, payload: bytes) -> None:
         with suppress(SnakesimError, *UNDECODABLE):
-            if key == keys.DESCRIPTION:
-                robot: Description = _decoder(Description).decode(payload)
-                if len(robot.links) == len(robot.joints) + 1:
-                    self._robot, self._frames, self._own = robot, BodyFrames(robot), own_kinds(robot)
-            else:
-                config = msgspec.json.decode(_decoder(Configuration).decode(payload).content, type=RunConfig)
-                placed = place(config.scene, capsules_at_start(config))  # checked when the run began
-                self._truth = shapes.obstacles([one.obstacle for one in placed], "obstacles", shapes.TRUTH, 0)
+            robot: Description = _get_decoder(Description).decode(payload)
+            if len(robot.links) == len(robot.joints) + 1:
+                frames = BodyMessages(robot)
+                custom_types = own_kinds(robot)
+                self._robot = robot
+                self._frames = frames
+                self._custom_types = custom_types
 
-    def _is_due(self, what: str, time_ns: int, every_ns: int) -> bool:
-        due_ns = self._due_ns.get(what, 0)
-        if due_ns - every_ns <= time_ns < due_ns:  # else it is late, or robot time started over
+    def _set_true_obstacles(self, payload: bytes) -> None:
+        """Place the obstacles of the run's configuration, as the simulator does."""
+        with suppress(SnakesimError, *UNDECODABLE):
+            content = _get_decoder(Configuration).decode(payload).content
+            config = msgspec.json.decode(content, type=RunConfig)
+            placed = place(config.scene, capsules_at_start(config))  # checked when the run began
+            obstacles = [body.obstacle for body in placed]
+            self._true_obstacles = shapes.draw_obstacles(obstacles, "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
+
+    # --- when something is due
+
+    def _is_due(self, subject: str, time_ns: int, period_ns: int) -> bool:
+        """Return whether a subject is to be shown now; then it is next due a period later.
+
+        A time that is more than a period before the due time means that robot time has started over.
+        """
+        due_ns = self._due_ns.get(subject, 0)
+        if due_ns - period_ns <= time_ns < due_ns:
             return False
-        self._due_ns[what] = time_ns + every_ns
+        self._due_ns[subject] = time_ns + period_ns
         return True
 
-    def _fresh(self, key: str, time_ns: int) -> bytes | None:
-        """The newest payload, unless its writer has fallen silent, or robot time has started over since."""
-        payload, written_ns = self._newest.get(key, (None, 0))
-        return payload if 0 <= time_ns - written_ns <= SILENCE_NS else None
+    def _read_fresh(self, key: str, time_ns: int) -> bytes | None:
+        """Return the newest payload of a key; None if it is silent, or robot time has started over since."""
+        if key not in self._newest:
+            return None
+        payload, written_ns = self._newest[key]
+        if 0 <= time_ns - written_ns <= SILENCE_NS:
+            return payload
+        return None
 
-    def _read(self, key: str, message: type[Any], time_ns: int) -> Any:
-        return _decoded(message, self._fresh(key, time_ns))
+    def _decode_fresh(self, key: str, message_type: type[Any], time_ns: int) -> Any:
+        """Return the newest message of a key; None if there is no fresh one that can be decoded."""
+        payload = self._read_fresh(key, time_ns)
+        if payload is None:
+            return None
+        return _decode(message_type, payload)
 
-    def _at_clock(self, time_ns: int) -> list[FoxgloveMessage]:
-        robot, frames = self._robot, self._frames
-        joints: JointState | None = self._read(keys.JOINTS, JointState, time_ns)
-        seen: PoseAndContacts | None = self._read(keys.WORLD, PoseAndContacts, time_ns)
+    # --- one message for each sample
+
+    def _convert_joints(self, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
+        joints: JointState | None = _decode(JointState, payload)
+        frames = self._frames
+        if frames is None or joints is None or not joints.is_of(frames.joint_count):
+            return []
+        encoded = frames.encode_joint_states(joints, time_ns)
+        topic = make_topic(self._robot_name, "joint_states")
+        return [FoxgloveMessage(topic, JointStates, encoded)]
+
+    def _convert_contacts(self, payload: bytes) -> list[FoxgloveMessage]:
+        contacts: Contacts | None = _decode(Contacts, payload)
+        if self._robot is None or contacts is None:
+            return []
+        forces = ContactForces.sum_contacts(contacts, len(self._robot.links))
+        return [self._encode_json("contact_forces", forces)]
+
+    def _make_state(self, time_ns: int, *, with_reference: bool = False) -> list[FoxgloveMessage]:
+        """Return the state of host and controller, what is new of it as a log, and the reference if it is wanted."""
+        self._state_due_ns = time_ns + MOTION_PERIOD_NS
+        status = self._read_fresh(keys.STATUS, time_ns)
+        control = self._read_fresh(keys.CONTROL_STATE, time_ns)
+        update = self._state_messages.update(status, control, time_ns)
+        messages = [self._encode_json("state", update.state)]
+        for log in update.new_logs:
+            messages.append(self._encode_protobuf("log", log))
+        frames = self._frames
+        if with_reference and frames is not None and len(update.reference_rad) == frames.joint_count:
+            encoded = frames.encode_references(update.reference_rad, time_ns)
+            topic = make_topic(self._robot_name, "joint_references")
+            messages.append(FoxgloveMessage(topic, JointStates, encoded))
+        return messages
+
+    def _convert_custom_sample(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
+        """Return a custom sensor's sample as JSON with its own schema, which viewers plot, and at times its frame."""
+        robot = self._robot
+        sample = _decode_custom(self._custom_types[key], payload)
+        if robot is None or sample is None or sample.link >= len(robot.links):
+            return []
+        name = make_name_part(key.rpartition("/")[2])
+        messages: list[FoxgloveMessage] = []
+        if self._is_due(key, time_ns, MOTION_PERIOD_NS):
+            link = robot.links[sample.link].name
+            frame_id = f"{name}_frame"
+            mount = shapes.make_frame(time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz)
+            messages.append(self._encode_frame(mount))
+        messages.append(self._encode_json(f"own/{name}", sample))
+        return messages
+
+    # --- a few times a second
+
+    def _convert_image(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
+        """Return an image with its camera's frame and calibration, if one is due."""
+        if not self._is_due(key, time_ns, IMAGE_PERIOD_NS):
+            return []
+        message_type = DepthImage if key.startswith(DEPTH_PREFIX) else ColorImage
+        image: Any = _decode(message_type, payload)
+        robot = self._robot
+        if robot is None or image is None or mismatch(image, robot) is not None:
+            return []
+        _, kind, camera = key.split("/", 2)
+        topic = f"{make_name_part(camera)}/{kind}"
+        frame_id = f"{make_name_part(camera)}_{kind}_optical_frame"
+        link = robot.links[image.link].name
+        orientation = shapes.rotate_to_optical(image.orientation_l_wxyz)
+        mount = shapes.make_frame(time_ns, link, frame_id, image.position_l, orientation)
+        raw_image = shapes.make_raw_image(image, frame_id, time_ns)
+        calibration = shapes.make_calibration(image, frame_id, time_ns)
+        return [
+            self._encode_frame(mount),
+            self._encode_protobuf(f"{topic}/image_raw", raw_image),
+            self._encode_protobuf(f"{topic}/camera_info", calibration),
+        ]
+
+    def _make_drawings(self, time_ns: int) -> list[FoxgloveMessage]:
+        """Return transforms, pose, forces and scene from the newest samples, if they are due."""
+        if not self._is_due("moving", time_ns, MOTION_PERIOD_NS):
+            return []
+        robot = self._robot
+        frames = self._frames
+        joints: JointState | None = self._decode_fresh(keys.JOINTS, JointState, time_ns)
+        world: PoseAndContacts | None = self._decode_fresh(keys.WORLD, PoseAndContacts, time_ns)
         if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
             return []
-        base = self._base(seen, time_ns)
-        made = [self._protobuf("tf", frames.transforms(joints.angle_rad, base, time_ns))]
+        base = self._find_base(world, time_ns)
+        transforms = frames.fill_transforms(joints.angle_rad, base, time_ns)
+        messages = [self._encode_protobuf("tf", transforms)]
         if base is not None:
-            made.append(self._protobuf("pose", _pose(*base, time_ns)))
-        if seen is not None:
-            made.append(self._scene("forces", [shapes.forces(seen.contacts, time_ns)]))
-        silent = self._state(time_ns, keys.CLOCK) if self._due_ns.get(_STATE, 0) <= time_ns else ()
-        return [*made, *silent, *self._still(robot, time_ns)]
+            messages.append(self._encode_protobuf("pose", _make_pose(base, time_ns)))
+        if world is not None:
+            forces = shapes.draw_forces(world.contacts, time_ns)
+            messages.append(self._encode_scene("forces", [forces]))
+        if self._state_due_ns <= time_ns:  # host and controller are silent, which is shown as well
+            messages += self._make_state(time_ns)
+        messages += self._make_scene(robot, time_ns)
+        return messages
 
-    def _joint_states(self, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
-        joints: JointState | None = _decoded(JointState, payload)
-        if self._frames is None or joints is None or not joints.is_of(self._frames.joints):
-            return []
-        made = self._frames.joint_states(joints, time_ns)
-        return [FoxgloveMessage(topic(self._named, "joint_states"), JointStates, made)]
+    def _make_scene(self, robot: Description, time_ns: int) -> list[FoxgloveMessage]:
+        """Return what seldom changes, as far as it is due: body, obstacles, map and path."""
+        messages: list[FoxgloveMessage] = []
+        if self._is_due("body", time_ns, SCENE_PERIOD_NS):
+            links = shapes.draw_body(robot, time_ns)
+            messages.append(self._encode_scene("body", links))
+            self._true_obstacles.timestamp.CopyFrom(shapes.make_timestamp(time_ns))
+            messages.append(self._encode_scene("obstacles", [self._true_obstacles]))
+        world: World | None = self._decode_when_due(keys.WORLD, World, time_ns)
+        if world is not None:
+            obstacles = shapes.draw_obstacles(world.obstacles, "map", shapes.MAP_COLOR, time_ns)
+            messages.append(self._encode_scene("map", [obstacles]))
+        trajectory: Trajectory | None = self._decode_when_due(keys.TRAJECTORY, Trajectory, time_ns)
+        if trajectory is not None:
+            path = shapes.draw_path(trajectory.path_w, time_ns)
+            messages.append(self._encode_scene("path", [path]))
+        return messages
 
-    def _contact_forces(self, payload: bytes) -> list[FoxgloveMessage]:
-        felt: Contacts | None = _decoded(Contacts, payload)
-        if self._robot is None or felt is None:
-            return []
-        return [self._json("contact_forces", ContactForces.of(felt, len(self._robot.links)))]
+    def _decode_when_due(self, key: str, message_type: type[Any], time_ns: int) -> Any:
+        """Return the newest message of a key if the scene is due to show it; else None."""
+        if key not in self._newest:
+            return None
+        if not self._is_due(key, time_ns, SCENE_PERIOD_NS):
+            return None
+        return self._decode_fresh(key, message_type, time_ns)
 
-    def _state(self, time_ns: int, at: str) -> Iterator[FoxgloveMessage]:
-        self._due_ns[_STATE] = time_ns + MOVING_NS  # then again, if host and controller have fallen silent
-        status, control = (self._fresh(key, time_ns) for key in (keys.STATUS, keys.CONTROL_STATE))
-        state, logged, wanted_rad = self._state_messages.of(status, control, time_ns)
-        yield self._json("state", state)
-        yield from (self._protobuf("log", one) for one in logged)
-        if at == keys.CONTROL_STATE and self._frames is not None and len(wanted_rad) == self._frames.joints:
-            made = self._frames.reference(wanted_rad, time_ns)
-            yield FoxgloveMessage(topic(self._named, "joint_references"), JointStates, made)
-
-    def _still(self, robot: Description, time_ns: int) -> Iterator[FoxgloveMessage]:
-        if self._is_due("body", time_ns, STILL_NS):
-            yield self._scene("body", shapes.body(robot, time_ns))
-            self._truth.timestamp.CopyFrom(shapes.stamp(time_ns))
-            yield self._scene("obstacles", [self._truth])
-        if keys.WORLD in self._newest and self._is_due(keys.WORLD, time_ns, STILL_NS):
-            world: World | None = self._read(keys.WORLD, World, time_ns)
-            if world is not None:
-                yield self._scene("map", [shapes.obstacles(world.obstacles, "map", shapes.MAP, time_ns)])
-        if keys.TRAJECTORY in self._newest and self._is_due(keys.TRAJECTORY, time_ns, STILL_NS):
-            trajectory: Trajectory | None = self._read(keys.TRAJECTORY, Trajectory, time_ns)
-            if trajectory is not None:
-                yield self._scene("path", [shapes.path(trajectory.path_w, time_ns)])
-
-    def _base(self, seen: PoseAndContacts | None, time_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Position and orientation of link 0: as measured, else as guidance believes."""
-        pose: Pose | None = self._read(keys.POSE, Pose, time_ns)
+    def _find_base(self, world: PoseAndContacts | None, time_ns: int) -> BasePose | None:
+        """Return the pose of link 0: the measured one, else the one that the world model estimates."""
+        pose: Pose | None = self._decode_fresh(keys.POSE, Pose, time_ns)
         if pose is not None:
             return pose.position_w, pose.orientation_wxyz
-        return None if seen is None else (seen.base_position_w, seen.base_orientation_wxyz)
+        if world is not None:
+            return world.base_position_w, world.base_orientation_wxyz
+        return None
 
-    def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
-        robot = self._robot
-        image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColorImage, payload)
-        if robot is None or image is None or mismatch(image, robot) is not None:
-            return
-        _, kind, camera = key.split("/", 2)
-        kind, camera = {"color": "color"}.get(kind, kind), _ros_name(camera)
-        frame_id = f"{camera}_{kind}_optical_frame"
-        turned = shapes.optical(image.orientation_l_wxyz)
-        mount = shapes.frame(time_ns, robot.links[image.link].name, frame_id, image.position_l, turned)
-        yield self._protobuf("tf", FrameTransforms(transforms=[mount]))
-        yield self._protobuf(f"{camera}/{kind}/image_raw", shapes.raw_image(image, frame_id, time_ns))
-        yield self._protobuf(f"{camera}/{kind}/camera_info", shapes.calibration(image, frame_id, time_ns))
+    # --- encoding
 
-    def _scene(self, name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
-        return self._protobuf(f"scene/{name}", SceneUpdate(entities=entities))
+    def _encode_scene(self, name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
+        return self._encode_protobuf(f"scene/{name}", SceneUpdate(entities=entities))
 
-    def _protobuf(self, name: str, message: Protobuf) -> FoxgloveMessage:
-        return FoxgloveMessage(topic(self._named, name), type(message), message.SerializeToString())
+    def _encode_frame(self, frame: FrameTransform) -> FoxgloveMessage:
+        return self._encode_protobuf("tf", FrameTransforms(transforms=[frame]))
 
-    def _json(self, name: str, message: State | ContactForces | OwnSample) -> FoxgloveMessage:
-        return FoxgloveMessage(topic(self._named, name), type(message), msgspec.json.encode(message))
+    def _encode_protobuf(self, name: str, message: Protobuf) -> FoxgloveMessage:
+        topic = make_topic(self._robot_name, name)
+        return FoxgloveMessage(topic, type(message), message.SerializeToString())
 
-    def _own_sample(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
-        """Of an own sensor, with its own schema: as JSON, which viewers plot; and its frame."""
-        robot, kind = self._robot, self._own[key].message
-        with suppress(*UNDECODABLE):
-            sample = msgspec.msgpack.decode(payload, type=kind)
-            if robot is None or sample.link >= len(robot.links):
-                return
-            name = _ros_name(key.rpartition("/")[2])
-            if self._is_due(key, time_ns, MOVING_NS):
-                place = sample.position_l, sample.orientation_l_wxyz
-                mount = shapes.frame(time_ns, robot.links[sample.link].name, f"{name}_frame", *place)
-                yield self._protobuf("tf", FrameTransforms(transforms=[mount]))
-            yield self._json(f"own/{name}", sample)
+    def _encode_json(self, name: str, message: JsonMessage) -> FoxgloveMessage:
+        topic = make_topic(self._robot_name, name)
+        return FoxgloveMessage(topic, type(message), msgspec.json.encode(message))
 
 
-def _decoded(message: type[Any], payload: bytes | None) -> Any:
+def _decode(message_type: type[Any], payload: bytes) -> Any:
+    """Return a decoded message, or None if the payload does not fit its type."""
     with suppress(*UNDECODABLE):
-        return None if payload is None else _decoder(message).decode(payload)
+        return _get_decoder(message_type).decode(payload)
     return None
 
 
-def _pose(position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int) -> PoseInFrame:
-    made = PoseInFrame(timestamp=shapes.stamp(time_ns), frame_id=shapes.WORLD_FRAME)
-    made.pose.position.x, made.pose.position.y, made.pose.position.z = position
-    turn = made.pose.orientation
-    turn.w, turn.x, turn.y, turn.z = wxyz
-    return made
+def _decode_custom(kind: OwnKind, payload: bytes) -> Any:
+    """Return the decoded sample of a custom sensor, or None if the payload does not fit its type."""
+    with suppress(*UNDECODABLE):
+        return msgspec.msgpack.decode(payload, type=kind.message)
+    return None
 
 
-def _ros_name(text: str) -> str:
-    return re.sub(r"\W", "_", text, flags=re.ASCII)
+def _make_pose(base: BasePose, time_ns: int) -> PoseInFrame:
+    position_w, orientation_wxyz = base
+    message = PoseInFrame(timestamp=shapes.make_timestamp(time_ns), frame_id=shapes.WORLD_FRAME)
+    position = message.pose.position
+    position.x, position.y, position.z = position_w
+    orientation = message.pose.orientation
+    orientation.w, orientation.x, orientation.y, orientation.z = orientation_wxyz
+    return message

@@ -1,49 +1,74 @@
-"""A live server for Foxglove: what a recording holds for it, as it is written. On loopback only, for no other pages."""
+"""A live server for Foxglove: it sends the messages that a recording gets for viewers, as they are written.
+
+It listens on loopback only, and refuses web pages of other origins.
+"""
 
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import TYPE_CHECKING, Self
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of, topic
-from snakesim_operator.recording.origin_relay import HOST, OriginRelay, hidden_host
+from snakesim_operator.recording.foxglove_topics import (
+    COMMON_TOPICS,
+    FoxgloveMessage,
+    MessageType,
+    make_schema,
+    make_topic,
+)
+from snakesim_operator.recording.origin_relay import HOST, OriginRelay, choose_hidden_host
 
 if TYPE_CHECKING:
     import foxglove
 
 
 class LiveServer:
-    """Hands messages to every viewer that has subscribed to their topic; a slow one loses the oldest."""
+    """Sends messages to every viewer that has subscribed to their topic; a slow viewer loses the oldest."""
 
     def __init__(self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]) -> None:
-        """port: 0 takes any; origins: of web pages that may read the robot; report: told of those that may not.
+        """Start the server with the topics that every robot has.
 
-        Raises NotConnectedError when the port is in use."""
+        Args:
+            robot: Name of the robot.
+            port: Port on loopback; 0 takes any free one.
+            origins: Origins of web pages that may read the robot.
+            report: Gets a line of text for each page that was refused.
+
+        Raises:
+            NotConnectedError: The port is in use.
+        """
         import foxglove  # needs the extra `foxglove`
 
-        self._new_channel, self._schema = foxglove.Channel, foxglove.Schema
+        self._channel_type = foxglove.Channel
+        self._schema_type = foxglove.Schema
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        for name, kind in ALWAYS.items():  # before the first viewer: it subscribes in vain to one made as it connects
-            self._add(topic(robot, name), kind)
-        host = hidden_host()
+        # Before the first viewer: it would not get a channel that is made while it connects.
+        for name, message_type in COMMON_TOPICS.items():
+            self._add_channel(make_topic(robot, name), message_type)
+        hidden_host = choose_hidden_host()
         try:
-            self._server = foxglove.start_server(name=robot, host=host, port=0, context=self._context)
+            self._server = foxglove.start_server(name=robot, host=hidden_host, port=0, context=self._context)
         except RuntimeError as error:
             raise NotConnectedError(f"cannot serve Foxglove: {error}") from error
-        self._relay = OriginRelay(port, (host, self._server.port), origins, report)
+        self._relay = OriginRelay(port, (hidden_host, self._server.port), origins, report)
         self.address = f"ws://{HOST}:{self._relay.port}"
 
-    def show(self, shown: FoxgloveMessage, time_ns: int) -> None:
-        """Hand on one message. time_ns: robot time."""
-        channel = self._channels.get(shown.topic) or self._add(shown.topic, shown.kind)
-        channel.log(shown.payload, log_time=time_ns)
+    def show(self, message: FoxgloveMessage, time_ns: int) -> None:
+        """Send one message to the viewers. time_ns: robot time."""
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._add_channel(message.topic, message.message_type)
+        channel.log(message.payload, log_time=time_ns)
 
-    def _add(self, of: str, kind: Kind) -> "foxglove.Channel":
-        name, message_encoding, encoding, data = schema_of(kind)
-        schema = self._schema(name=name, encoding=encoding, data=data)
-        channel = self._new_channel(of, schema=schema, message_encoding=message_encoding, context=self._context)
-        self._channels[of] = channel
+    def _add_channel(self, topic: str, message_type: MessageType) -> "foxglove.Channel":
+        schema = make_schema(message_type)
+        channel = self._channel_type(
+            topic,
+            schema=self._schema_type(name=schema.name, encoding=schema.schema_encoding, data=schema.data),
+            message_encoding=schema.message_encoding,
+            context=self._context,
+        )
+        self._channels[topic] = channel
         return channel
 
     def __enter__(self) -> Self:

@@ -1,89 +1,126 @@
-"""What a recording has lost, by time and by key, and the words for it. Pure."""
+"""Counts what a recording has lost, by time and by key, and describes it in words."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-KEYS_SHOWN, GAPS_SHOWN = 8, 3
-MOST_GAPS = 1000  # kept apart; what is lost behind them is counted with the last
-SHOWN_ONLY = ("/", "foxglove/")  # made of the others; `foxglove/` in older recordings
-ELSEWHERE = "keys that are not known"  # whose channel is lost too
+MAX_KEYS_SHOWN = 8
+MAX_GAPS_SHOWN = 3
+MAX_GAPS = 1000  # that are kept apart; later losses are counted with the last one
+VIEWER_PREFIXES = ("/", "foxglove/")  # topics made from other messages; `foxglove/` is that of older recordings
+UNKNOWN_KEYS = "keys that are not known"  # of messages whose channel is lost too
 
 
 @dataclass
 class Gap:
     """Messages that are lost in one place."""
 
-    begin_ns: int  # robot time of the newest message before it
-    end_ns: int | None = None  # of the next one that can be read; None: there is none
-    lost: Counter[str] = field(default_factory=Counter[str])  # by key; what nothing tells of is not in it
+    begin_ns: int  # robot time of the newest message before the gap
+    end_ns: int | None = None  # robot time of the next readable message; None: there is none
+    lost: Counter[str] = field(default_factory=Counter[str])  # known number of messages, by key
 
 
 @dataclass
 class Losses:
-    """All of one file."""
+    """Everything that one file has lost."""
 
     gaps: list[Gap] = field(default_factory=list[Gap])
-    damaged: list[str] = field(default_factory=list[str])  # where the file is damaged, and how; the first ones
-    places: int = 0  # so many in all
-    cut_ns: int | None = None  # the file has no end; robot time of the newest message
+    damaged: list[str] = field(default_factory=list[str])  # position and kind of the first damages
+    places: int = 0  # number of all damages
+    cut_ns: int | None = None  # the file has no end; robot time of its newest message
     misplaced: int = 0  # messages behind later ones of their key
-    earlier: list[str] = field(default_factory=list[str])  # what the file that this one was made of lacked
+    earlier: list[str] = field(default_factory=list[str])  # losses of the file that this one was copied from
     dropped: dict[str, int] = field(default_factory=dict[str, int])  # by key: the disk was too slow
 
     @property
     def lost(self) -> Counter[str]:
-        """Messages that are known to be lost, by key."""
+        """Return the number of messages that are known to be lost, by key."""
         return sum((gap.lost for gap in self.gaps), Counter[str]())
 
-    def damage(self, at: int, why: str, newest_ns: int) -> None:
-        """A place that cannot be read."""
+    def add_damage(self, position: int, reason: str, newest_ns: int) -> None:
+        """Count a place that cannot be read.
+
+        Args:
+            position: In bytes from the beginning of the file.
+            reason: What is damaged.
+            newest_ns: Robot time of the newest message before it.
+        """
         self.places += 1
-        if len(self.damaged) < GAPS_SHOWN:
-            self.damaged.append(f"{why} at byte {at}")
+        if len(self.damaged) < MAX_GAPS_SHOWN:
+            self.damaged.append(f"{reason} at byte {position}")
         self.open_gap(newest_ns)
 
     def open_gap(self, begin_ns: int, end_ns: int | None = None) -> None:
-        """Something is lost from there on."""
-        if len(self.gaps) < MOST_GAPS:
+        """Begin a gap at this robot time; beyond MAX_GAPS, extend the last one."""
+        if len(self.gaps) < MAX_GAPS:
             self.gaps.append(Gap(begin_ns, end_ns))
         else:
             self.gaps[-1].end_ns = end_ns
 
-    def words(self) -> list[str]:
-        """What is lost, for people; empty when nothing is."""
-        said: list[str] = []
+    def describe(self) -> list[str]:
+        """Return what is lost in words, one text for each kind of loss; empty if nothing is lost."""
+        texts: list[str] = []
         if self.places:
-            more = f" and {self.places - len(self.damaged)} more" if self.places > len(self.damaged) else ""
-            said.append(f"damaged in {_count(self.places, 'place')}: {'; '.join(self.damaged)}{more}")
-        known = [gap for gap in self.gaps if gap.lost]
-        said += [_gap(gap) for gap in known[:GAPS_SHOWN]]
-        if len(known) > GAPS_SHOWN:
-            rest = sum(gap.lost.total() for gap in known[GAPS_SHOWN:])
-            said.append(f"{_count(rest, 'message')} in {_count(len(known) - GAPS_SHOWN, 'further gap')}")
+            texts.append(self._describe_damages())
+        texts += self._describe_gaps()
         if self.cut_ns is not None:
-            said.append(
+            texts.append(
                 f"its end: it breaks off at {self.cut_ns * 1e-9:.2f} s of robot time, because the recorder was killed, "
                 "the disk was full, or the file was cut"
             )
         if self.misplaced:
-            said.append(f"its order: {_count(self.misplaced, 'message')} behind later ones of the same key")
-        if dropped := sum(self.dropped.values()):
-            said.append(f"{_count(dropped, 'message')}, dropped because the disk was too slow: {_keys(self.dropped)}")
-        return said + [f"before it was copied: {one}" for one in self.earlier if one not in said]
+            count = _format_count(self.misplaced, "message")
+            texts.append(f"its order: {count} behind later ones of the same key")
+        dropped_count = sum(self.dropped.values())
+        if dropped_count:
+            count = _format_count(dropped_count, "message")
+            texts.append(f"{count}, dropped because the disk was too slow: {_list_keys(self.dropped)}")
+        earlier_texts = [f"before it was copied: {text}" for text in self.earlier if text not in texts]
+        return texts + earlier_texts
+
+    def _describe_damages(self) -> str:
+        text = f"damaged in {_format_count(self.places, 'place')}: {'; '.join(self.damaged)}"
+        if self.places > len(self.damaged):
+            text += f" and {self.places - len(self.damaged)} more"
+        return text
+
+    def _describe_gaps(self) -> list[str]:
+        """Return one text for each of the first gaps in which messages are known to be lost, and one for the rest."""
+        gaps = [gap for gap in self.gaps if gap.lost]
+        texts = [_describe_gap(gap) for gap in gaps[:MAX_GAPS_SHOWN]]
+        further_gaps = gaps[MAX_GAPS_SHOWN:]
+        if further_gaps:
+            messages = sum(gap.lost.total() for gap in further_gaps)
+            gap_count = _format_count(len(further_gaps), "further gap")
+            texts.append(f"{_format_count(messages, 'message')} in {gap_count}")
+        return texts
 
 
-def _gap(gap: Gap) -> str:
-    when = f"between {gap.begin_ns * 1e-9:.2f} s and {(gap.end_ns or 0) * 1e-9:.2f} s"
+def _describe_gap(gap: Gap) -> str:
+    begin_s = gap.begin_ns * 1e-9
     if gap.end_ns is None:
-        when = f"after {gap.begin_ns * 1e-9:.2f} s"
-    return f"{_count(gap.lost.total(), 'message')} {when} of robot time: {_keys(gap.lost)}"
+        interval = f"after {begin_s:.2f} s"
+    else:
+        interval = f"between {begin_s:.2f} s and {gap.end_ns * 1e-9:.2f} s"
+    count = _format_count(gap.lost.total(), "message")
+    return f"{count} {interval} of robot time: {_list_keys(gap.lost)}"
 
 
-def _keys(counts: dict[str, int]) -> str:
-    most = sorted(counts.items(), key=lambda one: (one[0].startswith(SHOWN_ONLY), -one[1], one[0]))
-    shown = [f"{key} {count}" for key, count in most[:KEYS_SHOWN]]
-    return ", ".join([*shown, *[f"{_count(len(most) - KEYS_SHOWN, 'more key')}"] * (len(most) > KEYS_SHOWN)])
+def _list_keys(counts: Mapping[str, int]) -> str:
+    """Return keys with their counts: the robot's own before those for viewers, then the largest counts first."""
+
+    def rank(entry: tuple[str, int]) -> tuple[bool, int, str]:
+        key, count = entry
+        return key.startswith(VIEWER_PREFIXES), -count, key
+
+    ranked = sorted(counts.items(), key=rank)
+    texts = [f"{key} {count}" for key, count in ranked[:MAX_KEYS_SHOWN]]
+    if len(ranked) > MAX_KEYS_SHOWN:
+        texts.append(_format_count(len(ranked) - MAX_KEYS_SHOWN, "more key"))
+    return ", ".join(texts)
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def _format_count(number: int, noun: str) -> str:
+    if number == 1:
+        return f"{number} {noun}"
+    return f"{number} {noun}s"

@@ -1,9 +1,9 @@
-"""A message of a recording, its file's name, words for an option: known without what reads and writes MCAP."""
+"""What other packages need to know of recordings, without the libraries that read and write MCAP."""
 
 from dataclasses import dataclass
 
-RECORDING = "recording.mcap"
-RAW_ONLY = "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"
+RECORDING = "recording.mcap"  # name of the file in the folder of a run
+RAW_ONLY = "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"  # help of the option
 
 
 @dataclass(frozen=True)
@@ -14,4 +14,4 @@ class RecordedMessage:
     payload: bytes
     encoding: str  # on the wire
     time_ns: int  # robot time
-    wall_ns: int  # at the recorder
+    wall_ns: int  # wall clock at the recorder

@@ -1,4 +1,7 @@
-"""In front of Foxglove's server, which lets any web page in: relays connections of those who may read the robot."""
+"""A relay in front of Foxglove's server, which itself accepts any web page: it checks who connects first.
+
+Data flow: viewer -> relay on loopback (checks the request's head) -> Foxglove's server on a hidden address.
+"""
 
 import asyncio
 import contextlib
@@ -10,95 +13,120 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_operator.base.page_origin import why_head_refused
 
 HOST = "127.0.0.1"
-LONGEST_HEAD = 16 * 1024
-HEAD_S = 5.0  # for a client to say what it wants
-AT_ONCE = 64  # connections
-CHUNK = 64 * 1024
+MAX_HEAD_BYTES = 16 * 1024
+HEAD_TIMEOUT_S = 5.0
+MAX_CONNECTIONS = 64
+MAX_REASONS_REPORTED = 64  # a page could otherwise fill the terminal
+CHUNK_BYTES = 64 * 1024
+END_OF_HEAD = b"\r\n\r\n"
+FORBIDDEN = b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
-def hidden_host() -> str:
-    """An address of loopback that no page can guess: with a port of its own it is one of some 2^37."""
-    return "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))
+def choose_hidden_host() -> str:
+    """Return a random loopback address. A page cannot guess it: with its port it is one of about 2^37."""
+    octets = [str(1 + secrets.randbelow(254)) for _ in range(3)]
+    return "127." + ".".join(octets)
 
 
 class OriginRelay:
-    """Listens, and relays to a server behind it whatever is sent after a request that may pass."""
+    """Listens on loopback, and connects each viewer that may read the robot with the server behind the relay."""
 
     def __init__(
-        self, port: int, behind: tuple[str, int], also: Collection[str], report: Callable[[str], None]
+        self, port: int, server: tuple[str, int], origins: Collection[str], report: Callable[[str], None]
     ) -> None:
-        """Listen. Raises NotConnectedError when the port is in use.
+        """Start to listen, in a thread.
 
-        port: 0 takes any; behind: the server; also: further origins that may connect; report: told of each refusal.
+        Args:
+            port: Port on loopback; 0 takes any free one.
+            server: Host and port of the server behind the relay.
+            origins: Origins of web pages that may connect, besides local ones.
+            report: Gets a line of text for each kind of refusal.
+
+        Raises:
+            NotConnectedError: The port is in use.
         """
-        self._behind, self._also, self._report = behind, also, report
-        self._told: set[str] = set()
+        self._server_address = server
+        self._origins = origins
+        self._report = report
+        self._reported: set[str] = set()  # reasons
         self._connections: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         try:
-            self._server = self._loop.run_until_complete(
-                asyncio.start_server(self._serve, HOST, port, limit=LONGEST_HEAD)
-            )
+            listening = asyncio.start_server(self._serve, HOST, port, limit=MAX_HEAD_BYTES)
+            self._listener = self._loop.run_until_complete(listening)
         except OSError as error:
             self._loop.close()
             raise NotConnectedError(
                 f"cannot serve Foxglove on port {port}: {error.strerror}; choose another"
             ) from error
-        self.port: int = self._server.sockets[0].getsockname()[1]
+        self.port: int = self._listener.sockets[0].getsockname()[1]
         self._thread = threading.Thread(target=self._loop.run_forever, name="origin relay", daemon=True)
         self._thread.start()
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._connections.add(task)
-        try:
-            if len(self._connections) <= AT_ONCE:
-                await self._relay(reader, writer)
-        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # one of both is gone, or never was one of ours
-        finally:
-            self._connections.discard(task)
-            writer.close()
-
-    async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
-        why = why_head_refused(head, self._also)
-        if why is not None:
-            if why not in self._told and len(self._told) < AT_ONCE:
-                self._told.add(why)
-                self._report(f"Foxglove: refused a viewer: {why}; if you trust it: --foxglove-origin ORIGIN")
-            writer.write(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
-            await writer.drain()
-            return
-        behind, to_behind = await asyncio.open_connection(*self._behind)
-        try:
-            to_behind.write(head)
-            ways = [asyncio.ensure_future(_copy(reader, to_behind)), asyncio.ensure_future(_copy(behind, writer))]
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-            for way in ways:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
-        finally:
-            to_behind.close()
-
     def close(self) -> None:
-        """Let nobody in any more, and hang up."""
-        asyncio.run_coroutine_threadsafe(self._hang_up(), self._loop).result()
+        """Refuse new connections, and close the present ones."""
+        asyncio.run_coroutine_threadsafe(self._disconnect_all(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
 
-    async def _hang_up(self) -> None:
-        self._server.close()
+    async def _disconnect_all(self) -> None:
+        self._listener.close()
         for task in list(self._connections):
             task.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
 
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve one connection until either side closes it."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._connections.add(task)
+        try:
+            if len(self._connections) <= MAX_CONNECTIONS:
+                await self._check_and_relay(reader, writer)
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            pass  # a peer has left, or did not send a proper request
+        finally:
+            self._connections.discard(task)
+            writer.close()
+
+    async def _check_and_relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = await asyncio.wait_for(reader.readuntil(END_OF_HEAD), HEAD_TIMEOUT_S)
+        refusal = why_head_refused(head, self._origins)
+        if refusal is not None:
+            self._report_refusal(refusal)
+            writer.write(FORBIDDEN)
+            await writer.drain()
+            return
+        await self._relay(head, reader, writer)
+
+    def _report_refusal(self, reason: str) -> None:
+        """Report each reason once."""
+        if reason not in self._reported and len(self._reported) < MAX_REASONS_REPORTED:
+            self._reported.add(reason)
+            self._report(f"Foxglove: refused a viewer: {reason}; if you trust it: --foxglove-origin ORIGIN")
+
+    async def _relay(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Copy bytes in both directions until one of the sides closes its connection."""
+        from_server, to_server = await asyncio.open_connection(*self._server_address)
+        try:
+            to_server.write(head)
+            upstream = asyncio.ensure_future(_copy(reader, to_server))
+            downstream = asyncio.ensure_future(_copy(from_server, writer))
+            await asyncio.wait([upstream, downstream], return_when=asyncio.FIRST_COMPLETED)
+            upstream.cancel()
+            downstream.cancel()
+            await asyncio.gather(upstream, downstream, return_exceptions=True)
+        finally:
+            to_server.close()
+
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """As fast as the receiver takes it: what is too much for it is dropped by the server, which knows messages."""
+    """Copy bytes as fast as the receiver takes them.
+
+    For a slow viewer the server drops whole messages; this relay does not know where a message ends.
+    """
     with contextlib.suppress(OSError):
-        while data := await reader.read(CHUNK):
+        while data := await reader.read(CHUNK_BYTES):
             writer.write(data)
             await writer.drain()

@@ -1,6 +1,8 @@
-"""The recorder: a process of its own beside a run, or beside any robot. A robot never waits for it in real time.
+"""The recorder: a process of its own beside a run, or beside any robot. In real time, a robot never waits for it.
 
 `python -m snakesim_operator.recording.process` is the child of `snakesim run`; `snakesim record` calls `record`.
+
+Data flow: Zenoh's threads -> `Tap` (bounded queue) -> `Recorder`, in the main thread -> `Recording` (one file).
 """
 
 import argparse
@@ -22,7 +24,7 @@ from snakesim_hal.base.terminal import exit_code, print_stderr
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
-from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import ProcessOptions, process_options
 from snakesim_hal.service import START_LIMIT_S
@@ -34,65 +36,92 @@ from snakesim_operator.recording.message import RAW_ONLY, RECORDING
 from snakesim_operator.recording.recording import Recording, Show
 from snakesim_operator.recording.tap import Tap
 
-TURN_S = 0.02
-REST_S, QUIET_TURNS = 2.0, 2  # at the end: for as long at most; nothing must have come in so many turns
-NICE = 10  # a robot's own processes come first
+CYCLE_S = 0.02
+LAST_MESSAGES_TIMEOUT_S = 2.0  # at the end, for messages that are on their way
+QUIET_CYCLES = 2  # at the end: after so many cycles without a message, none is on its way
+NICE = 10  # a robot's own processes have precedence
 MAX_HOSTS = 100  # files: one for each host that a robot had
-FULL = 4  # exit code: the disk took no more
+EXIT_DISK_FULL = 4
 
 
 class Recorder:
-    """Writes what a tap takes; a file for each host that the robot has, one after the other."""
+    """Writes a robot's messages into a file, and begins a new file when the robot gets a new host."""
 
     def __init__(self, path: Path, shown_as: str | None, show: Show | None = None) -> None:
-        """Arguments as of Recording. Raises OSError when the file cannot be made."""
+        """Begin the first file. The arguments are those of Recording. Raises OSError if it cannot be created."""
         self.path = path
         self._shown_as = shown_as
         self._show = show
-        self.recording = Recording(path, shown_as, show)
-        self._latched: dict[str, Arrival] = {}
-        self._host: str | None = None
-        self._new_host = False
-        self._back: Arrival | None = None  # the newest clock, if time went back and no file has begun since
         self._began = datetime.now(UTC)
-        self._hosts = 1
+        self.recording = Recording(path, shown_as, show)
 
-    def take(self, arrival: Arrival) -> None:
-        """Write one message."""
+        # What a new host changes: its description comes, and robot time starts over, in either order.
+        self._latched: dict[str, Arrival] = {}  # newest messages that each file begins with, by key
+        self._host: str | None = None
+        self._host_count = 1
+        self._host_is_new = False  # and has no file
+        self._restarted_clock: Arrival | None = None  # the newest clock, if time went back and has no file
+
+    def write(self, arrival: Arrival) -> None:
+        """Write one message. Once the description and the first clock of a new host have come, begin a new file."""
         if arrival.key in (keys.DESCRIPTION, keys.CONFIG, keys.STATUS):
             self._latched[arrival.key] = arrival
             if arrival.key == keys.DESCRIPTION:
-                self._meet(arrival.payload)
+                self._read_host(arrival.payload)
         self.recording.take(arrival)
-        if arrival.key == keys.CLOCK and (self._back is not None or self.recording.time.went_back):
-            self._back = arrival
-        if self._new_host and self._back is not None:  # in either order
-            self._start_over(self._back)
+        if arrival.key == keys.CLOCK:
+            has_restarted = self._restarted_clock is not None or self.recording.time.went_back
+            if has_restarted:
+                self._restarted_clock = arrival
+        if self._host_is_new and self._restarted_clock is not None:
+            self._begin_next_file(self._restarted_clock)
 
     def close(self, dropped: dict[str, int]) -> str:
-        """Finish the file. Returns why it lacks something, or an empty text."""
-        about = {"version": version("snakesim"), "began": self._began.isoformat(), "dropped": dropped}
+        """Write metadata and index into the file, and close it.
+
+        Args:
+            dropped: Number of dropped messages by key, which the file then states.
+
+        Returns:
+            Why the file is incomplete, or an empty text.
+        """
+        about = {
+            "version": version("snakesim"),
+            "began": self._began.isoformat(),
+            "dropped": dropped,
+        }
         self.recording.close(about)
         return self.recording.failure
 
-    def _meet(self, payload: bytes) -> None:
+    def _read_host(self, payload: bytes) -> None:
+        """Note whether a description comes from a new host; an unproven one is ignored."""
         with contextlib.suppress(*UNDECODABLE):
             robot = msgspec.msgpack.decode(payload, type=Description)
             if is_proven(robot, own_run_key()):
-                self._new_host |= self._host not in (None, robot.host)
+                if self._host is not None and robot.host != self._host:
+                    self._host_is_new = True
                 self._host = robot.host
 
-    def _start_over(self, clock: Arrival) -> None:
-        """Robot time started over, with another host: what was before gets a file of its own."""
-        self._new_host, self._back = False, None
-        if self._hosts >= MAX_HOSTS:
+    def _begin_next_file(self, clock: Arrival) -> None:
+        """Keep what was written under another name, and begin a new file with the latched messages and a clock."""
+        self._host_is_new = False
+        self._restarted_clock = None
+        if self._host_count >= MAX_HOSTS:
             return
-        self._hosts += 1
+        self._host_count += 1
         self.close({})
-        self.path.rename(next(p for n in count(1) if not (p := self.path.with_stem(f"{self.path.stem}-{n}")).exists()))
+        self.path.rename(self._find_free_path())
         self.recording = Recording(self.path, self._shown_as, self._show)
         for arrival in (*self._latched.values(), clock):
             self.recording.take(arrival)
+
+    def _find_free_path(self) -> Path:
+        """Return the first of NAME-1, NAME-2 and so on that does not exist."""
+        numbers = count(1)
+        while True:
+            path = self.path.with_stem(f"{self.path.stem}-{next(numbers)}")
+            if not path.exists():
+                return path
 
 
 def record(
@@ -104,24 +133,41 @@ def record(
     raw_only: bool = False,
     after_host: bool = False,
 ) -> Recorder:
-    """Record a robot for as long as `goes_on` says. Raises NotConnectedError, ConfigError for a file that exists.
+    """Record a robot until the caller ends it or the disk is full.
 
-    raw_only: without topics for viewers, of which `show` would be told. after_host: then until its host has left."""
+    Args:
+        link: How to reach the robot.
+        path: The new file.
+        goes_on: Returns whether to continue; called in each cycle.
+        show: Gets each message that is made for viewers.
+        raw_only: Record messages as on the wire alone, without topics for viewers.
+        after_host: At the end, wait until the robot's host has left the network.
+
+    Returns:
+        The recorder with its closed file.
+
+    Raises:
+        ConfigError: The file exists or cannot be created.
+        NotConnectedError: There is no network at the link.
+    """
+    shown_as = None
+    if not raw_only:
+        shown_as = link.namespace or "robot"
     try:
-        recorder = Recorder(path, None if raw_only else link.namespace or "robot", show)
+        recorder = Recorder(path, shown_as, show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
     with open_session(link, connect_timeout_s=START_LIMIT_S) as session:
-        tap, hosts = Tap(session), set[str]()
-        session.on_alive(lambda key, there: (hosts.add if there else hosts.discard)(key), keys.alive(HAL))
+        tap = Tap(session)
+        hosts = _watch_hosts(session)
         session.declare_alive(RECORDER)
         show_process(session, own_entry(RECORDER))
         while goes_on() and not recorder.recording.failure:
-            _turn(tap, recorder)
-            time.sleep(TURN_S)
+            _write_arrivals(tap, recorder)
+            time.sleep(CYCLE_S)
         if after_host:
-            _take_rest(tap, recorder, hosts)
-        _turn(tap, recorder)
+            _write_last_messages(tap, recorder, hosts)
+        _write_arrivals(tap, recorder)
     for key, number in sorted(tap.dropped.items()):
         print_stderr(f"{number} messages on {key} were dropped: the disk was too slow")
     failure = recorder.close(dict(tap.dropped))
@@ -130,28 +176,54 @@ def record(
     return recorder
 
 
-def _take_rest(tap: Tap, recorder: Recorder, hosts: set[str]) -> None:
-    """What a host that has ended sent before, and what this process, which goes last, has not read yet."""
-    give_up_s, quiet = time.monotonic() + REST_S, 0
-    while quiet < QUIET_TURNS and time.monotonic() < give_up_s:
-        quiet = 0 if _turn(tap, recorder) or hosts else quiet + 1
-        time.sleep(TURN_S)
+def _watch_hosts(session: Session) -> set[str]:
+    """Return a set that holds the liveliness keys of the hosts that are present, from now on."""
+    hosts: set[str] = set()
+
+    def update(key: str, is_present: bool) -> None:
+        if is_present:
+            hosts.add(key)
+        else:
+            hosts.discard(key)
+
+    session.on_alive(update, keys.alive(HAL))
+    return hosts
 
 
-def _turn(tap: Tap, recorder: Recorder) -> int:
-    """Write what has arrived; returns how many messages."""
-    arrived = tap.take()
-    for arrival in arrived:
-        recorder.take(arrival)
+def _write_last_messages(tap: Tap, recorder: Recorder, hosts: set[str]) -> None:
+    """Write what an ending host still sends, until it has left and no message is on its way.
+
+    In a run the recorder ends last, so messages of the others may wait in the network.
+    """
+    give_up_s = time.monotonic() + LAST_MESSAGES_TIMEOUT_S
+    quiet_cycles = 0
+    while quiet_cycles < QUIET_CYCLES and time.monotonic() < give_up_s:
+        arrival_count = _write_arrivals(tap, recorder)
+        if arrival_count > 0 or hosts:
+            quiet_cycles = 0
+        else:
+            quiet_cycles += 1
+        time.sleep(CYCLE_S)
+
+
+def _write_arrivals(tap: Tap, recorder: Recorder) -> int:
+    """Write what has arrived since the last call, and return the number of messages."""
+    arrivals = tap.drain()
+    for arrival in arrivals:
+        recorder.write(arrival)
     clock = recorder.recording.time.clock
     if clock is not None and not tap.dropped:
         tap.lossless = clock.clock_mode == "lockstep"
     recorder.recording.flush_when_due()
-    return len(arrived)
+    return len(arrivals)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Record a run into its folder until told to end. Exit code 1 when it could not go on, 2 for wrong input."""
+    """Record a run into its folder until a stop signal.
+
+    Returns:
+        The exit code: 0; 2 for wrong input; EXIT_DISK_FULL; 1 for any other failure.
+    """
     parser = argparse.ArgumentParser(description="Record a run.")
     parser.add_argument("--out", type=Path, default=Path(), help="folder of the run")
     parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
@@ -159,17 +231,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_network(parser, "")
     add_parent(parser)
     arguments = parser.parse_args(argv)
-    return exit_code(f"snakesim {RECORDER}", lambda: _record(process_options(arguments)))
+    return exit_code(f"snakesim {RECORDER}", lambda: _record_run(process_options(arguments)))
 
 
-def _record(given: ProcessOptions) -> int:
-    ended: list[bool] = []
-    on_stop_signal(lambda: ended.append(True))
+def _record_run(options: ProcessOptions) -> int:
+    """Record as a child process of a run, with a low priority."""
+    stop_signals: list[bool] = []
+    on_stop_signal(lambda: stop_signals.append(True))
     os.nice(NICE)
-    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # its threads, woken by each message, displace nobody
-    file, raw_only = given.arguments.out / RECORDING, given.arguments.raw_only
-    recorder = record(given.link, file, lambda: not ended, raw_only=raw_only, after_host=True)
-    return FULL if recorder.recording.failure else 0
+    # A batch process: its threads are woken by each message, and must not displace the robot's processes.
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    path = options.arguments.out / RECORDING
+    raw_only = options.arguments.raw_only
+    recorder = record(options.link, path, lambda: not stop_signals, raw_only=raw_only, after_host=True)
+    if recorder.recording.failure:
+        return EXIT_DISK_FULL
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """Reads a recording: the messages in the order of the file, also of one that is damaged or was never finished.
 
-Damage ends nothing: the reading goes on at the next chunk that is intact. What is lost in between is known from the
-messages' sequence numbers, which count up by key, and from the file's own statistics if it has an end.
+Damage does not end the reading: it continues at the next intact chunk. What is lost in between is known from the
+messages' sequence numbers, which count up for each key, and from the file's own statistics if it has an end.
 """
 
 import json
 import os
-import re
-import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,288 +17,270 @@ from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.keys import row_key
-from snakesim_operator.recording.chunks import (
-    HEAD,
-    LARGEST_BYTES,
-    DamagedError,
-    chunk_bytes,
-    parsed,
-    records_in,
-    unpack,
-)
-from snakesim_operator.recording.losses import ELSEWHERE, MOST_GAPS, Losses
+from snakesim_operator.recording.chunks import DamagedError, parse_chunk, parse_record, unpack
+from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, Losses
 from snakesim_operator.recording.mcap_file import PROFILE
 from snakesim_operator.recording.message import RecordedMessage
+from snakesim_operator.recording.record_search import (
+    CUT,
+    READ_OPCODES,
+    RawRecord,
+    find_next_record,
+    read_record,
+    read_summary,
+)
 from snakesim_operator.recording.recording import ABOUT, COPIED
 
 LATEST_NS = 2**62  # 146 years: no robot time is later
-MOST_RATIO, FREE_BYTES = 100, 32 * 1024 * 1024  # a file may unpack to so many times its size, and to so much more
-_SCANNED_BYTES = 1024 * 1024
-_NEXT_BYTES = 64  # of what _NEXT matches, at most
-_NEXT = re.compile(  # a chunk of a known compression, our metadata, or the end of the messages
-    rb"\x06[\s\S]{4}\0{4}[\s\S]{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4})[\s\S]{4}\0{4}"
-    rb"|\x0c[\s\S]{4}\0{4}\x08\0{3}" + ABOUT.encode() + rb"|\x0f\x04\0{7}[\s\S]{4}[\x01-\x0f]"
-)
-_DATA_END = HEAD.pack(Opcode.DATA_END, 4)  # and a CRC
-_FOOTER = HEAD.size + 20 + len(MCAP0_MAGIC)  # bytes at the end: a record of two offsets and a CRC, and the magic
-_READ = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
+NO_SCHEMA = 0  # MCAP's number for a channel without a schema
+
+# A file may unpack to MAX_UNPACKING_RATIO times its size and to FREE_BYTES more; no robot's messages exceed that.
+MAX_UNPACKING_RATIO = 100
+FREE_BYTES = 32 * 1024 * 1024
+
+# Bounds of the metadata, which comes from the file.
+MAX_KEY_LENGTH = 200
+MAX_EARLIER_LOSSES = 10
+MAX_EARLIER_LENGTH = 500
 
 
 @dataclass
 class RecordingReader:
-    """One file. What it says of itself, and what it lacks, is known once its messages have been read."""
+    """One file. Its metadata and its losses are known once its messages have been read."""
 
     path: Path
     finished: bool = False  # else its recorder was killed, the disk was full, or the file was cut
     losses: Losses = field(default_factory=Losses)
     about: dict[str, Any] = field(default_factory=dict[str, Any])
+
+    # What has been read.
     _channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
-    _schemas: set[int] = field(default_factory=lambda: {0})  # 0: none
-    _last: dict[int, tuple[int, int]] = field(default_factory=dict[int, tuple[int, int]])  # sequence, gaps by then
-    _newest_ns: int = 0
-    _counted: bool = True  # sequence numbers count up
+    _schemas: set[int] = field(default_factory=lambda: {NO_SCHEMA})
+    _newest_ns: int = 0  # robot time of the newest message
     _unpacked_bytes: int = 0
+
+    # For the losses, by channel: newest sequence number, and how many gaps were known then.
+    _last: dict[int, tuple[int, int]] = field(default_factory=dict[int, tuple[int, int]])
+    _is_counted: bool = True  # sequence numbers count up, as a recorder of this program writes them
+
+    # The end of the file.
     _file: BinaryIO | None = None
-    _summary: list[McapRecord] | None = None
+    _summary: list[McapRecord] | None = None  # None: not read
 
     @property
     def lacks(self) -> list[str]:
-        """What is missing, for people."""
-        return self.losses.words()
+        """Return what is missing, in words; empty if nothing is."""
+        return self.losses.describe()
 
     def messages(self, keys: Collection[str] | None = None) -> Iterator[RecordedMessage]:
-        """Messages at these keys of the robot, or at all. Raises ConfigError for a file that is no recording.
+        """Yield the messages of the robot.
 
-        keys: a pattern of the key space stands for its keys.
+        Args:
+            keys: Keys to read; a pattern of the key space stands for its keys. None: all keys.
+
+        Raises:
+            ConfigError: The file is no recording, or cannot be read.
         """
         for record in self.records():
-            if isinstance(record, Message):
-                channel = self._channels[record.channel_id]
-                encoding = channel.metadata.get("encoding")
-                if encoding is not None and (keys is None or channel.topic in keys or row_key(channel.topic) in keys):
-                    yield RecordedMessage(channel.topic, record.data, encoding, record.log_time, record.publish_time)
+            if not isinstance(record, Message):
+                continue
+            channel = self._channels[record.channel_id]
+            encoding = channel.metadata.get("encoding")
+            if encoding is None:  # a topic made for viewers
+                continue
+            if keys is None or channel.topic in keys or row_key(channel.topic) in keys:
+                yield RecordedMessage(channel.topic, record.data, encoding, record.log_time, record.publish_time)
 
     def records(self) -> Iterator[McapRecord]:
-        """Every schema, channel, message and metadata that can be read. Raises ConfigError for a file that is no MCAP.
+        """Yield every schema, channel, message and metadata that can be read, a channel before its messages.
 
-        The channel of a message comes before it.
+        Raises:
+            ConfigError: The file is no MCAP file, or cannot be read.
         """
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                     raise ConfigError(f"{self.path} is not a recording: it does not begin as an MCAP file")
                 self._file = file
-                yield from self._read(file, os.fstat(file.fileno()).st_size)
-                self._close_books()
+                size = os.fstat(file.fileno()).st_size
+                yield from self._read_file(file, size)
+                self._count_losses_at_end()
         except OSError as error:
             raise ConfigError(f"{self.path} cannot be read: {error.strerror}") from None
 
-    def _read(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
-        at = len(MCAP0_MAGIC)
-        while not self.finished and at < size:
+    # --- reading
+
+    def _read_file(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
+        """Yield the usable records of a file; behind damage, continue at the next intact record."""
+        position = len(MCAP0_MAGIC)
+        while not self.finished and position < size:
             try:
-                opcode, content, end = _record_at(file, at, size)
+                raw_record = read_record(file, position, size)
             except DamagedError as error:
-                found = _next(file, at + 1, size)
-                if found is not None or str(error) != _CUT:
-                    self.losses.damage(at, str(error), self._newest_ns)
-                if found is None:
+                next_position = find_next_record(file, position + 1, size)
+                is_cut_end = next_position is None and str(error) == CUT
+                if not is_cut_end:
+                    self.losses.add_damage(position, str(error), self._newest_ns)
+                if next_position is None:
                     break
-                at = found
+                position = next_position
                 continue
             try:
-                for record in self._taken_apart(opcode, content, end):
-                    yield from self._accounted(record)
+                for record in self._parse(raw_record):
+                    yield from self._process(record)
             except DamagedError as error:
-                self.losses.damage(at, str(error), self._newest_ns)
-            at = end
+                self.losses.add_damage(position, str(error), self._newest_ns)
+            position = raw_record.end
         if not self.finished:
             self.losses.cut_ns = self._newest_ns
 
-    def _taken_apart(self, opcode: int, content: bytes, read_bytes: int) -> Iterator[McapRecord]:
+    def _parse(self, raw_record: RawRecord) -> Iterator[McapRecord]:
+        """Yield the record, or the records of a chunk. Raises DamagedError, ConfigError."""
+        opcode = raw_record.opcode
         if opcode == Opcode.CHUNK:
-            data = unpack(content)
-            self._unpacked_bytes += len(data)
-            if self._unpacked_bytes > FREE_BYTES + MOST_RATIO * read_bytes:
-                raise ConfigError(
-                    f"{self.path} is not a recording: its first {read_bytes / 1e6:.2f} MB unpack to "
-                    f"{self._unpacked_bytes / 1e6:.0f} MB or more, which no messages of a robot do; the most is "
-                    f"{FREE_BYTES / 1e6:.0f} MB and {MOST_RATIO} times the file"
-                )
-            yield from records_in(data)
+            data = unpack(raw_record.content)
+            self._count_unpacked_bytes(len(data), raw_record.end)
+            yield from parse_chunk(data)
         elif opcode == Opcode.DATA_END:
             self.finished = True
             yield DataEnd(0)
-        elif opcode in _READ:
-            yield parsed(opcode, memoryview(content))
+        elif opcode in READ_OPCODES:
+            yield parse_record(opcode, memoryview(raw_record.content))
 
-    def _accounted(self, record: McapRecord) -> Iterator[McapRecord]:
-        """The record, unless it is of no use; a channel that was lost is made up for."""
+    def _count_unpacked_bytes(self, chunk_bytes: int, read_bytes: int) -> None:
+        """Raise ConfigError for a file that unpacks to more than a recording can."""
+        self._unpacked_bytes += chunk_bytes
+        if self._unpacked_bytes > FREE_BYTES + MAX_UNPACKING_RATIO * read_bytes:
+            raise ConfigError(
+                f"{self.path} is not a recording: its first {read_bytes / 1e6:.2f} MB unpack to "
+                f"{self._unpacked_bytes / 1e6:.0f} MB or more, which no messages of a robot do; the most is "
+                f"{FREE_BYTES / 1e6:.0f} MB and {MAX_UNPACKING_RATIO} times the file"
+            )
+
+    def _process(self, record: McapRecord) -> Iterator[McapRecord]:
+        """Yield the record if it is usable, behind the channel and schema that it needs if those were lost."""
         match record:
             case Message():
-                if record.channel_id not in self._channels and record.channel_id in (lost := self._lost_channels()):
-                    yield from self._opened(lost[record.channel_id])  # as the end of the file repeats it
-                if self._is_good(record):
+                if record.channel_id not in self._channels:
+                    yield from self._restore_channel(record.channel_id)
+                if self._count_message(record):
                     yield record
             case Channel():
-                yield from self._opened(record)
+                yield from self._open_channel(record)
             case Schema():
                 self._schemas.add(record.id)
                 yield record
             case Header():
-                self._counted = record.profile == PROFILE
+                self._is_counted = record.profile == PROFILE
             case Metadata(name=name) if name == ABOUT:
-                self._take_about(record.metadata)
+                self._read_about(record.metadata)
                 yield record
             case _:
                 yield record
 
-    def _is_good(self, message: Message) -> bool:
-        channel, time_ns = self._channels.get(message.channel_id), message.log_time
-        losses = self.losses
-        if losses.gaps and losses.gaps[-1].end_ns is None and time_ns < LATEST_NS:
-            losses.gaps[-1].end_ns = max(time_ns, losses.gaps[-1].begin_ns)
-        topic = ELSEWHERE if channel is None else channel.topic
-        last, gaps_then = self._last.get(message.channel_id, (0, 0))
-        if self._counted and message.sequence > last + 1:
-            self._lose(topic, message.sequence - last - 1, gaps_then, time_ns)
-        elif self._counted and message.sequence <= last:
-            losses.misplaced += 1
-        self._last[message.channel_id] = (max(message.sequence, last), len(losses.gaps))
-        if channel is None or time_ns >= LATEST_NS:
-            self._lose(topic, 1, 0, self._newest_ns)
-            return False
-        self._newest_ns = max(self._newest_ns, time_ns)
-        return True
-
-    def _lose(self, topic: str, count: int, gaps_then: int, time_ns: int | None) -> None:
-        """Of a key whose newest message was read when there were so many gaps."""
-        gaps = self.losses.gaps
-        if len(gaps) <= gaps_then < MOST_GAPS:
-            end_ns = time_ns if time_ns is None else max(min(time_ns, LATEST_NS), self._newest_ns)
-            self.losses.open_gap(self._newest_ns, end_ns)
-        gaps[-1].lost[topic] += count
-
-    def _close_books(self) -> None:
-        """Count what is lost at the end, by the statistics of a file that has them."""
-        for statistics in (one for one in self._summarised() if isinstance(one, Statistics)):
-            for number, count in statistics.channel_message_counts.items():
-                last, gaps_then = self._last.get(number, (0, 0))
-                if self._counted and last < count < LATEST_NS:
-                    channel = self._channels.get(number) or self._lost_channels().get(number)
-                    self._lose(ELSEWHERE if channel is None else channel.topic, count - last, gaps_then, None)
-
-    def _opened(self, channel: Channel) -> Iterator[McapRecord]:
-        """The channel, behind its schema if that was lost."""
+    def _open_channel(self, channel: Channel) -> Iterator[McapRecord]:
+        """Yield the channel, behind its schema if that was lost and the summary repeats it."""
         self._channels.setdefault(channel.id, channel)
         if channel.schema_id not in self._schemas:
             self._schemas.add(channel.schema_id)
-            yield from (one for one in self._summarised() if isinstance(one, Schema) and one.id == channel.schema_id)
+            for record in self._read_summary():
+                if isinstance(record, Schema) and record.id == channel.schema_id:
+                    yield record
         yield channel
 
-    def _lost_channels(self) -> dict[int, Channel]:
-        return {one.id: one for one in self._summarised() if isinstance(one, Channel)}
+    def _restore_channel(self, number: int) -> Iterator[McapRecord]:
+        """Open a channel that was lost, if the summary repeats it."""
+        channel = self._find_in_summary(number)
+        if channel is not None:
+            yield from self._open_channel(channel)
 
-    def _summarised(self) -> list[McapRecord]:
-        """Channels, schemas and statistics at the end of the file; empty when it has no such end."""
+    def _find_in_summary(self, number: int) -> Channel | None:
+        """Return the last channel of this number in the summary, or None."""
+        found: Channel | None = None
+        for record in self._read_summary():
+            if isinstance(record, Channel) and record.id == number:
+                found = record
+        return found
+
+    def _read_summary(self) -> list[McapRecord]:
+        """Return channels, schemas and statistics at the end of the file; empty if it has no intact end."""
         if self._summary is None and self._file is not None:
             try:
-                self._summary = _summary_of(self._file)
+                self._summary = read_summary(self._file)
             except DamagedError:
                 self._summary = []
         return self._summary or []
 
-    def _take_about(self, metadata: dict[str, str]) -> None:
+    def _read_about(self, metadata: dict[str, str]) -> None:
+        """Read the recorder's metadata; entries that are no JSON are ignored."""
         for name, value in metadata.items():
             try:
                 self.about[name] = json.loads(value)
             except (ValueError, RecursionError):
                 continue
-        dropped, earlier = self.about.get("dropped"), self.about.get(COPIED)
+        dropped = self.about.get("dropped")
         if isinstance(dropped, dict):
-            known = {str(key)[:200]: count for key, count in dropped.items() if isinstance(count, int) and count > 0}
-            self.losses.dropped = known
+            self.losses.dropped = {}
+            for key, count in dropped.items():
+                if isinstance(count, int) and count > 0:
+                    self.losses.dropped[str(key)[:MAX_KEY_LENGTH]] = count
+        earlier = self.about.get(COPIED)
         if isinstance(earlier, list):
-            self.losses.earlier = [str(one)[:500] for one in earlier[:10]]
+            self.losses.earlier = [str(text)[:MAX_EARLIER_LENGTH] for text in earlier[:MAX_EARLIER_LOSSES]]
 
+    # --- losses
 
-_CUT = "the file ends in the middle of a record"
+    def _count_message(self, message: Message) -> bool:
+        """Count what is lost before a message, and return whether the message itself is usable."""
+        channel = self._channels.get(message.channel_id)
+        topic = UNKNOWN_KEYS if channel is None else channel.topic
+        time_ns = message.log_time
+        self._end_gap(time_ns)
+        last, gaps_then = self._last.get(message.channel_id, (0, 0))
+        if self._is_counted:
+            if message.sequence > last + 1:
+                self._add_loss(topic, message.sequence - last - 1, gaps_then, time_ns)
+            elif message.sequence <= last:
+                self.losses.misplaced += 1
+        self._last[message.channel_id] = (max(message.sequence, last), len(self.losses.gaps))
+        if channel is None or time_ns >= LATEST_NS:
+            self._add_loss(topic, 1, 0, self._newest_ns)
+            return False
+        self._newest_ns = max(self._newest_ns, time_ns)
+        return True
 
+    def _end_gap(self, time_ns: int) -> None:
+        """Let an open gap end at the robot time of a message, if that is plausible."""
+        gaps = self.losses.gaps
+        if gaps and gaps[-1].end_ns is None and time_ns < LATEST_NS:
+            gaps[-1].end_ns = max(time_ns, gaps[-1].begin_ns)
 
-def _record_at(file: BinaryIO, at: int, size: int) -> tuple[int, bytes, int]:
-    """Kind, content and end of a record; no content for those that are skipped. Raises DamagedError, OSError."""
-    file.seek(at)
-    head = file.read(HEAD.size)
-    if len(head) < HEAD.size:
-        raise DamagedError(_CUT)
-    opcode, length = HEAD.unpack(head)
-    begin, end = at + HEAD.size, at + HEAD.size + length
-    if not 0 < opcode < 0x10 and opcode < 0x80:
-        raise DamagedError("no record")
-    if end > size:
-        raise DamagedError(_CUT)
-    if opcode == Opcode.CHUNK:
-        _check(length == chunk_bytes(file.read(_NEXT_BYTES)), "a chunk whose lengths contradict each other")
-        file.seek(begin)
-    elif opcode == Opcode.MESSAGE_INDEX:
-        listed = int.from_bytes(file.read(6)[2:], "little")
-        _check(length == 6 + listed and listed % 16 == 0, "an index whose lengths contradict each other")
-    elif opcode == Opcode.DATA_END:
-        _check(length == 4, "an end that is none")
-    if opcode != Opcode.CHUNK and opcode not in _READ:
-        return opcode, b"", end
-    _check(length <= LARGEST_BYTES, f"a record of {length / 1e6:.0f} MB, more than {LARGEST_BYTES / 1e6:.0f} MB")
-    content = file.read(length)
-    _check(len(content) == length, _CUT)
-    return opcode, content, end
+    def _add_loss(self, topic: str, count: int, gaps_then: int, end_ns: int | None) -> None:
+        """Count lost messages of a key in the newest gap, or in a new one if there was none since its last message.
 
+        Args:
+            topic: The key.
+            count: Number of lost messages.
+            gaps_then: Number of gaps when the last message of this key was read.
+            end_ns: Robot time of the next message; None if there is none.
+        """
+        gaps = self.losses.gaps
+        if len(gaps) <= gaps_then < MAX_GAPS:
+            if end_ns is not None:
+                end_ns = max(min(end_ns, LATEST_NS), self._newest_ns)
+            self.losses.open_gap(self._newest_ns, end_ns)
+        gaps[-1].lost[topic] += count
 
-def _check(holds: bool, why: str) -> None:
-    if not holds:
-        raise DamagedError(why)
-
-
-def _next(file: BinaryIO, at: int, size: int) -> int | None:
-    """Where the next record begins that one can go on at; None: nowhere. Raises OSError."""
-    while at < size:
-        file.seek(at)
-        block = file.read(_SCANNED_BYTES + _NEXT_BYTES)
-        begin = 0
-        while (found := _NEXT.search(block, begin)) is not None and found.start() < _SCANNED_BYTES:
-            try:
-                _record_at(file, at + found.start(), size)
-            except DamagedError:
-                begin = found.start() + 1
-            else:
-                return at + found.start()
-        at += _SCANNED_BYTES
-    return None
-
-
-def _summary_of(file: BinaryIO) -> list[McapRecord]:
-    """Raises DamagedError, OSError."""
-    size = file.seek(0, os.SEEK_END)
-    _check(size > _FOOTER, _CUT)
-    file.seek(size - _FOOTER)
-    tail = file.read(_FOOTER)
-    _check(tail.endswith(MCAP0_MAGIC) and tail[: HEAD.size] == HEAD.pack(Opcode.FOOTER, 20), _CUT)
-    begin, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
-    at = max(size - _FOOTER - LARGEST_BYTES, 0)
-    file.seek(at)
-    last = file.read(size - _FOOTER - at)
-    # Where the footer says; or behind the last messages, wherever these are when a part of the file is gone.
-    for start in (begin - at, last.rfind(_DATA_END) + len(_DATA_END) + 4):
-        summary = last[start:] if 0 < start <= len(last) else b""
-        if crc and zlib.crc32(tail[:25], zlib.crc32(summary)) == crc:
-            break
-    else:
-        raise DamagedError("a summary whose checksum does not fit")
-    found, at, view = list[McapRecord](), 0, memoryview(summary)
-    while at + HEAD.size <= len(summary):
-        opcode, length = HEAD.unpack_from(summary, at)
-        at += HEAD.size
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
-            _check(at + length <= len(summary), "a summary whose lengths contradict each other")
-            found.append(parsed(opcode, view[at : at + length]))
-        at += length
-    return found
+    def _count_losses_at_end(self) -> None:
+        """Count what is lost behind the last message of each key, by the statistics of a file that has them."""
+        if not self._is_counted:
+            return
+        for record in self._read_summary():
+            if not isinstance(record, Statistics):
+                continue
+            for number, count in record.channel_message_counts.items():
+                last, gaps_then = self._last.get(number, (0, 0))
+                if last < count < LATEST_NS:
+                    channel = self._channels.get(number) or self._find_in_summary(number)
+                    topic = UNKNOWN_KEYS if channel is None else channel.topic
+                    self._add_loss(topic, count - last, gaps_then, None)

@@ -1,8 +1,9 @@
-"""One MCAP file: the wire bytes of every message with their schema, as they arrive.
+"""Writes one MCAP file: every message as it was on the wire, with its schema, in the order of arrival.
 
-A channel is a key, its messages the payloads verbatim (encoding `msgpack`), its schema the published JSON Schema, its
-metadata the encoding on the wire. `log_time` is robot time, `publish_time` the wall clock at the recorder, `sequence`
-counts the arrivals at a key. A chunk is written at least every FLUSH_S, so that a killed recorder lacks no more.
+A channel is a key. Its messages are the payloads without change (encoding `msgpack`), its schema is the published JSON
+Schema, its metadata has the encoding on the wire. `log_time` is robot time, `publish_time` is the wall clock at the
+recorder, `sequence` counts the arrivals at a key. A chunk is written at least every FLUSH_S, so that a recorder that
+is killed loses no more than that.
 """
 
 import json
@@ -21,128 +22,171 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.foxglove import FoxgloveChannels, FoxgloveMessage, schema_of
+from snakesim_operator.recording.foxglove import FoxgloveChannels
+from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, make_schema
 from snakesim_operator.recording.mcap_file import McapFile
-from snakesim_operator.recording.robot_time import RobotTime
+from snakesim_operator.recording.robot_time import MessageClock
 
 FLUSH_S = 0.5
-MAX_EARLY = 1000  # samples of own sensors before the description; what is more is written without its own schema
+MAX_EARLY_SAMPLES = 1000  # of custom sensors before the description; further ones get no schema of their own
+MAX_ENCODING_NAME = 200  # characters; it comes from the network
 ABOUT = "snakesim"  # the name of the metadata record
-COPIED = "lacked_before_copy"  # in it: what the recording lacked that this one was copied from
+COPIED = "lacked_before_copy"  # entry of that record: what the recording lacked that this one was copied from
 
-Show = Callable[[FoxgloveMessage, int], None]  # and the robot time in ns
+Show = Callable[[FoxgloveMessage, int], None]  # gets a message for viewers, and its robot time in ns
 
 
 class Recording:
-    """A file that is written. A disk that takes no more ends it, and nothing else."""
+    """A file that is being written. A full disk ends it (see `failure`), and raises nothing."""
 
     def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:
-        """Raises OSError, FileExistsError when there is such a file.
+        """Create the file and write its beginning.
 
-        shown_as: the robot's name in topics for viewers; None: only the messages as on the wire, and no such topics.
-        show: gets what is made for viewers, too.
+        Args:
+            path: The new file.
+            shown_as: The robot's name in topics for viewers; None: record the messages as on the wire alone.
+            show: Gets each message that is made for viewers.
+
+        Raises:
+            OSError: The file cannot be created; FileExistsError if it exists.
         """
         self.path = path
         self._show = show
         self.failure = ""  # why nothing is written any more
-        self.counts: Counter[str] = Counter()  # messages written, by key
-        self.time = RobotTime()
-        self._foxglove = None if shown_as is None else FoxgloveChannels(shown_as)
-        self._shown: Counter[str] = Counter()  # messages made for Foxglove, by topic
+        self.time = MessageClock()
+        self._wall_offset_ns = time.time_ns() - time.monotonic_ns()  # wall clock minus monotonic clock
+
+        # The file.
         self._file = GrowingFile(path)
         self._mcap = McapFile(self._file)
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
-        self._own: dict[str, OwnKind] = {}
-        self._early: list[Arrival] | None = []  # of own sensors, until the description says what they are; None: it has
-        self._flush_at = 0.0
-        self._wall_ns = time.time_ns() - time.monotonic_ns()
+        self._channels: dict[str, int] = {}  # channel numbers, by key and by topic
+        self._schemas: dict[str, int] = {}  # schema numbers, by the schema's name or text
+        self._next_flush_s = 0.0
+
+        # The robot's messages.
+        self.counts: Counter[str] = Counter()  # messages written, by key
+        self._custom_types: dict[str, OwnKind] = {}  # messages of custom sensors, by key
+        self._early_samples: list[Arrival] | None = []  # of custom sensors; None once the description is known
+
+        # Messages made for viewers.
+        self._foxglove: FoxgloveChannels | None = None
+        if shown_as is not None:
+            self._foxglove = FoxgloveChannels(shown_as)
+        self._shown_counts: Counter[str] = Counter()  # by topic
+
         self.flush()
 
     def take(self, arrival: Arrival) -> None:
-        """Write one message. Those that are not at a key of the key space are left out."""
+        """Write one message, unless its key is not in the key space.
+
+        A custom sensor's sample waits until the robot's description has said what it means.
+        """
         if self.failure:
             return
-        if self._early is not None and keys.row_key(arrival.key) == keys.OWN_ALL and len(self._early) < MAX_EARLY:
-            self._early.append(arrival)
+        early = self._early_samples
+        if early is not None and keys.row_key(arrival.key) == keys.OWN_ALL and len(early) < MAX_EARLY_SAMPLES:
+            early.append(arrival)
             return
         self._write(arrival)
         if arrival.key == keys.DESCRIPTION:
-            self._write_early()
-
-    def _write_early(self) -> None:
-        early, self._early = self._early or (), None
-        for arrival in early:
-            self._write(arrival)
-
-    def _write(self, arrival: Arrival) -> None:
-        if arrival.key == keys.DESCRIPTION:
-            with suppress(*UNDECODABLE):
-                self._own = own_kinds(msgspec.msgpack.decode(arrival.payload, type=Description))
-        channel = self._channels.get(arrival.key)
-        if channel is None and (channel := self._open(arrival)) is None:
-            return
-        at_ns = self.time.of(arrival.key, arrival.payload)
-        self.counts[arrival.key] += 1
-        wall_ns = arrival.monotonic_ns + self._wall_ns
-        self._mcap.add(channel, at_ns, wall_ns, self.counts[arrival.key], arrival.payload)
-        if self._foxglove is None:
-            return
-        for shown in self._foxglove.take(arrival.key, arrival.payload, at_ns):
-            self._shown[shown.topic] += 1
-            channel = self._channels.get(shown.topic) or self._open_shown(shown)
-            self._mcap.add(channel, at_ns, wall_ns, self._shown[shown.topic], shown.payload)
-            if self._show is not None:
-                self._show(shown, at_ns)
+            self._write_early_samples()
 
     def flush_when_due(self) -> None:
-        """Write what waits, a few times a second."""
-        if not self.failure and time.monotonic() >= self._flush_at:
+        """Give the waiting messages to the disk, if the last time is FLUSH_S ago."""
+        if not self.failure and time.monotonic() >= self._next_flush_s:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits."""
-        self._flush_at = time.monotonic() + FLUSH_S
+        """Give the waiting messages to the disk."""
+        self._next_flush_s = time.monotonic() + FLUSH_S
         try:
             self._mcap.flush()
         except OSError as error:
-            self.failure = f"{self.path}: {error.strerror or error}"
+            self._set_failure(error)
 
     def close(self, about: dict[str, object]) -> None:
-        """Write index and metadata. about: of the recording itself, kept as JSON."""
-        self._write_early()
+        """Write metadata and index, and close the file. about: metadata of the recording itself, kept as JSON."""
+        self._write_early_samples()
         if not self.failure:
             self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
             try:
                 self._mcap.finish()
             except OSError as error:
-                self.failure = f"{self.path}: {error.strerror or error}"
+                self._set_failure(error)
         self._file.close()
 
-    def _open_shown(self, shown: FoxgloveMessage) -> int:
-        name, message_encoding, encoding, data = schema_of(shown.kind)
-        if name not in self._schemas:
-            self._schemas[name] = self._mcap.add_schema(name, encoding, data)
-        channel = self._mcap.add_channel(shown.topic, message_encoding, self._schemas[name])
-        self._channels[shown.topic] = channel
+    def _set_failure(self, error: OSError) -> None:
+        self.failure = f"{self.path}: {error.strerror or error}"
+
+    def _write_early_samples(self) -> None:
+        early = self._early_samples or []
+        self._early_samples = None
+        for arrival in early:
+            self._write(arrival)
+
+    def _write(self, arrival: Arrival) -> None:
+        """Write one message, and what is made of it for viewers."""
+        if arrival.key == keys.DESCRIPTION:
+            with suppress(*UNDECODABLE):
+                self._custom_types = own_kinds(msgspec.msgpack.decode(arrival.payload, type=Description))
+        channel = self._channels.get(arrival.key)
+        if channel is None:
+            channel = self._open_channel(arrival)
+        if channel is None:
+            return
+        robot_ns = self.time.date(arrival.key, arrival.payload)
+        wall_ns = arrival.monotonic_ns + self._wall_offset_ns
+        self.counts[arrival.key] += 1
+        self._mcap.add(channel, robot_ns, wall_ns, self.counts[arrival.key], arrival.payload)
+        if self._foxglove is not None:
+            for message in self._foxglove.convert(arrival.key, arrival.payload, robot_ns):
+                self._write_shown(message, robot_ns, wall_ns)
+
+    def _write_shown(self, message: FoxgloveMessage, robot_ns: int, wall_ns: int) -> None:
+        """Write one message for viewers, and show it."""
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._open_shown_channel(message)
+        self._shown_counts[message.topic] += 1
+        self._mcap.add(channel, robot_ns, wall_ns, self._shown_counts[message.topic], message.payload)
+        if self._show is not None:
+            self._show(message, robot_ns)
+
+    def _open_shown_channel(self, message: FoxgloveMessage) -> int:
+        """Return the number of a new channel for a topic of viewers."""
+        schema = make_schema(message.message_type)
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._mcap.add_schema(schema.name, schema.schema_encoding, schema.data)
+        channel = self._mcap.add_channel(message.topic, schema.message_encoding, self._schemas[schema.name])
+        self._channels[message.topic] = channel
         return channel
 
-    def _open(self, arrival: Arrival) -> int | None:
-        message = keys.message_at(arrival.key)
-        if message is None:
+    def _open_channel(self, arrival: Arrival) -> int | None:
+        """Return the number of a new channel for a key, or None if the key is not in the key space."""
+        message_type = keys.message_at(arrival.key)
+        if message_type is None:
             return None
-        name = message.__name__
-        if (own := self._own.get(arrival.key)) is not None:
-            name, content = f"own.{own.message.__name__}", own.schema.encode()
-        elif name in self._schemas:
-            content = b""
+        custom_type = self._custom_types.get(arrival.key)
+        if custom_type is None:
+            schema = self._add_published_schema(message_type.__name__)
         else:
-            content = (SCHEMAS / "messages" / f"{name}.json").read_bytes()
-        schema = name if own is None else own.schema  # two authors may have one name
-        if schema not in self._schemas:
-            self._schemas[schema] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
-        metadata = {"encoding": arrival.encoding[:200]}
-        channel = self._channels[arrival.key] = self._mcap.add_channel(
-            arrival.key, "msgpack", self._schemas[schema], metadata
-        )
+            schema = self._add_custom_schema(custom_type)
+        metadata = {"encoding": arrival.encoding[:MAX_ENCODING_NAME]}
+        channel = self._mcap.add_channel(arrival.key, "msgpack", schema, metadata)
+        self._channels[arrival.key] = channel
         return channel
+
+    def _add_published_schema(self, name: str) -> int:
+        """Return the number of a message's published schema; it is added when it is first needed."""
+        if name not in self._schemas:
+            content = (SCHEMAS / "messages" / f"{name}.json").read_bytes()
+            self._schemas[name] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
+        return self._schemas[name]
+
+    def _add_custom_schema(self, custom_type: OwnKind) -> int:
+        """Return the number of a custom message's schema. Its text identifies it: two authors may choose one name."""
+        text = custom_type.schema
+        if text not in self._schemas:
+            name = f"snakesim.own.{custom_type.message.__name__}"
+            self._schemas[text] = self._mcap.add_schema(name, "jsonschema", text.encode())
+        return self._schemas[text]

@@ -1,53 +1,66 @@
-"""The robot time of a message, by the tick that it names, if that is plausible."""
+"""Dates a message in robot time: by the tick that it names, if that is plausible, else by the newest clock."""
 
 import msgspec
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 
-MAX_AWAY_NS = 1_000_000_000  # a tick further away from the clock is a lie, or of another host
-LATEST_NS = 2**63 - 1
+MAX_AWAY_NS = 1_000_000_000  # a tick further away from the clock is wrong, or belongs to another host
+LATEST_NS = 2**63 - 1  # the file stores unsigned 64 bits; readers use signed ones
 
 
-class _Stamped(msgspec.Struct):
-    """What the messages have in common; the rest is skipped."""
+class _DatedFields(msgspec.Struct):
+    """The fields that date a message; the rest of it is skipped."""
 
     tick: int | None = None
     timestamp_ns: int | None = None
 
 
-class _Clock(msgspec.Struct):
+class _ClockFields(msgspec.Struct):
+    """The fields of a clock that are needed here."""
+
     tick: int
     period_ns: int
     clock_mode: str
 
 
-class RobotTime:
-    """The time of messages, in the order of their arrival."""
+class MessageClock:
+    """Dates messages in robot time, in the order of their arrival."""
 
     def __init__(self) -> None:
-        self._dated = msgspec.msgpack.Decoder(_Stamped)
-        self._clock = msgspec.msgpack.Decoder(_Clock)
-        self.clock: _Clock | None = None  # the newest one
-        self.went_back = False  # the newest clock is before the one before
+        self._dated_decoder = msgspec.msgpack.Decoder(_DatedFields)
+        self._clock_decoder = msgspec.msgpack.Decoder(_ClockFields)
+        self.clock: _ClockFields | None = None  # the newest one
+        self.went_back = False  # the newest clock is earlier than the previous one
         self._now_ns = 0  # by the newest clock
 
-    def of(self, key: str, payload: bytes) -> int:
-        """Robot time in ns: of the message's own tick, or of the newest clock when it names none or none near it."""
+    def date(self, key: str, payload: bytes) -> int:
+        """Return the robot time of a message in ns.
+
+        It is the time of the tick that the message names. A message that names none, or none near the newest clock,
+        has the time of the newest clock; before the first clock, it has its own timestamp.
+        """
         try:
             if key == keys.CLOCK:
-                clock = self._clock.decode(payload)
-                self.went_back = self.clock is not None and clock.tick < self.clock.tick
-                self.clock = clock
-                self._now_ns = min(max(clock.tick * clock.period_ns, 0), LATEST_NS)
-                return self._now_ns
-            dated = self._dated.decode(payload)
+                return self._set_clock(self._clock_decoder.decode(payload))
+            dated = self._dated_decoder.decode(payload)
         except UNDECODABLE:
             return self._now_ns
         if self.clock is None:
-            return min(max(dated.timestamp_ns or 0, 0), LATEST_NS)
+            return _limit(dated.timestamp_ns or 0)
         if dated.tick is not None:
-            at_ns = dated.tick * self.clock.period_ns
-            if at_ns >= 0 and abs(at_ns - self._now_ns) <= MAX_AWAY_NS:
-                return at_ns
+            tick_ns = dated.tick * self.clock.period_ns
+            if tick_ns >= 0 and abs(tick_ns - self._now_ns) <= MAX_AWAY_NS:
+                return tick_ns
         return self._now_ns
+
+    def _set_clock(self, clock: _ClockFields) -> int:
+        """Take in the newest clock, and return its robot time in ns."""
+        self.went_back = self.clock is not None and clock.tick < self.clock.tick
+        self.clock = clock
+        self._now_ns = _limit(clock.tick * clock.period_ns)
+        return self._now_ns
+
+
+def _limit(time_ns: int) -> int:
+    return min(max(time_ns, 0), LATEST_NS)

@@ -1,7 +1,7 @@
-"""Foxglove's messages, made of ours: transforms, joint states, shapes, arrows, images. Pure.
+"""Makes Foxglove's messages from the robot's: transforms, shapes, arrows, paths and images.
 
-Source: https://docs.foxglove.dev/docs/sdk/schemas. A cylinder's axis is z there, an arrow points along x,
-a camera looks along z with x to the right.
+Source: https://docs.foxglove.dev/docs/sdk/schemas. There, a cylinder's axis is z, an arrow points along x, and a
+camera looks along z with x to the right.
 """
 
 import math
@@ -24,33 +24,42 @@ from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, Obstacle, WorldContact
+from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, LinkDescription, Obstacle, WorldContact
 
 WORLD_FRAME = "world"
-FORCE_M_PER_N = 0.01
-LONGEST_ARROW_M = 0.5
-SNAKE, TRUTH, MAP, FORCE, PATH = (
-    Color(r=0.18, g=0.49, b=0.60, a=1.0),
-    Color(r=0.55, g=0.55, b=0.58, a=1.0),
-    Color(r=0.95, g=0.60, b=0.10, a=0.45),
-    Color(r=0.85, g=0.15, b=0.20, a=1.0),
-    Color(r=0.20, g=0.65, b=0.30, a=1.0),
-)
+
+# How things are drawn.
+BODY_COLOR = Color(r=0.18, g=0.49, b=0.60, a=1.0)
+TRUE_OBSTACLE_COLOR = Color(r=0.55, g=0.55, b=0.58, a=1.0)
+MAP_COLOR = Color(r=0.95, g=0.60, b=0.10, a=0.45)  # transparent: it covers the true obstacles
+FORCE_COLOR = Color(r=0.85, g=0.15, b=0.20, a=1.0)
+PATH_COLOR = Color(r=0.20, g=0.65, b=0.30, a=1.0)
+ARROW_M_PER_N = 0.01
+MAX_ARROW_M = 0.5
+SHAFT_DIAMETER_M = 0.012
+HEAD_DIAMETER_M = 0.03
+PATH_WIDTH_M = 0.01
+PATH_HEIGHT_M = 0.005  # above the ground, else the ground hides parts of it
+
+MAX_DEPTH_MM = 65535  # 16 bits
+
 _UPRIGHT = Quaternion(w=1.0)
-_ALONG_X = Quaternion(w=math.sqrt(0.5), y=math.sqrt(0.5))  # z of a cylinder along the link
-_OPTICAL = (0.5, -0.5, 0.5, -0.5)  # wxyz: Foxglove's camera frame in ours
+_Z_TO_X = Quaternion(w=math.sqrt(0.5), y=math.sqrt(0.5))  # lays a cylinder along the link
+_OPTICAL_IN_CAMERA = (0.5, -0.5, 0.5, -0.5)  # wxyz: Foxglove's camera frame in the robot's
 
 
-def stamp(time_ns: int) -> Timestamp:
-    """Robot time."""
+def make_timestamp(time_ns: int) -> Timestamp:
+    """Return a robot time as a timestamp."""
     return Timestamp(seconds=time_ns // 1_000_000_000, nanos=time_ns % 1_000_000_000)
 
 
-def frame(time_ns: int, parent: str, child: str, position: Sequence[float], wxyz: Sequence[float]) -> FrameTransform:
-    """Where a frame is in another."""
+def make_frame(
+    time_ns: int, parent: str, child: str, position: Sequence[float], wxyz: Sequence[float]
+) -> FrameTransform:
+    """Return the pose of the frame `child` in the frame `parent`."""
     w, x, y, z = wxyz
     return FrameTransform(
-        timestamp=stamp(time_ns),
+        timestamp=make_timestamp(time_ns),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=Vector3(x=position[0], y=position[1], z=position[2]),
@@ -58,105 +67,108 @@ def frame(time_ns: int, parent: str, child: str, position: Sequence[float], wxyz
     )
 
 
-def optical(wxyz: Sequence[float]) -> tuple[float, float, float, float]:
-    """The orientation of Foxglove's camera frame, of ours."""
-    (a, b, c, d), (e, f, g, h) = wxyz, _OPTICAL
+def rotate_to_optical(camera_wxyz: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return the orientation of Foxglove's camera frame for a camera of this orientation.
+
+    It is the quaternion product p q of the camera's orientation p and of the optical frame q in the camera.
+    """
+    pw, px, py, pz = camera_wxyz
+    qw, qx, qy, qz = _OPTICAL_IN_CAMERA
     return (
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
     )
 
 
-def body(robot: Description, time_ns: int) -> list[SceneEntity]:
-    """The links, each in its own frame."""
-    return [
-        SceneEntity(
-            timestamp=stamp(time_ns),
-            frame_id=link.name,
-            id=link.name,
-            frame_locked=True,
-            cylinders=[
-                _cylinder(
-                    Pose(position=Vector3(x=0.5 * link.length_m), orientation=_ALONG_X),
-                    link.radius_m,
-                    link.length_m,
-                    SNAKE,
-                )
-            ],
-            spheres=[
-                _ball(0.0, 0.0, 0.0, 2 * link.radius_m, SNAKE),
-                _ball(link.length_m, 0.0, 0.0, 2 * link.radius_m, SNAKE),
-            ],
-        )
-        for link in robot.links
-    ]
+def draw_body(robot: Description, time_ns: int) -> list[SceneEntity]:
+    """Return the links as capsules, each in its own frame."""
+    return [_draw_link(link, time_ns) for link in robot.links]
 
 
-def obstacles(found: Iterable[Obstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
-    """Obstacles in the world."""
-    entity = SceneEntity(timestamp=stamp(time_ns), frame_id=WORLD_FRAME, id=name)
-    for one in found:
-        x, y, z = one.position_w
-        if one.shape == "sphere":
-            entity.spheres.append(_ball(x, y, z, 2 * one.radius_m, color))
-            continue
-        half_yaw = 0.5 * one.yaw_rad
-        turned = Quaternion(w=math.cos(half_yaw), z=math.sin(half_yaw))
-        pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=turned)
-        if one.shape == "box":
-            size = Vector3(**{axis: 2 * half for axis, half in zip("xyz", one.half_size_m, strict=True)})
-            entity.cubes.append(CubePrimitive(pose=pose, size=size, color=color))
-        else:
-            entity.cylinders.append(_cylinder(pose, one.radius_m, one.height_m, color))
+def _draw_link(link: LinkDescription, time_ns: int) -> SceneEntity:
+    middle = Pose(position=Vector3(x=0.5 * link.length_m), orientation=_Z_TO_X)
+    diameter_m = 2 * link.radius_m
+    return SceneEntity(
+        timestamp=make_timestamp(time_ns),
+        frame_id=link.name,
+        id=link.name,
+        frame_locked=True,
+        cylinders=[_make_cylinder(middle, link.radius_m, link.length_m, BODY_COLOR)],
+        spheres=[
+            _make_ball(0.0, 0.0, 0.0, diameter_m, BODY_COLOR),
+            _make_ball(link.length_m, 0.0, 0.0, diameter_m, BODY_COLOR),
+        ],
+    )
+
+
+def draw_obstacles(obstacles: Iterable[Obstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
+    """Return obstacles in the world as one entity of this name."""
+    entity = SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id=name)
+    for obstacle in obstacles:
+        x, y, z = obstacle.position_w
+        half_yaw_rad = 0.5 * obstacle.yaw_rad
+        orientation = Quaternion(w=math.cos(half_yaw_rad), z=math.sin(half_yaw_rad))
+        pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=orientation)
+        match obstacle.shape:
+            case "sphere":
+                entity.spheres.append(_make_ball(x, y, z, 2 * obstacle.radius_m, color))
+            case "box":
+                half_x_m, half_y_m, half_z_m = obstacle.half_size_m
+                size = Vector3(x=2 * half_x_m, y=2 * half_y_m, z=2 * half_z_m)
+                entity.cubes.append(CubePrimitive(pose=pose, size=size, color=color))
+            case "cylinder":
+                entity.cylinders.append(_make_cylinder(pose, obstacle.radius_m, obstacle.height_m, color))
     return entity
 
 
-def forces(contacts: Iterable[WorldContact], time_ns: int) -> SceneEntity:
-    """An arrow for the force on the body at each contact, one centimetre a newton."""
-    entity = SceneEntity(timestamp=stamp(time_ns), frame_id=WORLD_FRAME, id="forces")
+def draw_forces(contacts: Iterable[WorldContact], time_ns: int) -> SceneEntity:
+    """Return an arrow for the force on the body at each contact, ARROW_M_PER_N long for each newton."""
+    entity = SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id="forces")
     for contact in contacts:
-        size_n = math.hypot(*contact.force_w)
-        if size_n <= 0.0:
+        force_n = math.hypot(*contact.force_w)
+        if force_n <= 0.0:
             continue
-        length_m = min(FORCE_M_PER_N * size_n, LONGEST_ARROW_M)
+        length_m = min(ARROW_M_PER_N * force_n, MAX_ARROW_M)
         x, y, z = contact.position_w
-        entity.arrows.append(
-            ArrowPrimitive(
-                pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_towards(contact.force_w, size_n)),
-                shaft_length=0.8 * length_m,
-                shaft_diameter=0.012,
-                head_length=0.2 * length_m,
-                head_diameter=0.03,
-                color=FORCE,
-            )
+        orientation = _rotate_x_to(contact.force_w, force_n)
+        arrow = ArrowPrimitive(
+            pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=orientation),
+            shaft_length=0.8 * length_m,
+            shaft_diameter=SHAFT_DIAMETER_M,
+            head_length=0.2 * length_m,
+            head_diameter=HEAD_DIAMETER_M,
+            color=FORCE_COLOR,
         )
+        entity.arrows.append(arrow)
     return entity
 
 
-def path(points_w: Iterable[Sequence[float]], time_ns: int) -> SceneEntity:
-    """A planned path on the ground."""
+def draw_path(points_w: Iterable[Sequence[float]], time_ns: int) -> SceneEntity:
+    """Return a planned path as a line on the ground."""
     line = LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=Pose(orientation=_UPRIGHT),
-        thickness=0.01,
-        color=PATH,
-        points=[Point3(x=point[0], y=point[1], z=0.005) for point in points_w],
+        thickness=PATH_WIDTH_M,
+        color=PATH_COLOR,
+        points=[Point3(x=point[0], y=point[1], z=PATH_HEIGHT_M) for point in points_w],
     )
-    return SceneEntity(timestamp=stamp(time_ns), frame_id=WORLD_FRAME, id="path", lines=[line])
+    return SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id="path", lines=[line])
 
 
-def raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> RawImage:
-    """Depth in millimetres (16UC1), or color (rgb8)."""
+def make_raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> RawImage:
+    """Return an image: depth in millimeters as 16UC1, color as rgb8."""
     if isinstance(image, ColorImage):
-        data, encoding, pixel_bytes = image.rgb, "rgb8", 3
+        data = image.rgb
+        encoding = "rgb8"
+        pixel_bytes = 3
     else:
-        counts = np.frombuffer(image.depth, dtype="<u2")
-        in_mm = counts if image.scale_m == 0.001 else np.minimum(counts * (image.scale_m * 1000), 65535)
-        data, encoding, pixel_bytes = in_mm.astype("<u2").tobytes(), "16UC1", 2
+        data = _convert_to_millimeters(image)
+        encoding = "16UC1"
+        pixel_bytes = 2
     return RawImage(
-        timestamp=stamp(time_ns),
+        timestamp=make_timestamp(time_ns),
         frame_id=frame_id,
         width=image.width,
         height=image.height,
@@ -166,11 +178,23 @@ def raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> Ra
     )
 
 
-def calibration(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> CameraCalibration:
-    """The pinhole of an image."""
-    fx, fy, cx, cy = image.fx_px, image.fy_px, image.cx_px, image.cy_px
+def _convert_to_millimeters(image: DepthImage) -> bytes:
+    """Return the pixels of a depth image as unsigned 16 bit numbers in mm, little endian."""
+    counts = np.frombuffer(image.depth, dtype="<u2")
+    if image.scale_m == 0.001:
+        return counts.tobytes()
+    depth_mm = np.minimum(counts * (image.scale_m * 1000), MAX_DEPTH_MM)
+    return depth_mm.astype("<u2").tobytes()
+
+
+def make_calibration(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> CameraCalibration:
+    """Return the pinhole model of an image's camera: intrinsics K, no rectification R, projection P."""
+    fx = image.fx_px
+    fy = image.fy_px
+    cx = image.cx_px
+    cy = image.cy_px
     return CameraCalibration(
-        timestamp=stamp(time_ns),
+        timestamp=make_timestamp(time_ns),
         frame_id=frame_id,
         width=image.width,
         height=image.height,
@@ -180,20 +204,21 @@ def calibration(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> 
     )
 
 
-def _cylinder(pose: Pose, radius_m: float, length_m: float, color: Color) -> CylinderPrimitive:
+def _make_cylinder(pose: Pose, radius_m: float, length_m: float, color: Color) -> CylinderPrimitive:
     size = Vector3(x=2 * radius_m, y=2 * radius_m, z=length_m)
     return CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=color)
 
 
-def _ball(x: float, y: float, z: float, diameter_m: float, color: Color) -> SpherePrimitive:
+def _make_ball(x: float, y: float, z: float, diameter_m: float, color: Color) -> SpherePrimitive:
     size = Vector3(x=diameter_m, y=diameter_m, z=diameter_m)
-    return SpherePrimitive(pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT), size=size, color=color)
+    pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT)
+    return SpherePrimitive(pose=pose, size=size, color=color)
 
 
-def _towards(vector: Sequence[float], length: float) -> Quaternion:
-    """The shortest turn from x to a vector."""
+def _rotate_x_to(vector: Sequence[float], length: float) -> Quaternion:
+    """Return the shortest rotation from the x axis to a vector of this length."""
     x, y, z = (value / length for value in vector)
     if x < -0.999999:
-        return Quaternion(z=1.0)
+        return Quaternion(z=1.0)  # half a turn about z; the formula below would divide by 0
     w = math.sqrt(0.5 * (1.0 + x))
     return Quaternion(w=w, y=-z / (2 * w), z=y / (2 * w))

@@ -1,9 +1,9 @@
-"""What Foxglove has no schema for, as JSON: state of host and controller, a log of its changes, forces of contact."""
+"""Messages for which Foxglove has no schema, as JSON: state of host and controller, and contact forces; and its log."""
 
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Self
+from typing import Annotated, NamedTuple, Self
 
 import msgspec
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -11,13 +11,14 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Contacts
-from snakesim_operator.recording.shapes import stamp
+from snakesim_operator.recording.shapes import make_timestamp
 
-Maybe = float | msgspec.UnsetType
+OptionalNumber = float | msgspec.UnsetType
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """`/ROBOT/state`. What is unknown is empty, or left out."""
+    """`/ROBOT/state`. Unknown texts are empty, unknown numbers are left out."""
 
     lifecycle: str
     why: str
@@ -27,10 +28,10 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     jammed: bool
     saturated: bool
     faults: int
-    path_s_m: Maybe = msgspec.UNSET
-    propulsion_n: Maybe = msgspec.UNSET
-    propulsion_torque_nm: Maybe = msgspec.UNSET
-    torque_headroom_nm: Maybe = msgspec.UNSET
+    path_s_m: OptionalNumber = msgspec.UNSET
+    propulsion_n: OptionalNumber = msgspec.UNSET
+    propulsion_torque_nm: OptionalNumber = msgspec.UNSET
+    torque_headroom_nm: OptionalNumber = msgspec.UNSET
 
 
 class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,11 +42,13 @@ class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
     up_n: list[float]
 
     @classmethod
-    def of(cls, felt: Contacts, links: int) -> Self:
-        """Of a sample, for a robot of so many links."""
-        along_n, left_n, up_n = ([0.0] * links for _ in range(3))
-        for contact in felt.contacts:
-            if contact.link < links:
+    def sum_contacts(cls, contacts: Contacts, link_count: int) -> Self:
+        """Return the forces of a sample, for a robot of so many links; contacts of other links are ignored."""
+        along_n = [0.0] * link_count
+        left_n = [0.0] * link_count
+        up_n = [0.0] * link_count
+        for contact in contacts.contacts:
+            if contact.link < link_count:
                 along_n[contact.link] += contact.force_l[0]
                 left_n[contact.link] += contact.force_l[1]
                 up_n[contact.link] += contact.force_l[2]
@@ -53,7 +56,7 @@ class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _StatusFields(msgspec.Struct, frozen=True):
-    """Of `hal/status`."""
+    """The fields of `hal/status` that are shown."""
 
     lifecycle: q.Name = ""
     why: q.Reason = ""
@@ -61,7 +64,7 @@ class _StatusFields(msgspec.Struct, frozen=True):
 
 
 class _ControlFields(msgspec.Struct, frozen=True):
-    """Of `control/state`."""
+    """The fields of `control/state` that are shown."""
 
     state: q.Name = ""
     reason: q.Reason = ""
@@ -75,51 +78,100 @@ class _ControlFields(msgspec.Struct, frozen=True):
     saturated: bool = False
 
 
-_status, _control = msgspec.msgpack.Decoder(_StatusFields), msgspec.msgpack.Decoder(_ControlFields)
-_NUMBER = re.compile(r"-?\d+(\.\d+)?")
-_NUMBERS = ("path_s_m", "propulsion_n", "propulsion_torque_nm", "torque_headroom_nm")
+_status_decoder = msgspec.msgpack.Decoder(_StatusFields)
+_control_decoder = msgspec.msgpack.Decoder(_ControlFields)
+
+
+class StateUpdate(NamedTuple):
+    """What is shown of the newest state of host and controller."""
+
+    state: State
+    new_logs: list[Log]  # the state in words, as far as it differs from what was logged
+    reference_rad: Sequence[float]  # (n_joints,) angles that the controller wants; empty if unknown
 
 
 class StateMessages:
-    """Remembers what it has logged."""
+    """Makes the state message, and log entries when the state changes."""
 
     def __init__(self) -> None:
-        self._logged: dict[str, tuple[str, str]] = {}
+        self._logged: dict[str, tuple[str, str]] = {}  # by source: state, and its reason without numbers
 
-    def of(self, status: bytes | None, control: bytes | None, time_ns: int) -> tuple[State, list[Log], Sequence[float]]:
-        """State, what of it is new, and the angles that the controller wants, in rad: of the newest payloads."""
-        host, control_state = _StatusFields(), _ControlFields()
-        with suppress(*UNDECODABLE):
-            host = host if status is None else _status.decode(status)
-        with suppress(*UNDECODABLE):
-            control_state = control_state if control is None else _control.decode(control)
-        numbers: dict[str, Any] = {
-            name: value for name in _NUMBERS if (value := getattr(control_state, name)) is not None
-        }
+    def update(self, status: bytes | None, control: bytes | None, time_ns: int) -> StateUpdate:
+        """Return what is to be shown.
+
+        Args:
+            status: Newest payload of `hal/status`; None if the host is silent.
+            control: Newest payload of `control/state`; None if the controller is silent.
+            time_ns: Robot time.
+        """
+        host_state = _decode_status(status)
+        control_state = _decode_control(control)
         state = State(
-            lifecycle=host.lifecycle,
-            why=host.why,
+            lifecycle=host_state.lifecycle,
+            why=host_state.why,
             locomotion=control_state.state,
             reason=control_state.reason,
             propulsion_joint=control_state.propulsion_joint or "",
             jammed=control_state.jammed,
             saturated=control_state.saturated,
-            faults=len(host.faults),
-            **numbers,
+            faults=len(host_state.faults),
+            path_s_m=_unset_if_none(control_state.path_s_m),
+            propulsion_n=_unset_if_none(control_state.propulsion_n),
+            propulsion_torque_nm=_unset_if_none(control_state.propulsion_torque_nm),
+            torque_headroom_nm=_unset_if_none(control_state.torque_headroom_nm),
         )
-        return state, self._new(state, time_ns), control_state.reference_rad
+        return StateUpdate(state, self._make_logs(state, time_ns), control_state.reference_rad)
 
-    def _new(self, state: State, time_ns: int) -> list[Log]:
-        stopped, stuck = state.lifecycle in ("fault", "estop"), state.jammed or state.saturated
-        found: list[Log] = []
-        for name, what, why, level in (
-            ("hal", state.lifecycle, state.why.partition("; ")[0], Log.ERROR if stopped else Log.INFO),
-            ("control", state.locomotion, state.reason, Log.WARNING if stuck else Log.INFO),
+    def _make_logs(self, state: State, time_ns: int) -> list[Log]:
+        """Return a log entry for the host and for the controller, if its state or reason has changed."""
+        host_level = Log.INFO
+        if state.lifecycle in ("fault", "estop"):
+            host_level = Log.ERROR
+        host_reason, _, _ = state.why.partition("; ")
+        control_level = Log.INFO
+        if state.jammed or state.saturated:
+            control_level = Log.WARNING
+        logs: list[Log] = []
+        for source, name, reason, level in (
+            ("hal", state.lifecycle, host_reason, host_level),
+            ("control", state.locomotion, state.reason, control_level),
         ):
-            if not what and name in self._logged:
-                what, why, level = "silent", f"the state of {name} is no longer published", Log.ERROR
-            said = (what, _NUMBER.sub("#", why))  # a force or an age that changes is no news
-            if what and self._logged.get(name) != said:
-                self._logged[name] = said
-                found.append(Log(timestamp=stamp(time_ns), level=level, name=name, message=f"{what}: {why}"))
-        return found
+            entry = self._make_log(source, name, reason, level, time_ns)
+            if entry is not None:
+                logs.append(entry)
+        return logs
+
+    def _make_log(self, source: str, name: str, reason: str, level: "Log.Level.ValueType", time_ns: int) -> Log | None:
+        """Return a log entry for the state of a source, or None if it is logged or was never known."""
+        if not name:
+            if source not in self._logged:
+                return None
+            name = "silent"
+            reason = f"the state of {source} is no longer published"
+            level = Log.ERROR
+        reason_without_numbers = _NUMBER.sub("#", reason)  # a force or an age that changes is no new state
+        content = (name, reason_without_numbers)
+        if self._logged.get(source) == content:
+            return None
+        self._logged[source] = content
+        return Log(timestamp=make_timestamp(time_ns), level=level, name=source, message=f"{name}: {reason}")
+
+
+def _decode_status(payload: bytes | None) -> _StatusFields:
+    if payload is not None:
+        with suppress(*UNDECODABLE):
+            return _status_decoder.decode(payload)
+    return _StatusFields()
+
+
+def _decode_control(payload: bytes | None) -> _ControlFields:
+    if payload is not None:
+        with suppress(*UNDECODABLE):
+            return _control_decoder.decode(payload)
+    return _ControlFields()
+
+
+def _unset_if_none(value: float | None) -> OptionalNumber:
+    if value is None:
+        return msgspec.UNSET
+    return value

@@ -1,10 +1,11 @@
-"""Takes everything that a robot publishes, for a writer that may be slower; never more than MAX_BYTES wait.
+"""Collects everything that a robot publishes, for a writer that may be slower; at most MAX_BYTES wait.
 
-In real time what finds no room is dropped, and counted. In lockstep nothing may be lost: there the network waits for
-room, and the robot with it, but at most once for LIMIT_S. After that the disk hangs, and the robot goes on without.
+In real time, a message that finds no room is dropped and counted. In lockstep no message may be lost: there the
+network waits for room, and the robot with it, but once for at most LIMIT_S. After that the disk is taken to hang, and
+the robot continues without the recording.
 
-In lockstep messages come as fast as the computer is, and those who make them want the processors: so the thread that
-receives takes what the kernel holds, rests, and is not woken meanwhile.
+In lockstep messages come as fast as the computer is, and the processes that make them need the processors. So the
+receiving thread reads what the kernel holds, rests, and is not woken meanwhile.
 """
 
 import threading
@@ -15,53 +16,57 @@ from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 
 MAX_BYTES = 64 * 1024 * 1024
-LIMIT_S = 2.0
-TAKES_NS, RESTS_S = 1_000_000, 0.005  # in turn; less than the kernel holds on a connection
+LIMIT_S = 2.0  # for a disk to take messages, in lockstep
+RECEIVE_NS = 1_000_000  # between two rests, in lockstep
+REST_S = 0.005  # less than the kernel can hold on a connection
+ROOM_POLL_S = 0.001
 
 
 class Tap:
-    """Everything published within one robot's namespace, as it arrives."""
+    """Receives every message below one robot's namespace, in Zenoh's threads, until the recorder takes them."""
 
     def __init__(self, session: Session) -> None:
-        self.lossless = False
+        self.lossless = False  # whether the network waits for room; set in lockstep
         self.dropped: Counter[str] = Counter()  # by key
         self._waiting: deque[Arrival] = deque()
-        self._bytes = 0
-        self._rest_at_ns = 0
+        self._waiting_bytes = 0
+        self._next_rest_ns = 0
         self._lock = threading.Lock()
         for row in keys.SPACE:
             if row.kind == "latched":
-                session.on_latched_arrival(row.key, self._put)
+                session.on_latched_arrival(row.key, self._receive)
             elif row.kind == "stream":
-                session.on_urgent_arrival(row.key, self._put)  # a thread for each key would wake with every message
+                # Urgent: otherwise each key had a thread, which would wake with every message.
+                session.on_urgent_arrival(row.key, self._receive)
 
-    def take(self) -> list[Arrival]:
-        """What has arrived since the last call, in order."""
+    def drain(self) -> list[Arrival]:
+        """Return what has arrived since the last call, in order."""
         with self._lock:
-            taken = list(self._waiting)
+            arrivals = list(self._waiting)
             self._waiting.clear()
-            self._bytes = 0
-        return taken
+            self._waiting_bytes = 0
+        return arrivals
 
-    def _put(self, arrival: Arrival) -> None:
-        """In Zenoh's threads."""
-        if self.lossless and arrival.monotonic_ns > self._rest_at_ns:
-            time.sleep(RESTS_S)
-            self._rest_at_ns = time.monotonic_ns() + TAKES_NS
+    def _receive(self, arrival: Arrival) -> None:
+        """Keep a message, or drop it if there is no room. This runs in Zenoh's threads."""
+        if self.lossless and arrival.monotonic_ns > self._next_rest_ns:
+            time.sleep(REST_S)
+            self._next_rest_ns = time.monotonic_ns() + RECEIVE_NS
         size = len(arrival.payload)
-        if self.lossless and self._bytes + size > MAX_BYTES:
+        if self.lossless and self._waiting_bytes + size > MAX_BYTES:
             self._wait_for_room(size)
         with self._lock:
-            if self._bytes + size > MAX_BYTES:
+            if self._waiting_bytes + size > MAX_BYTES:
                 self.dropped[arrival.key] += 1
                 return
-            self._bytes += size
+            self._waiting_bytes += size
             self._waiting.append(arrival)
 
     def _wait_for_room(self, size: int) -> None:
-        give_up = time.monotonic() + LIMIT_S
-        while self._bytes + size > MAX_BYTES:
-            if time.monotonic() > give_up:
+        """Wait until a message of this size finds room; after LIMIT_S, never wait again."""
+        give_up_s = time.monotonic() + LIMIT_S
+        while self._waiting_bytes + size > MAX_BYTES:
+            if time.monotonic() > give_up_s:
                 self.lossless = False
                 return
-            time.sleep(0.001)
+            time.sleep(ROOM_POLL_S)

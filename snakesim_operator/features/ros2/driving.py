@@ -1,7 +1,7 @@
-"""Joint commands from ROS, as the robot's control service: a client with a lease, like any other, in a thread.
+"""Sends joint commands from ROS to the robot, as the robot's control service.
 
-Without the lease nothing is sent. Whatever ends the bridge ends the lease within 50 to 100 ms, and an armed robot goes
-into its stop mode.
+It is a client with a lease, like any other controller, and runs in a thread. Without the lease it sends nothing.
+However the bridge ends, the lease expires within 50 to 100 ms, and an armed robot enters its stop mode.
 """
 
 import contextlib
@@ -16,72 +16,95 @@ from snakesim_hal.network.commanding import Commanding
 from snakesim_hal.network.foreign_network import RawReader
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, JointState, Status
-from snakesim_operator.features.ros2.joint_commands import JointTargets
+from snakesim_hal.wire.messages import Clock, Description, JointState, Status
+from snakesim_operator.features.ros2.joint_commands import RosJointTargets
 from snakesim_operator.features.ros2.message_age import SenderClocks
 
-RETRY_S, PRESENT_S, END_S = 2.0, 5.0, 5.0
+RETRY_S = 2.0  # after a lost connection
+PRESENT_S = 5.0  # within which a robot that is running describes itself
+END_TIMEOUT_S = 5.0  # for the thread
 
 
-class Driving:
-    """Commands every joint in every tick, from the messages of one topic; again after each loss of the robot."""
+class JointCommander:
+    """Commands every joint in every tick from the messages of one topic; reconnects after a loss of the robot."""
 
     def __init__(self, session: Session, messages: RawReader, say: Say, *, wall_time: bool) -> None:
-        """Take the lease. Raises RefusedError for a robot that has a controller.
+        """Start the thread that commands the robot.
 
-        wall_time: whether stamps in ROS are wall-clock time, else robot time.
+        Args:
+            session: Session on the robot's network.
+            messages: Messages of the ROS topic.
+            say: Reports changes to the user.
+            wall_time: Whether timestamps in ROS are wall-clock time; else they are robot time.
+
+        Raises:
+            RefusedError: The robot has a controller.
         """
         if session.present(keys.alive(CONTROL)):
             raise RefusedError(
                 "--joint-commands: the robot has a controller already, which holds the lease; run it without one: "
                 "--set services.control.external=true"
             )
-        self._session, self._messages, self._say = session, messages, say
+        self._session = session
+        self._messages = messages
+        self._say = say
         self._wall_time = wall_time
         self._senders = SenderClocks()
+        self._last_report = ""
         self._ended = threading.Event()
-        self._said = ""
         self._thread = start_worker("driving", self._run, is_over=self._ended.is_set)
 
     def close(self) -> None:
-        """End it, and with it the lease."""
+        """End the thread, and with it the lease."""
         self._ended.set()
-        self._thread.join(END_S)
+        self._thread.join(END_TIMEOUT_S)
 
     def _run(self) -> None:
+        """Command the robot until `close`; after an error, wait and connect again."""
         while not self._ended.is_set():
             try:
                 with contextlib.closing(self._session.part()) as part:
-                    self._drive(part)
+                    self._command_robot(part)
             except SnakesimError as error:
-                self._tell(f"nothing is commanded from ROS: {error}")
+                self._report(f"nothing is commanded from ROS: {error}")
                 self._ended.wait(RETRY_S)
 
-    def _drive(self, session: Session) -> None:
+    def _command_robot(self, session: Session) -> None:
+        """Send setpoints in every tick. Raises NotConnectedError if the robot is lost or restarted."""
         robot = session.latest(keys.DESCRIPTION, Description, PRESENT_S)
         status = session.latest(keys.STATUS, Status, PRESENT_S)
         if robot is None or status is None:
             raise NotConnectedError("the robot does not describe itself; is its HAL host running?")
-        commanding, targets = Commanding(session, robot, status.clock_mode), JointTargets(robot)
-        self._tell(f"joint commands from ROS move {robot.robot} once it is armed")
+        commanding = Commanding(session, robot, status.clock_mode)
+        targets = RosJointTargets(robot)
+        self._report(f"joint commands from ROS move {robot.robot} once it is armed")
         while not self._ended.is_set():
             clock = commanding.wait()
             if commanding.host_changed():
                 raise NotConnectedError("the robot's host has restarted")
-            for message in self._messages.drain():
-                wall_ns = time.time_ns()
-                age_ns = self._senders.age_ns(message, wall_ns, time.monotonic_ns())
-                ros_now_ns = wall_ns if self._wall_time else clock.timestamp_ns
-                if not targets.take(message.payload, clock.timestamp_ns, ros_now_ns, age_ns):
-                    self._tell(f"a message on joint_commands {targets.why}; it is dropped, with all that are alike")
+            self._read_messages(targets, clock)
             joints = commanding.read(keys.JOINTS)
-            if isinstance(joints, JointState) and (commanding.mine or clock.lifecycle != "armed"):
-                points = targets.setpoints(clock, joints)
+            if not isinstance(joints, JointState):
+                continue
+            if commanding.mine or clock.lifecycle != "armed":
+                # Without the lease too: a robot that is not armed makes the targets forget the last arm session.
+                setpoints = targets.make_setpoints(clock, joints)
                 if commanding.mine:
-                    commanding.send(points)
+                    commanding.send(setpoints)
 
-    def _tell(self, text: str) -> None:
-        """Once, until there is something else to tell."""
-        if text != self._said:
-            self._said = text
+    def _read_messages(self, targets: RosJointTargets, clock: Clock) -> None:
+        """Take over the targets of all messages that have arrived since the last tick."""
+        for message in self._messages.drain():
+            wall_ns = time.time_ns()
+            age_ns = self._senders.measure_age(message, wall_ns, time.monotonic_ns())
+            ros_now_ns = clock.timestamp_ns
+            if self._wall_time:
+                ros_now_ns = wall_ns
+            if not targets.accept(message.payload, clock.timestamp_ns, ros_now_ns, age_ns):
+                self._report(f"a message on joint_commands {targets.reason}; it is dropped, with all that are alike")
+
+    def _report(self, text: str) -> None:
+        """Show a text to the user, unless it is the same as the last one."""
+        if text != self._last_report:
+            self._last_report = text
             self._say(text)

@@ -1,10 +1,10 @@
-"""Frames of the robot by their ROS names (REP 105), and their poses.
+"""Names the robot's frames as ROS expects them (REP 105), and computes their poses.
 
     map -> odom -> base_link -> the tail link -> ... -> the head link -> sensors
 
-`map` and `odom` are the world of guidance; they coincide, because there is one estimate of the pose, without a
-separate drift. `base_link` is the base: tail end of the tail link, x along it, y to the left, z upwards (REP 103).
-Links are named as in the robot's description. An optical frame has z forward, x to the right and y downwards.
+`map` and `odom` are the world frame of the navigation; they coincide, because there is a single pose estimate without
+a separate drift. `base_link` is the base: the tail end of the tail link, x along it, y to the left, z upwards
+(REP 103). Links are named as in the robot's description. An optical frame has z forward, x to the right, y downwards.
 """
 
 import math
@@ -14,76 +14,93 @@ from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, Join
 from snakesim_operator.features.ros2.messages import Transform, Triple, Wxyz
 
 MAP = "map"
-NOWHERE: Triple = (0.0, 0.0, 0.0)
-UNTURNED: Wxyz = (1.0, 0.0, 0.0, 0.0)
+ORIGIN: Triple = (0.0, 0.0, 0.0)
+NO_ROTATION: Wxyz = (1.0, 0.0, 0.0, 0.0)
 OPTICAL_IN_CAMERA: Wxyz = (0.5, -0.5, 0.5, -0.5)
 
 
-def ros_name(text: str) -> str:
-    """A name as ROS allows it in a topic: letters, digits and _, not a digit first."""
-    word = re.sub(r"\W", "_", text, flags=re.ASCII)
-    return word if not word[:1].isdigit() else f"_{word}"
+def make_ros_name(text: str) -> str:
+    """Return a text as a valid ROS name: letters, digits and _, without a leading digit."""
+    name = re.sub(r"\W", "_", text, flags=re.ASCII)
+    if name[:1].isdigit():
+        return f"_{name}"
+    return name
 
 
 class Frames:
-    """The frames of one robot. prefix: before every name but `map`, such as `planar13/`; empty for a single robot."""
+    """The frames of one robot: their names, and the transforms between them."""
 
     def __init__(self, robot: Description, prefix: str = "") -> None:
-        self._robot, self._prefix = robot, prefix
-        self.odom, self.base = f"{prefix}odom", f"{prefix}base_link"
-        at_base = Transform(self.base, self.link(0), NOWHERE, UNTURNED)
-        self.fixed = [Transform(MAP, self.odom, NOWHERE, UNTURNED), at_base]
+        """Name the frames of the robot.
 
-    def link(self, index: int) -> str:
-        """Frame of a link."""
-        return self._prefix + self._robot.links[index].name
+        Args:
+            robot: Description of the robot.
+            prefix: Text before every frame name but `map`, such as `planar13/`; empty for a single robot.
+        """
+        self._robot = robot
+        self._prefix = prefix
+        self.odom = f"{prefix}odom"
+        self.base = f"{prefix}base_link"
+        self.fixed = [
+            Transform(MAP, self.odom, ORIGIN, NO_ROTATION),
+            Transform(self.base, self.get_link_frame(0), ORIGIN, NO_ROTATION),
+        ]
 
-    def optical(self, kind: str, camera: str) -> str:
-        """Frame of a camera's images. kind: depth or color."""
-        return f"{self._prefix}{ros_name(camera)}_{kind}_optical_frame"
+    def get_link_frame(self, link: int) -> str:
+        """Return the frame name of a link."""
+        return self._prefix + self._robot.links[link].name
 
-    def mount(self, sensor: str) -> str:
-        """Frame of a lidar, a range finder, or a sensor with a message of its own."""
-        return f"{self._prefix}{ros_name(sensor)}_frame"
+    def get_optical_frame(self, kind: str, camera: str) -> str:
+        """Return the frame name of a camera's images. kind: depth or color."""
+        return f"{self._prefix}{make_ros_name(camera)}_{kind}_optical_frame"
 
-    def imu(self, index: int) -> str:
-        """Frame of the IMU of a link."""
-        return f"{self.link(index)}_imu_frame"
+    def get_mount_frame(self, sensor: str) -> str:
+        """Return the frame name of a lidar, a range finder or a custom sensor."""
+        return f"{self._prefix}{make_ros_name(sensor)}_frame"
 
-    def of_imu(self, index: int) -> Transform:
-        """An IMU in the middle of its link."""
-        middle = (self._robot.links[index].length_m / 2, 0.0, 0.0)
-        return Transform(self.link(index), self.imu(index), middle, UNTURNED)
+    def get_imu_frame(self, link: int) -> str:
+        """Return the frame name of the IMU on a link."""
+        return f"{self.get_link_frame(link)}_imu_frame"
 
-    def of_base(self, pose: World | Pose) -> Transform:
-        """The base in odom."""
+    def make_imu_transform(self, link: int) -> Transform:
+        """Return the pose of an IMU, which sits in the middle of its link."""
+        middle = (self._robot.links[link].length_m / 2, 0.0, 0.0)
+        return Transform(self.get_link_frame(link), self.get_imu_frame(link), middle, NO_ROTATION)
+
+    def make_base_transform(self, pose: World | Pose) -> Transform:
+        """Return the pose of the base in `odom`."""
         if isinstance(pose, Pose):
             return Transform(self.odom, self.base, pose.position_w, pose.orientation_wxyz)
         return Transform(self.odom, self.base, pose.base_position_w, pose.base_orientation_wxyz)
 
-    def of_joints(self, joints: JointState) -> list[Transform]:
-        """Every link in the one behind it; those whose joint is not valid are left out."""
-        found: list[Transform] = []
+    def make_joint_transforms(self, joints: JointState) -> list[Transform]:
+        """Return the pose of each link in the link behind it, without the links whose joint state is not valid."""
+        transforms: list[Transform] = []
         for i, joint in enumerate(self._robot.joints):
-            if joints.valid[i]:
-                position = (self._robot.links[i].length_m, 0.0, 0.0)
-                turn = _turned(joint.axis, joints.angle_rad[i])
-                found.append(Transform(self.link(i), self.link(i + 1), position, turn))
-        return found
+            if not joints.valid[i]:
+                continue
+            position = (self._robot.links[i].length_m, 0.0, 0.0)
+            orientation = _rotate_about(joint.axis, joints.angle_rad[i])
+            transforms.append(Transform(self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation))
+        return transforms
 
-    def of_camera(self, kind: str, camera: str, seen: DepthImage | ColorImage) -> list[Transform]:
-        """A camera on its link, and its optical frame in it."""
-        optical = self.optical(kind, camera)
-        body = optical.replace("_optical_frame", "_frame")
-        mount = Transform(self.link(seen.link), body, seen.position_l, seen.orientation_l_wxyz)
-        return [mount, Transform(body, optical, NOWHERE, OPTICAL_IN_CAMERA)]
+    def make_camera_transforms(self, kind: str, camera: str, image: DepthImage | ColorImage) -> list[Transform]:
+        """Return the pose of a camera on its link, and of its optical frame in the camera frame."""
+        optical_frame = self.get_optical_frame(kind, camera)
+        camera_frame = optical_frame.replace("_optical_frame", "_frame")
+        mount = Transform(self.get_link_frame(image.link), camera_frame, image.position_l, image.orientation_l_wxyz)
+        return [mount, Transform(camera_frame, optical_frame, ORIGIN, OPTICAL_IN_CAMERA)]
 
-    def of_mount(self, sensor: str, seen: MountedSample) -> list[Transform]:
-        """That sensor on its link."""
-        return [Transform(self.link(seen.link), self.mount(sensor), seen.position_l, seen.orientation_l_wxyz)]
+    def make_mount_transforms(self, sensor: str, sample: MountedSample) -> list[Transform]:
+        """Return the pose of a sensor on its link, as its sample states it."""
+        link_frame = self.get_link_frame(sample.link)
+        return [Transform(link_frame, self.get_mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
 
 
-def _turned(axis: str, angle_rad: float) -> Wxyz:
-    """A joint's turn: yaw about z, pitch about y."""
-    c, s = math.cos(angle_rad / 2), math.sin(angle_rad / 2)
-    return (c, 0.0, 0.0, s) if axis == "yaw" else (c, 0.0, s, 0.0)
+def _rotate_about(axis: str, angle_rad: float) -> Wxyz:
+    """Return the rotation of a joint as a quaternion: yaw turns about z, pitch about y."""
+    cos_half = math.cos(angle_rad / 2)
+    sin_half = math.sin(angle_rad / 2)
+    if axis == "yaw":
+        return (cos_half, 0.0, 0.0, sin_half)
+    return (cos_half, 0.0, sin_half, 0.0)

@@ -1,7 +1,7 @@
 """rmw_zenoh's graph: keys of topics, liveliness tokens of nodes and endpoints, and the attachment of each sample.
 
-Source: docs/design.md, liveliness_utils.cpp and attachment_helpers.cpp of ros2/rmw_zenoh. As in Kilted and Rolling, and
-in Jazzy from rmw_zenoh_cpp 0.2.4 on; earlier ones had another attachment.
+Source: docs/design.md, liveliness_utils.cpp and attachment_helpers.cpp of ros2/rmw_zenoh. The formats are those of
+Kilted and Rolling, and of Jazzy from rmw_zenoh_cpp 0.2.4 on; earlier versions used another attachment.
 """
 
 import struct
@@ -12,11 +12,19 @@ from itertools import count
 
 from snakesim_hal.network.foreign_network import ForeignNetwork, RawPublisher, RawQueryable, RawReader
 
-NODE, PUBLISHER, SUBSCRIPTION, SERVER = "NN", "MP", "MS", "SS"
-NODE_ID = 0
-BEST_EFFORT, TRANSIENT_LOCAL = 2, 1  # as rmw_qos_profile_t numbers them; the defaults are left out
+# Kinds of entities in liveliness tokens.
+NODE = "NN"
+PUBLISHER = "MP"
+SUBSCRIPTION = "MS"
+SERVER = "SS"
+
+# Quality of service as rmw_qos_profile_t numbers it; defaults are left out of a token.
+BEST_EFFORT = 2
+TRANSIENT_LOCAL = 1
+
+NODE_ID = 0  # a process of this bridge has a single node
 GID_BYTES = 16
-ATTACHED = struct.Struct("<qqB16s")  # sequence, wall clock of the sender, length of what follows, the sender
+ATTACHMENT = struct.Struct("<qqB16s")  # sequence, sender's wall clock in ns, length of the GID, sender's GID
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,7 @@ class RosType:
 
     @property
     def dds_name(self) -> str:
-        """As rmw_zenoh writes it, such as `std_msgs::msg::dds_::String_`."""
+        """Return the name as rmw_zenoh writes it, such as `std_msgs::msg::dds_::String_`."""
         package, kind, name = self.name.split("/")
         return f"{package}::{kind}::dds_::{name}_"
 
@@ -46,26 +54,14 @@ class Topic:
 
     @property
     def qos(self) -> str:
-        """Reliability, durability, history and depth; the rest is the default."""
-        reliability = str(BEST_EFFORT) if self.best_effort else ""
-        durability = str(TRANSIENT_LOCAL) if self.latched else ""
+        """Return reliability, durability, history and depth as a token has them; the rest is the default."""
+        reliability = ""
+        if self.best_effort:
+            reliability = str(BEST_EFFORT)
+        durability = ""
+        if self.latched:
+            durability = str(TRANSIENT_LOCAL)
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
-
-
-def topic_key(domain: int, topic: Topic) -> str:
-    """Zenoh key of a topic's samples."""
-    return f"{domain}/{topic.name.strip('/')}/{topic.type.dds_name}/{topic.type.type_hash}"
-
-
-def token_key(domain: int, zenoh_id: str, entity: int, kind: str, node: "NodeName", topic: Topic | None = None) -> str:
-    """Liveliness token of a node (topic is None) or of one of its endpoints."""
-    names = f"{_flat('/')}/{_flat(node.namespace)}/{node.name}"  # the first is the security enclave
-    ends = "" if topic is None else f"/{_flat(topic.name)}/{topic.type.dds_name}/{topic.type.type_hash}/{topic.qos}"
-    return f"@ros2_lv/{domain}/{zenoh_id}/{NODE_ID}/{entity}/{kind}/{names}{ends}"
-
-
-def _flat(name: str) -> str:
-    return name.replace("/", "%")
 
 
 @dataclass(frozen=True)
@@ -76,67 +72,109 @@ class NodeName:
     namespace: str = "/"
 
 
-def attachment(sequence: int, timestamp_ns: int, gid: bytes) -> bytes:
-    """Of one sample. timestamp_ns: wall clock of the sender; gid: of the publisher, GID_BYTES long."""
-    return ATTACHED.pack(sequence, timestamp_ns, GID_BYTES, gid)
+def make_topic_key(domain: int, topic: Topic) -> str:
+    """Return the Zenoh key of a topic's samples."""
+    return f"{domain}/{topic.name.strip('/')}/{topic.type.dds_name}/{topic.type.type_hash}"
 
 
-def answering(request: bytes) -> bytes | None:
-    """Attachment of the reply to a request with this one: the same sequence and sender; None: it has none to read."""
-    if len(request) != ATTACHED.size:
+def make_token(domain: int, zenoh_id: str, entity: int, kind: str, node: NodeName, topic: Topic | None = None) -> str:
+    """Return the liveliness token of a node (without a topic) or of one of its endpoints."""
+    security_enclave = _escape_slashes("/")
+    node_names = f"{security_enclave}/{_escape_slashes(node.namespace)}/{node.name}"
+    token = f"@ros2_lv/{domain}/{zenoh_id}/{NODE_ID}/{entity}/{kind}/{node_names}"
+    if topic is None:
+        return token
+    return f"{token}/{_escape_slashes(topic.name)}/{topic.type.dds_name}/{topic.type.type_hash}/{topic.qos}"
+
+
+def _escape_slashes(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def make_attachment(sequence: int, timestamp_ns: int, gid: bytes) -> bytes:
+    """Return the attachment of one sample.
+
+    Args:
+        sequence: Number of the sample at its publisher.
+        timestamp_ns: Wall clock of the sender.
+        gid: Identity of the publisher, GID_BYTES long.
+    """
+    return ATTACHMENT.pack(sequence, timestamp_ns, GID_BYTES, gid)
+
+
+def make_reply_attachment(request: bytes) -> bytes | None:
+    """Return the attachment of the reply to a request: same sequence and sender, and the present time.
+
+    Args:
+        request: The attachment of the request.
+
+    Returns:
+        The attachment of the reply, or None if that of the request is malformed.
+    """
+    if len(request) != ATTACHMENT.size:
         return None
-    sequence, _, length, gid = ATTACHED.unpack(request)
-    return None if length != GID_BYTES or sequence < 0 else attachment(sequence, time.time_ns(), gid)
+    sequence, _, gid_bytes, gid = ATTACHMENT.unpack(request)
+    if gid_bytes != GID_BYTES or sequence < 0:
+        return None
+    return make_attachment(sequence, time.time_ns(), gid)
 
 
-def gid_of(token: str) -> bytes:
-    """Identity of an endpoint: the 128 bits of XXH3 over its liveliness token, low half first."""
+def compute_gid(token: str) -> bytes:
+    """Return the identity of an endpoint: the 128 bits of XXH3 over its liveliness token, low half first."""
     import xxhash  # here, because it comes with the extra `ros2`
 
     return xxhash.xxh3_128(token).intdigest().to_bytes(GID_BYTES, "little")
 
 
 class RosPublisher:
-    """Publishes on one topic."""
+    """Publishes messages on one topic, each with the attachment that ROS subscribers expect."""
 
     def __init__(self, publisher: RawPublisher, token: str) -> None:
         self._publisher = publisher
-        self._gid = gid_of(token)
+        self._gid = compute_gid(token)
         self._sequence = count(1)
-        self.heard = publisher.heard
+        self.has_subscribers = publisher.heard
 
-    def put(self, message: bytes) -> None:
-        """Send a message, in CDR."""
-        self._publisher.put(message, attachment(next(self._sequence), time.time_ns(), self._gid))
+    def publish(self, message: bytes) -> None:
+        """Send a message in CDR."""
+        attachment = make_attachment(next(self._sequence), time.time_ns(), self._gid)
+        self._publisher.put(message, attachment)
 
 
 class Node:
-    """A node in the ROS graph, present as long as the session."""
+    """A node in the ROS graph, present for as long as its session is open."""
 
     def __init__(self, foreign_network: ForeignNetwork, domain: int, name: NodeName) -> None:
-        self._network, self._domain, self._name = foreign_network, domain, name
-        self._entities: Iterator[int] = count(NODE_ID)
-        foreign_network.declare_token(self._token(NODE))
+        self._network = foreign_network
+        self._domain = domain
+        self._name = name
+        self._entities: Iterator[int] = count(NODE_ID)  # numbers of the node and its endpoints
+        foreign_network.declare_token(self._make_next_token(NODE))
 
-    def publisher(self, topic: Topic) -> RosPublisher:
-        """A publisher that `ros2 topic info` shows."""
-        key = topic_key(self._domain, topic)
+    def declare_publisher(self, topic: Topic) -> RosPublisher:
+        """Declare a publisher, which `ros2 topic info` then shows."""
+        key = make_topic_key(self._domain, topic)
         publisher = self._network.publisher(key, latched=topic.latched, background=topic.images)
-        token = self._token(PUBLISHER, topic)
+        token = self._make_next_token(PUBLISHER, topic)
         self._network.declare_token(token)
         return RosPublisher(publisher, token)
 
-    def subscription(self, topic: Topic) -> RawReader:
-        """The newest messages of a topic, in CDR and with what is attached, as many as its depth."""
-        reader = self._network.reader(topic_key(self._domain, topic), topic.depth)
-        self._network.declare_token(self._token(SUBSCRIPTION, topic))
+    def declare_subscription(self, topic: Topic) -> RawReader:
+        """Subscribe to a topic.
+
+        Returns:
+            A reader that keeps the newest messages in CDR with their attachments, as many as the topic's depth.
+        """
+        reader = self._network.reader(make_topic_key(self._domain, topic), topic.depth)
+        self._network.declare_token(self._make_next_token(SUBSCRIPTION, topic))
         return reader
 
-    def server(self, service: Topic) -> RawQueryable:
-        """A service that `ros2 service list` shows: its requests, in CDR."""
-        queryable = self._network.queryable(topic_key(self._domain, service))
-        self._network.declare_token(self._token(SERVER, service))
+    def declare_service(self, service: Topic) -> RawQueryable:
+        """Offer a service, which `ros2 service list` then shows, and return the queue of its requests in CDR."""
+        queryable = self._network.queryable(make_topic_key(self._domain, service))
+        self._network.declare_token(self._make_next_token(SERVER, service))
         return queryable
 
-    def _token(self, kind: str, topic: Topic | None = None) -> str:
-        return token_key(self._domain, self._network.id, next(self._entities), kind, self._name, topic)
+    def _make_next_token(self, kind: str, topic: Topic | None = None) -> str:
+        """Return the liveliness token of the next entity of this node."""
+        return make_token(self._domain, self._network.id, next(self._entities), kind, self._name, topic)

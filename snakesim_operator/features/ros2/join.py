@@ -1,33 +1,47 @@
-"""The bridge's two sessions: one on the robot's network, one on that of the ROS nodes."""
+"""Runs the bridge between its two sessions: one on the robot's network, one on that of the ROS nodes."""
 
 import argparse
 import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NoReturn
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.terminal import say
-from snakesim_hal.network.foreign_network import open_foreign_network
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.foreign_network import ForeignNetwork, open_foreign_network
+from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.base.targets import RobotSelection, only_robot
-from snakesim_operator.features.ros2.bridge import Bridge, Options, is_consistent
-from snakesim_operator.features.ros2.driving import Driving
+from snakesim_operator.features.ros2.bridge import Bridge, BridgeOptions, is_consistent
+from snakesim_operator.features.ros2.driving import JointCommander
 from snakesim_operator.features.ros2.graph import Node, NodeName, Topic
 from snakesim_operator.features.ros2.messages import JOINT_STATE
-from snakesim_operator.features.ros2.operating import operating_servers
-from snakesim_operator.features.ros2.parameters import parameter_servers
+from snakesim_operator.features.ros2.operating import make_operating_servers
+from snakesim_operator.features.ros2.parameters import make_parameter_servers
+from snakesim_operator.features.ros2.server import ServiceServer
 
-MAX_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
-KEPT_COMMANDS = 64  # messages that name a joint each, between two ticks
-STARTING_S = 60.0  # a robot may take so long to start
+NODE_NAME = "snakesim"
+MAX_ROS_MESSAGE_BYTES = 65536  # a Twist has 52
+JOINT_COMMANDS_KEPT = 64  # between two ticks: messages that name a single joint each
+START_TIMEOUT_S = 60.0  # a robot may take so long to start
+RETRY_S = 0.5  # while the robot starts
 
 
-def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
-    """Run the bridge until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    link = _started(where)
+def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
+    """Run the bridge until Ctrl-C.
+
+    Args:
+        arguments: The command line.
+        selection: The robot that it names.
+
+    Raises:
+        ConfigError: The robot itself is on the endpoint of the ROS router.
+        NotConnectedError: There is no such robot, or no router of ROS nodes.
+    """
+    link = _wait_for_robot(selection)
     if link.endpoint == arguments.ros_router:
         raise ConfigError(
             f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
@@ -35,61 +49,85 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
             "`snakesim run`; this command finds it there"
         )
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.latest(keys.DESCRIPTION, Description, STARTING_S, is_consistent)
+        robot = session.latest(keys.DESCRIPTION, Description, START_TIMEOUT_S, is_consistent)
         if robot is None:
-            raise NotConnectedError(f"{link.namespace} does not describe itself within {STARTING_S:g} s")
-        wall_time = not robot.emulated if arguments.stamps is None else arguments.stamps == "wall"
-        options = Options(
-            namespace=arguments.ros_namespace or "",
-            hz=arguments.hz,
-            images_hz=arguments.image_hz,
-            cmd_vel=arguments.cmd_vel,
-            wall_time=wall_time,
-        )
-        with contextlib.ExitStack() as opened:
-            try:
-                network = opened.enter_context(open_foreign_network(arguments.ros_router, max_bytes=MAX_IN_BYTES))
-            except NotConnectedError:
-                raise NotConnectedError(
-                    f"no router of ROS nodes on {arguments.ros_router}; start it by "
-                    "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router"
-                ) from None
-            name = NodeName("snakesim", f"/{options.namespace}")
+            raise NotConnectedError(f"{link.namespace} does not describe itself within {START_TIMEOUT_S:g} s")
+        options = _make_options(arguments, robot)
+        with contextlib.ExitStack() as cleanup:
+            network = _connect_to_ros(arguments.ros_router, cleanup)
+            name = NodeName(NODE_NAME, f"/{options.namespace}")
             node = Node(network, arguments.domain, name)
-            made = Bridge(session, node, robot, options)
-            operate: bool = arguments.operate
-            servers = [
-                *operating_servers(session, node, link, made.prefix, operate=operate),
-                *parameter_servers(session, node, f"/{made.prefix}{name.name}", operate=operate),
-            ]
+            bridge = Bridge(session, node, robot, options)
+            servers = _make_servers(session, node, link, bridge.prefix, operate=arguments.operate)
             for server in servers:
-                opened.callback(server.close)
+                cleanup.callback(server.close)
             if arguments.joint_commands:
-                commands = node.subscription(Topic(f"/{made.prefix}joint_commands", JOINT_STATE, depth=KEPT_COMMANDS))
-                opened.callback(Driving(session, commands, say, wall_time=wall_time).close)
+                topic = Topic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=JOINT_COMMANDS_KEPT)
+                messages = node.declare_subscription(topic)
+                commander = JointCommander(session, messages, say, wall_time=options.wall_time)
+                cleanup.callback(commander.close)
+            time_name = "robot"
+            if options.wall_time:
+                time_name = "wall-clock"
             say(
                 f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
-                f"{'wall-clock' if wall_time else 'robot'} time; Ctrl-C ends it"
+                f"{time_name} time; Ctrl-C ends it"
             )
-            due_s = time.monotonic()
-            while True:
-                made.turn()
-                for server in servers:
-                    server.turn(say)
-                due_s = max(due_s + 1.0 / arguments.hz, time.monotonic())
-                time.sleep(max(0.0, due_s - time.monotonic()))
+            _run_cycles(bridge, servers, arguments.hz)
 
 
-def _started(where: RobotSelection) -> Link:
-    """The robot, also one that is starting just now."""
-    until_s, told = time.monotonic() + STARTING_S, False
+def _make_options(arguments: argparse.Namespace, robot: Description) -> BridgeOptions:
+    """Return the bridge's options. Without --stamps, a real robot has wall-clock time, an emulated one robot time."""
+    wall_time = not robot.emulated
+    if arguments.stamps is not None:
+        wall_time = arguments.stamps == "wall"
+    return BridgeOptions(
+        namespace=arguments.ros_namespace or "",
+        hz=arguments.hz,
+        images_hz=arguments.image_hz,
+        cmd_vel=arguments.cmd_vel,
+        wall_time=wall_time,
+    )
+
+
+def _connect_to_ros(endpoint: str, cleanup: contextlib.ExitStack) -> ForeignNetwork:
+    try:
+        return cleanup.enter_context(open_foreign_network(endpoint, max_bytes=MAX_ROS_MESSAGE_BYTES))
+    except NotConnectedError:
+        raise NotConnectedError(
+            f"no router of ROS nodes on {endpoint}; start it by "
+            "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router"
+        ) from None
+
+
+def _make_servers(session: Session, node: Node, link: Link, prefix: str, *, operate: bool) -> list[ServiceServer]:
+    operating_servers = make_operating_servers(session, node, link, prefix, operate=operate)
+    parameter_servers = make_parameter_servers(session, node, f"/{prefix}{NODE_NAME}", operate=operate)
+    return operating_servers + parameter_servers
+
+
+def _run_cycles(bridge: Bridge, servers: Sequence[ServiceServer], hz: float) -> NoReturn:
+    """Run the bridge's cycles at this rate until Ctrl-C; cycles that were missed are not made up for."""
+    due_s = time.monotonic()
+    while True:
+        bridge.run_cycle()
+        for server in servers:
+            server.poll(say)
+        due_s = max(due_s + 1.0 / hz, time.monotonic())
+        time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _wait_for_robot(selection: RobotSelection) -> Link:
+    """Return how to reach the selected robot; wait for a robot that is starting. Raises NotConnectedError."""
+    give_up_s = time.monotonic() + START_TIMEOUT_S
+    is_reported = False
     while True:
         try:
-            return only_robot(where, "ros2")
+            return only_robot(selection, "ros2")
         except NotConnectedError as error:
-            if time.monotonic() > until_s:
+            if time.monotonic() > give_up_s:
                 raise
-            if not told:
-                say(f"{error}. Waiting for it up to {STARTING_S:g} s")
-            told = True
-            time.sleep(0.5)
+            if not is_reported:
+                say(f"{error}. Waiting for it up to {START_TIMEOUT_S:g} s")
+                is_reported = True
+            time.sleep(RETRY_S)

@@ -1,8 +1,8 @@
-"""From sensor_msgs/JointState on joint_commands to setpoints for every joint. Pure except for its own state.
+"""Turns sensor_msgs/JointState on joint_commands into setpoints for every joint of the robot.
 
-A message names any joints. Each of them follows what it was told for half a second of robot time, from when the message
-was sent on, then stays where it is; so does every joint of which nothing was said since arming. What is said while the
-robot is not armed is dropped.
+A message names any of the joints. Each named joint follows its target for VALID_NS of robot time from when the
+message was sent; then it holds the angle that it has. A joint without a target since the robot was armed holds its
+angle as well. Targets that arrive while the robot is not armed are dropped.
 """
 
 import math
@@ -13,102 +13,165 @@ from rosbags.serde import SerdeError
 
 from snakesim_hal.wire.messages import Clock, Description, JointState, Mode
 from snakesim_hal.wire.setpoints import RequestedSetpoints
-from snakesim_operator.features.ros2.message_age import why_too_old
+from snakesim_operator.features.ros2.message_age import explain_age_refusal
 from snakesim_operator.features.ros2.messages import JOINT_STATE, STORE
 
-VALID_NS = 500_000_000  # of a joint's command in robot time
-KINDS = ((Mode.POSITION, "position"), (Mode.VELOCITY, "velocity"), (Mode.TORQUE, "effort"))  # the first given counts
+VALID_NS = 500_000_000  # of a joint's target in robot time
+MODE_FIELDS = ((Mode.POSITION, "position"), (Mode.VELOCITY, "velocity"), (Mode.TORQUE, "effort"))
+MAX_NAME_SHOWN = 40  # characters of an unknown joint name in a message to the user
+
+
+class _RefusedMessageError(Exception):
+    """A message cannot be followed; its text says why."""
 
 
 @dataclass(frozen=True)
-class _Commanded:
+class _JointCommand:
     """A message that can be followed."""
 
     mode: Mode
-    targets: dict[int, float]  # by joint
-    timestamp_ns: int  # of its header, in ROS time; 0: none
+    targets: dict[int, float]  # by joint index; in rad, rad/s or N m, as the mode requires
+    timestamp_ns: int  # in its header, in ROS time; 0: none
 
 
-class JointTargets:
-    """What each joint was told last."""
+@dataclass(frozen=True)
+class _JointTarget:
+    """The newest target of one joint."""
+
+    mode: Mode
+    target: float
+    until_ns: int  # robot time
+
+
+class RosJointTargets:
+    """Keeps the newest target of each joint, and makes the setpoints of each control cycle from them."""
 
     def __init__(self, robot: Description) -> None:
         self._robot = robot
-        self._index = {joint.name: i for i, joint in enumerate(robot.joints)}
-        self._limits_nm = [joint.torque_limit_nm for joint in robot.joints]
-        self._told: list[tuple[Mode, float, int] | None] = [None] * len(robot.joints)  # mode, target, until when
-        self._stays_rad: list[float | None] = [None] * len(robot.joints)
+        self._joint_indices = {joint.name: i for i, joint in enumerate(robot.joints)}
+        self._torque_limits_nm = [joint.torque_limit_nm for joint in robot.joints]
+        self._targets: list[_JointTarget | None] = [None] * len(robot.joints)
+        self._held_angles_rad: list[float | None] = [None] * len(robot.joints)  # None: not holding yet
         self.rejected = 0  # messages
-        self.why = ""  # the last one was
+        self.reason = ""  # for the newest rejection
 
-    def take(self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0) -> bool:
-        """Take in a message, all of it or nothing; returns whether it was taken.
+    def accept(self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0) -> bool:
+        """Take over the targets of a message: either all of them or none.
 
         Args:
             payload: The message in CDR.
             now_ns: Robot time.
-            ros_now_ns: The time in ROS, with which a header's stamp is compared; None: robot time.
-            age_ns: How long ago the message was sent, for one without a stamp.
+            ros_now_ns: Present time in ROS, to compare with a header's timestamp; None: robot time.
+            age_ns: How long ago the message was sent, for a message without a timestamp.
+
+        Returns:
+            Whether the message was accepted. If not, `reason` says why.
         """
-        commanded = self._read(payload)
-        if isinstance(commanded, str):
-            return self._reject(commanded)
-        by = "the times of its sender's messages"
-        if commanded.timestamp_ns:
-            age_ns = (now_ns if ros_now_ns is None else ros_now_ns) - commanded.timestamp_ns
-            by = "the stamp of its header"
-        if why := why_too_old(age_ns, by):
-            return self._reject(why)
+        if ros_now_ns is None:
+            ros_now_ns = now_ns
+        try:
+            command = self._decode(payload)
+            age_ns = _check_age(command, age_ns, ros_now_ns)
+        except _RefusedMessageError as error:
+            self.rejected += 1
+            self.reason = str(error)
+            return False
         until_ns = now_ns - max(age_ns, 0) + VALID_NS
-        for i, target in commanded.targets.items():
-            self._told[i] = (commanded.mode, target, until_ns)
-            self._stays_rad[i] = None
+        for i, target in command.targets.items():
+            self._targets[i] = _JointTarget(command.mode, target, until_ns)
+            self._held_angles_rad[i] = None
         return True
 
-    def _reject(self, why: str) -> bool:
-        self.rejected += 1
-        self.why = why
-        return False
-
-    def setpoints(self, clock: Clock, joints: JointState) -> RequestedSetpoints:
-        """For this tick. An arming begins with staying."""
-        count = len(self._robot.joints)
+    def make_setpoints(self, clock: Clock, joints: JointState) -> RequestedSetpoints:
+        """Return the setpoints of this control cycle. While the robot is not armed, all targets are forgotten."""
+        joint_count = len(self._robot.joints)
         if clock.lifecycle != "armed":
-            self._told, self._stays_rad = [None] * count, [None] * count
-        modes, targets = [Mode.POSITION] * count, [0.0] * count
-        for i in range(count):
-            told = self._told[i]
-            if told is not None and clock.timestamp_ns <= told[2]:
-                modes[i], targets[i] = told[0], told[1]
+            self._targets = [None] * joint_count
+            self._held_angles_rad = [None] * joint_count
+        modes = [Mode.POSITION] * joint_count
+        targets = [0.0] * joint_count
+        for i in range(joint_count):
+            target = self._targets[i]
+            if target is not None and clock.timestamp_ns <= target.until_ns:
+                modes[i] = target.mode
+                targets[i] = target.target
                 continue
-            self._told[i] = None
-            stays_rad = self._stays_rad[i]
-            if stays_rad is None:  # where it is now, not where it sinks to
-                self._stays_rad[i] = stays_rad = joints.angle_rad[i]
-            targets[i] = stays_rad
-        return RequestedSetpoints(modes, targets, self._limits_nm)
+            self._targets[i] = None
+            targets[i] = self._hold(i, joints)
+        return RequestedSetpoints(modes, targets, self._torque_limits_nm)
 
-    def _read(self, payload: bytes) -> "_Commanded | str":
-        """What a message commands; a text: what is wrong with it."""
+    def _hold(self, joint: int, joints: JointState) -> float:
+        """Return the angle in rad that a joint had when it began to hold.
+
+        The angle is kept, because a joint that held its present angle in each cycle would sink under its load.
+        """
+        held_rad = self._held_angles_rad[joint]
+        if held_rad is None:
+            held_rad = joints.angle_rad[joint]
+            self._held_angles_rad[joint] = held_rad
+        return held_rad
+
+    def _decode(self, payload: bytes) -> _JointCommand:
+        """Return what a message commands. Raises _RefusedMessageError."""
         try:
-            found: Any = STORE.deserialize_cdr(payload, JOINT_STATE.name)
+            message: Any = STORE.deserialize_cdr(payload, JOINT_STATE.name)
         except SerdeError as error:
-            return f"is no sensor_msgs/JointState: {error}"
-        mode, word = next(((mode, word) for mode, word in KINDS if len(getattr(found, word))), (None, ""))
-        if mode is None:
-            return "has no position, velocity or effort"
-        values = [float(value) for value in getattr(found, word)]
-        if len(values) != len(found.name) or len(set(found.name)) != len(found.name):
-            return f"has {len(values)} numbers in {word} for {len(found.name)} names, must have one for each joint"
+            raise _RefusedMessageError(f"is no sensor_msgs/JointState: {error}") from None
+        mode, field = _find_mode(message)
+        values = [float(value) for value in getattr(message, field)]
+        has_duplicates = len(set(message.name)) != len(message.name)
+        if len(values) != len(message.name) or has_duplicates:
+            raise _RefusedMessageError(
+                f"has {len(values)} numbers in {field} for {len(message.name)} names, must have one for each joint"
+            )
         targets: dict[int, float] = {}
-        for name, value in zip(found.name, values, strict=True):
-            if name not in self._index:
-                return f"names {name[:40]!r}; {self._robot.robot} has {', '.join(self._index)}"
-            joint = self._robot.joints[self._index[name]]
-            if not math.isfinite(value):
-                return f"has {word} {value} for {name}, must be finite"
-            if not joint.has(mode):
-                return f"has {word} for {name}, whose drive takes {', '.join(one.name.lower() for one in joint.modes)}"
-            targets[self._index[name]] = value
-        timestamp_ns = found.header.stamp.sec * 1_000_000_000 + found.header.stamp.nanosec
-        return _Commanded(mode, targets, timestamp_ns)
+        for name, value in zip(message.name, values, strict=True):
+            self._check_target(name, mode, field, value)
+            targets[self._joint_indices[name]] = value
+        stamp = message.header.stamp
+        timestamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        return _JointCommand(mode, targets, timestamp_ns)
+
+    def _check_target(self, name: str, mode: Mode, field: str, value: float) -> None:
+        """Raise _RefusedMessageError for a target that this robot's joint cannot follow."""
+        if name not in self._joint_indices:
+            known_names = ", ".join(self._joint_indices)
+            raise _RefusedMessageError(f"names {name[:MAX_NAME_SHOWN]!r}; {self._robot.robot} has {known_names}")
+        if not math.isfinite(value):
+            raise _RefusedMessageError(f"has {field} {value} for {name}, must be finite")
+        joint = self._robot.joints[self._joint_indices[name]]
+        if not joint.has(mode):
+            supported = ", ".join(supported_mode.name.lower() for supported_mode in joint.modes)
+            raise _RefusedMessageError(f"has {field} for {name}, whose drive takes {supported}")
+
+
+def _check_age(command: _JointCommand, age_ns: int, ros_now_ns: int) -> int:
+    """Return the age of a command in ns.
+
+    Args:
+        command: The command; the timestamp of its header counts, if it has one.
+        age_ns: Its age by the times of its sender's messages.
+        ros_now_ns: Present time in ROS.
+
+    Raises:
+        _RefusedMessageError: The command is too old, or comes from the future.
+    """
+    source = "the times of its sender's messages"
+    if command.timestamp_ns:
+        age_ns = ros_now_ns - command.timestamp_ns
+        source = "the stamp of its header"
+    refusal = explain_age_refusal(age_ns, source)
+    if refusal:
+        raise _RefusedMessageError(refusal)
+    return age_ns
+
+
+def _find_mode(message: Any) -> tuple[Mode, str]:
+    """Return the mode that a message commands, and the name of its field: the first field that is not empty counts.
+
+    Raises _RefusedMessageError.
+    """
+    for mode, field in MODE_FIELDS:
+        if len(getattr(message, field)) > 0:
+            return mode, field
+    raise _RefusedMessageError("has no position, velocity or effort")

@@ -1,96 +1,123 @@
-"""How old a message from ROS is. Pure except for its own state.
+"""Measures how old a message from ROS is, so that a message that the network held back moves nothing.
 
-What moves a robot counts for half a second from the moment at which its sender sent it, not from when it came: a
-network that stalls delivers all that it has kept at once. Where a message has a header, its stamp says when. Every
-message of rmw_zenoh also has the time of its sender's wall clock attached, which need not agree with ours. So the
-quickest message of a sender within two minutes counts as one without delay, and the others are as old as they are
-slower. No session of rmw_zenoh outlives a stall of two minutes.
+A message that moves a robot counts for half a second from when its sender sent it, not from when it arrived: after a
+stall, a network delivers all that it has kept at once. If a message has a header, its timestamp gives the time of
+sending. Every message of rmw_zenoh also carries its sender's wall-clock time as an attachment. That clock need not
+agree with ours, so only differences count: the fastest message of a sender within two minutes is taken to have no
+delay, and every other message is as old as it is slower than that one. No session of rmw_zenoh survives a stall of
+two minutes, so there is always a message without such a delay to compare with.
 """
 
 from collections import OrderedDict, deque
 
 from snakesim_hal.network.foreign_network import RawSample
-from snakesim_operator.features.ros2.graph import ATTACHED, GID_BYTES
+from snakesim_operator.features.ros2.graph import ATTACHMENT, GID_BYTES
 
 MAX_AGE_NS = 500_000_000  # of a message that moves a robot
-AHEAD_NS = 100_000_000  # by which a header's stamp may be ahead of our time: clocks are not read at the same instant
-MAX_REQUEST_AGE_NS = 5_000_000_000  # of a service request that lets a robot move
-SENDERS_KEPT = 64
-PART_NS, PARTS_KEPT = 10_000_000_000, 12  # of the time in which the quickest message is sought
+MAX_AHEAD_NS = 100_000_000  # of a header's timestamp: two clocks are not read at the same instant
+MAX_REQUEST_AGE_NS = 5_000_000_000  # of a service request that allows a robot to move
+SENDERS_KEPT = 64  # bounds the memory that a flood of senders can take
+WINDOW_PART_NS = 10_000_000_000
+WINDOW_PARTS = 12  # times WINDOW_PART_NS: the two minutes in which the fastest message is searched
 
 
-class _Quickest:
-    """The least offset between our wall clock and a sender's, of each part of the last two minutes."""
+class _FastestMessage:
+    """The smallest difference between our wall clock and a sender's, kept for each part of the last two minutes.
+
+    Each difference is clock offset plus latency, so the smallest one belongs to the fastest message.
+    """
 
     def __init__(self) -> None:
-        self._parts: deque[tuple[int, int]] = deque(maxlen=PARTS_KEPT)  # number of the part, least offset in ns
+        self._parts: deque[tuple[int, int]] = deque(maxlen=WINDOW_PARTS)  # number of the part, smallest offset in ns
 
-    def put(self, offset_ns: int, monotonic_ns: int) -> int:
-        """Take in an offset, and return by how much it is larger than the least one."""
-        part = monotonic_ns // PART_NS
-        while self._parts and self._parts[0][0] <= part - PARTS_KEPT:
+    def add_offset(self, offset_ns: int, monotonic_ns: int) -> int:
+        """Take in the offset of a message, and return in ns by how much it exceeds the smallest one."""
+        part = monotonic_ns // WINDOW_PART_NS
+        while self._parts and self._parts[0][0] <= part - WINDOW_PARTS:
             self._parts.popleft()
         if self._parts and self._parts[-1][0] == part:
-            offset_in_part_ns = min(self._parts.pop()[1], offset_ns)
-            self._parts.append((part, offset_in_part_ns))
+            _, previous_ns = self._parts.pop()
+            self._parts.append((part, min(previous_ns, offset_ns)))
         else:
             self._parts.append((part, offset_ns))
-        return offset_ns - min(min_ns for _, min_ns in self._parts)
+        smallest_ns = min(part_ns for _, part_ns in self._parts)
+        return offset_ns - smallest_ns
 
 
 class SenderClocks:
-    """How late each message came, compared with the quickest one of its sender."""
+    """Measures the delay of each message by comparison with the fastest message of its sender."""
 
     def __init__(self) -> None:
-        self._quickest: OrderedDict[bytes, _Quickest] = OrderedDict()
+        self._fastest: OrderedDict[bytes, _FastestMessage] = OrderedDict()  # by sender, longest silent first
 
-    def age_ns(self, sample: RawSample, wall_ns: int, monotonic_ns: int) -> int:
-        """Return the age of a message at the present times, since it was sent as far as that is known."""
-        waited_ns = monotonic_ns - sample.arrived_ns  # in this process
-        sent = sent_by(sample.attachment)
-        if sent is None:
-            return waited_ns
-        sender, sent_ns = sent
-        quickest = self._quickest.setdefault(sender, _Quickest())
-        self._quickest.move_to_end(sender)
-        while len(self._quickest) > SENDERS_KEPT:
-            self._quickest.popitem(last=False)
-        return max(quickest.put(wall_ns - sent_ns, monotonic_ns), waited_ns)
+    def measure_age(self, sample: RawSample, wall_ns: int, monotonic_ns: int) -> int:
+        """Return the age of a message in ns, since it was sent as far as that is known.
+
+        The age is never below the time that the message has waited in this process.
+
+        Args:
+            sample: The message with its attachment and its arrival time.
+            wall_ns: Present time of our wall clock.
+            monotonic_ns: Present monotonic time.
+        """
+        waiting_ns = monotonic_ns - sample.arrived_ns
+        origin = read_sender(sample.attachment)
+        if origin is None:
+            return waiting_ns
+        sender, sent_ns = origin
+        fastest = self._fastest.setdefault(sender, _FastestMessage())
+        self._fastest.move_to_end(sender)
+        while len(self._fastest) > SENDERS_KEPT:
+            self._fastest.popitem(last=False)
+        delay_ns = fastest.add_offset(wall_ns - sent_ns, monotonic_ns)
+        return max(delay_ns, waiting_ns)
 
 
-def sent_by(attachment: bytes) -> tuple[bytes, int] | None:
-    """Return who sent a message, and when by its wall clock in ns; None: it has no such attachment."""
-    if len(attachment) != ATTACHED.size:
+def read_sender(attachment: bytes) -> tuple[bytes, int] | None:
+    """Return the sender of a message and its wall-clock time of sending in ns; None without such an attachment."""
+    if len(attachment) != ATTACHMENT.size:
         return None
-    _, sent_ns, length, sender = ATTACHED.unpack(attachment)
-    return (sender, sent_ns) if length == GID_BYTES else None
+    _, sent_ns, gid_bytes, sender = ATTACHMENT.unpack(attachment)
+    if gid_bytes != GID_BYTES:
+        return None
+    return sender, sent_ns
 
 
-def why_too_old(age_ns: float, by: str) -> str:
-    """Return why a message may move nothing; empty when it may. by: by what its age is known."""
+def explain_age_refusal(age_ns: float, source: str) -> str:
+    """Return why a message may not move the robot; empty if it may.
+
+    Args:
+        age_ns: Age of the message; negative for a timestamp in the future.
+        source: What the age was measured by, in words.
+    """
     if age_ns > MAX_AGE_NS:
-        return f"is older than {MAX_AGE_NS * 1e-9:g} s by {by}"
-    if age_ns < -AHEAD_NS:
+        return f"is older than {MAX_AGE_NS * 1e-9:g} s by {source}"
+    if age_ns < -MAX_AHEAD_NS:
         return (
-            f"is ahead of the time in ROS by {by}; give robot time (use_sim_time) when the bridge publishes /clock, "
-            "synchronised wall-clock time otherwise, or no stamp"
+            f"is ahead of the time in ROS by {source}; give robot time (use_sim_time) when the bridge publishes "
+            "/clock, synchronised wall-clock time otherwise, or no stamp"
         )
     return ""
 
 
-def why_request_too_old(attachment: bytes, wall_ns: int) -> str:
-    """Return why a request may not let a robot move; empty when it may.
+def explain_request_age_refusal(attachment: bytes, wall_ns: int) -> str:
+    """Return why a service request may not allow the robot to move; empty if it may.
 
-    A client asks once, so that there is no quicker message to compare with: its clock has to agree with ours roughly.
+    A client sends a single request, so there is no faster message to compare with: its clock must agree with ours
+    to within MAX_REQUEST_AGE_NS.
     """
-    sent = sent_by(attachment)
-    if sent is None:
+    origin = read_sender(attachment)
+    if origin is None:
         return "the request has no time attached"
-    late_ns = wall_ns - sent[1]
-    if abs(late_ns) <= MAX_REQUEST_AGE_NS:
+    _, sent_ns = origin
+    age_ns = wall_ns - sent_ns
+    if abs(age_ns) <= MAX_REQUEST_AGE_NS:
         return ""
-    when = f"{abs(late_ns) * 1e-9:.0f} s {'ago' if late_ns > 0 else 'in the future'}"
+    direction = "in the future"
+    if age_ns > 0:
+        direction = "ago"
     return (
-        f"the request was sent {when}, by the clock of its sender; {MAX_REQUEST_AGE_NS * 1e-9:g} s are allowed. Ask "
+        f"the request was sent {abs(age_ns) * 1e-9:.0f} s {direction}, by the clock of its sender; "
+        f"{MAX_REQUEST_AGE_NS * 1e-9:g} s are allowed. Ask "
         "again; if it is refused again, synchronise the clocks of both computers"
     )

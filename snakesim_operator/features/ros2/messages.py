@@ -1,7 +1,7 @@
-"""Types and parts of the ROS messages that the bridge sends, field by field as defined; rosbags encodes them.
+"""Builds and encodes the ROS messages that the bridge sends, field by field as defined; rosbags encodes them.
 
-Frames, units and conventions: REP 103. A stamp is in nanoseconds. Quaternions come as wxyz, and ROS has them as xyzw.
-Definitions are those of Jazzy; a test compares the types' hashes with later distributions.
+Frames, units and conventions follow REP 103. A timestamp is in nanoseconds. Quaternions come as wxyz, and ROS has
+them as xyzw. The definitions are those of Jazzy; a test compares the types' hashes with later distributions.
 """
 
 from collections.abc import Sequence
@@ -17,30 +17,39 @@ from snakesim_operator.features.ros2.graph import RosType
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
-def _type(name: str) -> RosType:
+def _define_type(name: str) -> RosType:
     return RosType(name, STORE.hash_rihs01(name))
 
 
-JOINT_STATE = _type("sensor_msgs/msg/JointState")
-TRANSFORMS = _type("tf2_msgs/msg/TFMessage")
-MARKERS = _type("visualization_msgs/msg/MarkerArray")
-IMAGE = _type("sensor_msgs/msg/Image")
-COMPRESSED_IMAGE = _type("sensor_msgs/msg/CompressedImage")
-IMU = _type("sensor_msgs/msg/Imu")
-CAMERA_INFO = _type("sensor_msgs/msg/CameraInfo")
-LASER_SCAN = _type("sensor_msgs/msg/LaserScan")
-NUMBERS = _type("std_msgs/msg/Float64MultiArray")
-STRING = _type("std_msgs/msg/String")
-CLOCK = _type("rosgraph_msgs/msg/Clock")
-TWIST = _type("geometry_msgs/msg/Twist")
-DIAGNOSTICS = _type("diagnostic_msgs/msg/DiagnosticArray")
+JOINT_STATE = _define_type("sensor_msgs/msg/JointState")
+TRANSFORMS = _define_type("tf2_msgs/msg/TFMessage")
+MARKERS = _define_type("visualization_msgs/msg/MarkerArray")
+IMAGE = _define_type("sensor_msgs/msg/Image")
+COMPRESSED_IMAGE = _define_type("sensor_msgs/msg/CompressedImage")
+IMU = _define_type("sensor_msgs/msg/Imu")
+CAMERA_INFO = _define_type("sensor_msgs/msg/CameraInfo")
+LASER_SCAN = _define_type("sensor_msgs/msg/LaserScan")
+NUMBERS = _define_type("std_msgs/msg/Float64MultiArray")
+STRING = _define_type("std_msgs/msg/String")
+CLOCK = _define_type("rosgraph_msgs/msg/Clock")
+TWIST = _define_type("geometry_msgs/msg/Twist")
+DIAGNOSTICS = _define_type("diagnostic_msgs/msg/DiagnosticArray")
 
 Triple = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]
 Rgba = tuple[float, float, float, float]
-ARROW, CUBE, SPHERE, CYLINDER = 0, 1, 2, 3  # types of a marker
-ADD, DELETE_ALL = 0, 3  # actions of a marker
-LAST_SECOND = 2**31 - 1  # of ROS; a robot's clock may say anything
+
+# Types of a visualization_msgs/Marker.
+ARROW = 0
+CUBE = 1
+SPHERE = 2
+CYLINDER = 3
+
+# Actions of a visualization_msgs/Marker.
+ADD = 0
+DELETE_ALL = 3
+
+MAX_TIME_S = 2**31 - 1  # builtin_interfaces/Time has 32 bits; a robot's clock may have any value
 
 
 @dataclass(frozen=True)
@@ -66,97 +75,153 @@ class Marker:
     points_m: tuple[Triple, ...] = ()
 
 
-def sent(kind: RosType, *fields: Any) -> bytes:
-    """A message of this type in CDR, by its fields in their order."""
-    return bytes(STORE.serialize_cdr(made(kind.name, *fields), kind.name))
+def make_message(type_name: str, *fields: Any) -> Any:
+    """Return a ROS message object, given its fields in the order of their definition."""
+    message_types: Any = STORE.types
+    return message_types[type_name](*fields)
 
 
-def made(name: str, *fields: Any) -> Any:
-    """A ROS message, by its fields in their order."""
-    known: Any = STORE.types
-    return known[name](*fields)
+def encode_message(ros_type: RosType, *fields: Any) -> bytes:
+    """Return a message in CDR, given its fields in the order of their definition."""
+    message = make_message(ros_type.name, *fields)
+    return bytes(STORE.serialize_cdr(message, ros_type.name))
 
 
-def _time(timestamp_ns: int) -> Any:
-    return made("builtin_interfaces/msg/Time", min(timestamp_ns // 10**9, LAST_SECOND), timestamp_ns % 10**9)
+def _make_time(timestamp_ns: int) -> Any:
+    seconds = min(timestamp_ns // 10**9, MAX_TIME_S)
+    nanoseconds = timestamp_ns % 10**9
+    return make_message("builtin_interfaces/msg/Time", seconds, nanoseconds)
 
 
-def header(timestamp_ns: int, frame: str) -> Any:
-    """Of a message. frame: empty for one that has none."""
-    return made("std_msgs/msg/Header", _time(timestamp_ns), frame)
+def make_header(timestamp_ns: int, frame: str) -> Any:
+    """Return the header of a message. frame: empty for a message that belongs to no frame."""
+    return make_message("std_msgs/msg/Header", _make_time(timestamp_ns), frame)
 
 
-def vector(xyz: Triple) -> Any:
-    """geometry_msgs/Vector3."""
-    return made("geometry_msgs/msg/Vector3", *xyz)
+def make_vector(xyz: Triple) -> Any:
+    """Return a geometry_msgs/Vector3."""
+    return make_message("geometry_msgs/msg/Vector3", *xyz)
 
 
-def _point(xyz: Triple) -> Any:
-    return made("geometry_msgs/msg/Point", *xyz)
+def _make_point(xyz: Triple) -> Any:
+    return make_message("geometry_msgs/msg/Point", *xyz)
 
 
-def quaternion(wxyz: Wxyz) -> Any:
-    """geometry_msgs/Quaternion."""
-    return made("geometry_msgs/msg/Quaternion", *wxyz[1:], wxyz[0])
+def make_quaternion(wxyz: Wxyz) -> Any:
+    """Return a geometry_msgs/Quaternion, which has its fields in the order xyzw."""
+    w, x, y, z = wxyz
+    return make_message("geometry_msgs/msg/Quaternion", x, y, z, w)
 
 
-def _octets(raw: bytes) -> np.ndarray:
-    return np.frombuffer(raw, dtype=np.uint8)
+def _make_octets(data: bytes) -> np.ndarray:
+    return np.frombuffer(data, dtype=np.uint8)
 
 
-def clock(timestamp_ns: int) -> bytes:
-    """rosgraph_msgs/Clock."""
-    return sent(CLOCK, _time(timestamp_ns))
+def encode_clock(timestamp_ns: int) -> bytes:
+    """Return a rosgraph_msgs/Clock in CDR."""
+    return encode_message(CLOCK, _make_time(timestamp_ns))
 
 
-def string(text: str) -> bytes:
-    """std_msgs/String."""
-    return sent(STRING, text)
+def encode_string(text: str) -> bytes:
+    """Return a std_msgs/String in CDR."""
+    return encode_message(STRING, text)
 
 
-def transforms(timestamp_ns: int, all_of_them: Sequence[Transform]) -> bytes:
-    """tf2_msgs/TFMessage."""
-    return sent(TRANSFORMS, [_transform(timestamp_ns, one) for one in all_of_them])
+def encode_transforms(timestamp_ns: int, transforms: Sequence[Transform]) -> bytes:
+    """Return a tf2_msgs/TFMessage in CDR."""
+    stamped = [_make_stamped_transform(timestamp_ns, transform) for transform in transforms]
+    return encode_message(TRANSFORMS, stamped)
 
 
-def _transform(timestamp_ns: int, one: Transform) -> Any:
-    pose = made("geometry_msgs/msg/Transform", vector(one.position_m), quaternion(one.orientation_wxyz))
-    return made("geometry_msgs/msg/TransformStamped", header(timestamp_ns, one.parent), one.child, pose)
+def _make_stamped_transform(timestamp_ns: int, transform: Transform) -> Any:
+    translation = make_vector(transform.position_m)
+    rotation = make_quaternion(transform.orientation_wxyz)
+    pose = make_message("geometry_msgs/msg/Transform", translation, rotation)
+    header = make_header(timestamp_ns, transform.parent)
+    return make_message("geometry_msgs/msg/TransformStamped", header, transform.child, pose)
 
 
-def markers(timestamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
-    """visualization_msgs/MarkerArray that replaces everything on its topic."""
-    head = header(timestamp_ns, frame)
-    cleared = _marker(head, 0, DELETE_ALL, Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
-    return sent(MARKERS, [cleared, *(_marker(head, number, ADD, shape) for number, shape in enumerate(shapes))])
+def encode_markers(timestamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
+    """Return a visualization_msgs/MarkerArray in CDR that replaces everything on its topic."""
+    header = make_header(timestamp_ns, frame)
+    nothing = Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
+    markers = [_make_marker(header, 0, DELETE_ALL, nothing)]
+    for number, shape in enumerate(shapes):
+        markers.append(_make_marker(header, number, ADD, shape))
+    return encode_message(MARKERS, markers)
 
 
-def _marker(head: Any, number: int, action: int, shape: Marker) -> Any:
-    pose = made("geometry_msgs/msg/Pose", _point(shape.position_m), quaternion(shape.orientation_wxyz))
-    color = made("std_msgs/msg/ColorRGBA", *shape.rgba)
-    until_replaced = made("builtin_interfaces/msg/Duration", 0, 0)
-    drawn = (pose, vector(shape.size_m), color, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
-    no_texture = ("", made("sensor_msgs/msg/CompressedImage", header(0, ""), "", _octets(b"")), [])
-    no_mesh = ("", made("visualization_msgs/msg/MeshFile", "", _octets(b"")), False)
-    what = (shape.group, number, shape.shape, action)
-    return made("visualization_msgs/msg/Marker", head, *what, *drawn, *no_texture, "", *no_mesh)
+def _make_marker(header: Any, number: int, action: int, shape: Marker) -> Any:
+    """Return a visualization_msgs/Marker; its fields are in the order of their definition."""
+    position = _make_point(shape.position_m)
+    orientation = make_quaternion(shape.orientation_wxyz)
+    until_replaced = make_message("builtin_interfaces/msg/Duration", 0, 0)
+    no_image = make_message("sensor_msgs/msg/CompressedImage", make_header(0, ""), "", _make_octets(b""))
+    no_mesh = make_message("visualization_msgs/msg/MeshFile", "", _make_octets(b""))
+    return make_message(
+        "visualization_msgs/msg/Marker",
+        header,
+        shape.group,  # ns
+        number,  # id
+        shape.shape,  # type
+        action,
+        make_message("geometry_msgs/msg/Pose", position, orientation),
+        make_vector(shape.size_m),  # scale
+        make_message("std_msgs/msg/ColorRGBA", *shape.rgba),
+        until_replaced,  # lifetime
+        False,  # frame_locked
+        [_make_point(point) for point in shape.points_m],
+        [],  # colors
+        "",  # texture_resource
+        no_image,  # texture
+        [],  # uv_coordinates
+        "",  # text
+        "",  # mesh_resource
+        no_mesh,  # mesh_file
+        False,  # mesh_use_embedded_materials
+    )
 
 
-def image(timestamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
-    """sensor_msgs/Image. encoding: 16UC1 (mm), 32FC1 (m) or rgb8; rows without padding, little endian."""
-    size = (height, width, encoding, 0, len(pixels) // height)
-    return sent(IMAGE, header(timestamp_ns, frame), *size, _octets(pixels))
+def encode_image(timestamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
+    """Return a sensor_msgs/Image in CDR.
+
+    Args:
+        timestamp_ns: Time of the image.
+        frame: Its optical frame.
+        width: In pixels.
+        height: In pixels.
+        encoding: 16UC1 (mm), 32FC1 (m) or rgb8.
+        pixels: Rows without padding, little endian.
+    """
+    is_big_endian = 0
+    row_bytes = len(pixels) // height
+    return encode_message(
+        IMAGE,
+        make_header(timestamp_ns, frame),
+        height,
+        width,
+        encoding,
+        is_big_endian,
+        row_bytes,
+        _make_octets(pixels),
+    )
 
 
-def compressed_image(timestamp_ns: int, frame: str, described: str, data: bytes) -> bytes:
-    """sensor_msgs/CompressedImage. described: its `format`, as the plug-ins of image_transport read it."""
-    return sent(COMPRESSED_IMAGE, header(timestamp_ns, frame), described, _octets(data))
+def encode_compressed_image(timestamp_ns: int, frame: str, format_: str, data: bytes) -> bytes:
+    """Return a sensor_msgs/CompressedImage in CDR. format_: as the plug-ins of image_transport read it."""
+    return encode_message(COMPRESSED_IMAGE, make_header(timestamp_ns, frame), format_, _make_octets(data))
 
 
-def six_doubles(twist: bytes) -> tuple[float, ...] | None:
-    """A Twist's numbers, of either byte order; None: it is none."""
+def decode_twist(payload: bytes) -> tuple[float, ...] | None:
+    """Return the components of a Twist in CDR of either byte order: linear xyz, then angular xyz.
+
+    Returns:
+        Six numbers, or None if the payload is no Twist.
+    """
     try:
-        found: Any = STORE.deserialize_cdr(twist, TWIST.name)
+        twist: Any = STORE.deserialize_cdr(payload, TWIST.name)
     except SerdeError:
         return None
-    return tuple(getattr(part, axis) for part in (found.linear, found.angular) for axis in "xyz")
+    linear = twist.linear
+    angular = twist.angular
+    return (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)

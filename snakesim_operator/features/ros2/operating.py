@@ -1,4 +1,4 @@
-"""Arm, disarm, clear and stop as services of ROS: the same requests as those of `snakesim arm` and the others."""
+"""Offers arm, disarm, clear and stop as ROS services: the same requests as those of `snakesim arm` and the others."""
 
 import time
 from collections.abc import Callable
@@ -11,64 +11,104 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, request_to_arm
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.features.ros2.graph import Node
-from snakesim_operator.features.ros2.message_age import why_request_too_old
-from snakesim_operator.features.ros2.server import Server, told
+from snakesim_operator.features.ros2.message_age import explain_request_age_refusal
+from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.features.ros2.service_types import TRIGGER
 from snakesim_operator.robot_commands.command import ask_host
 from snakesim_operator.robot_commands.stop import estop
 
-DESCRIBED_S, READY_S = 3.0, 5.0  # a controller may be on its way
-WHO = f"{user_name()[:40]}, ros2"
+DESCRIPTION_TIMEOUT_S = 3.0
+READY_TIMEOUT_S = 5.0  # a controller may be starting
+REQUESTER = f"{user_name()[:40]}, ros2"
 
 
-def operating_servers(session: Session, node: Node, link: Link, prefix: str, *, operate: bool) -> list[Server]:
-    """The services. prefix: of their names; operate: whether ROS may do more than stop."""
-    acts: dict[str, Callable[[], str]] = {"stop": lambda: _stop(link)}
+def make_operating_servers(
+    session: Session, node: Node, link: Link, prefix: str, *, operate: bool
+) -> list[ServiceServer]:
+    """Declare the services that operate the robot.
+
+    Args:
+        session: Session on the robot's network.
+        node: The ROS node that offers them.
+        link: How to reach the robot.
+        prefix: Namespace of the services, with a slash behind it, or empty.
+        operate: Whether ROS may arm, disarm and clear; stop is always offered.
+    """
+    operator = _Operator(session, link)
+    servers = [_make_trigger_server(node, f"/{prefix}stop", operator.stop)]
     if operate:
-        acts |= {
-            "arm": lambda: _arm(session, link),
-            "disarm": lambda: _ask(session, link, LifecycleRequest(action="disarm", who=WHO), "disarmed"),
-            "clear": lambda: _ask(session, link, LifecycleRequest(action="clear", who=WHO), "cleared"),
-        }
-    return [
-        Server(
+        arm = ServiceServer(
             node,
-            f"/{prefix}{name}",
+            f"/{prefix}arm",
             TRIGGER,
-            _triggered(act),
-            refuse=lambda why: TRIGGER.response(False, why),
-            why_not=_why_not_armed if name == "arm" else lambda _attachment: "",
+            _make_trigger_answer(operator.arm),
+            make_refusal=_make_trigger_refusal,
+            explain_refusal=_explain_late_arm_request,
         )
-        for name, act in acts.items()
-    ]
+        disarm = _make_trigger_server(node, f"/{prefix}disarm", operator.disarm)
+        clear = _make_trigger_server(node, f"/{prefix}clear", operator.clear)
+        servers += [arm, disarm, clear]
+    return servers
 
 
-def _why_not_armed(attachment: bytes) -> str:
-    """A network that stalls may deliver a request long after somebody has given it up."""
-    return why_request_too_old(attachment, time.time_ns())
+def _make_trigger_server(node: Node, name: str, action: Callable[[], str]) -> ServiceServer:
+    return ServiceServer(node, name, TRIGGER, _make_trigger_answer(action), make_refusal=_make_trigger_refusal)
 
 
-def _triggered(act: Callable[[], str]) -> Callable[[Any], bytes]:
-    return lambda _request: TRIGGER.response(*told(act))
+def _make_trigger_answer(action: Callable[[], str]) -> Callable[[Any], bytes]:
+    def answer(_request: Any) -> bytes:
+        succeeded, text = run_action(action)
+        return TRIGGER.encode_response(succeeded, text)
+
+    return answer
 
 
-def _stop(link: Link) -> str:
-    said: list[str] = []
-    if estop(RobotSelection(link.endpoint, link.namespace, link.session), said.append):
-        raise RefusedError(*said)
-    return "; ".join(said)
+def _make_trigger_refusal(reason: str) -> bytes:
+    return TRIGGER.encode_response(False, reason)
 
 
-def _arm(session: Session, link: Link) -> str:
-    """The robot and the backend that it has now; its name is that of the bridge's own."""
-    robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
-    if robot is None:
-        raise NotConnectedError(f"{link.namespace} publishes no description; is its HAL host running?")
-    session.latest(keys.STATUS, Status, READY_S, lambda status: status.ready_to_arm)  # else the host says why not
-    return _ask(session, link, request_to_arm(robot, WHO), "armed")
+def _explain_late_arm_request(attachment: bytes) -> str:
+    """Return why a request to arm is refused; empty if it is allowed.
+
+    A network that stalls may deliver a request long after the client has given it up.
+    """
+    return explain_request_age_refusal(attachment, time.time_ns())
 
 
-def _ask(session: Session, link: Link, request: LifecycleRequest, done: str) -> str:
-    said: list[str] = []
-    ask_host(session, keys.LIFECYCLE, request, done, link, said.append)
-    return "; ".join(said)
+class _Operator:
+    """Sends the requests of the services to the robot. Each method returns the robot's answer in words."""
+
+    def __init__(self, session: Session, link: Link) -> None:
+        self._session = session
+        self._link = link
+
+    def stop(self) -> str:
+        """Stop the robot by `snakesim estop`. Raises RefusedError if the robot does not confirm it."""
+        lines: list[str] = []
+        robot = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
+        exit_code = estop(robot, lines.append)
+        if exit_code != 0:
+            raise RefusedError(*lines)
+        return "; ".join(lines)
+
+    def arm(self) -> str:
+        """Arm the robot that the host describes at present."""
+        robot = self._session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
+        if robot is None:
+            raise NotConnectedError(f"{self._link.namespace} publishes no description; is its HAL host running?")
+        # If it does not become ready, the host's answer to the request gives the reason.
+        self._session.latest(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
+        return self._request(request_to_arm(robot, REQUESTER), "armed")
+
+    def disarm(self) -> str:
+        """Disarm the robot."""
+        return self._request(LifecycleRequest(action="disarm", who=REQUESTER), "disarmed")
+
+    def clear(self) -> str:
+        """Reset the robot's fault."""
+        return self._request(LifecycleRequest(action="clear", who=REQUESTER), "cleared")
+
+    def _request(self, request: LifecycleRequest, done: str) -> str:
+        lines: list[str] = []
+        ask_host(self._session, keys.LIFECYCLE, request, done, self._link, lines.append)
+        return "; ".join(lines)

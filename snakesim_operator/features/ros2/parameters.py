@@ -1,10 +1,11 @@
-"""The running controller's parameters as parameters of the ROS node: list, get, describe, set.
+"""Offers the running controller's parameters as parameters of the ROS node: list, get, describe, set.
 
-They are those of `snakesim param`, under the same names. Nothing is kept here: every request asks the controller.
+They are those of `snakesim param`, under the same names. The bridge keeps no copy: every request reads them from the
+controller.
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,136 +14,214 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Session
 from snakesim_operator.features.ros2 import service_types as types
 from snakesim_operator.features.ros2.graph import Node
-from snakesim_operator.features.ros2.messages import made
-from snakesim_operator.features.ros2.operating import WHO
-from snakesim_operator.features.ros2.server import Server, told
+from snakesim_operator.features.ros2.messages import make_message
+from snakesim_operator.features.ros2.operating import REQUESTER
+from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.robot_commands.parameters import PREFIX, Parameter, change, in_force, in_text, parameters_of
 
-NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)  # types of rcl_interfaces/ParameterType
-DOUBLES, STRINGS = 8, 9
-DEPTH = 1000  # of the queue of a node's parameter services
-_FIELDS = {BOOL: "bool_value", INTEGER: "integer_value", DOUBLE: "double_value", STRING: "string_value"}
-_ARRAYS = {6: "bool_array_value", 7: "integer_array_value", DOUBLES: "double_array_value"}
+# Types of rcl_interfaces/ParameterType.
+NOT_SET = 0
+BOOL = 1
+INTEGER = 2
+DOUBLE = 3
+STRING = 4
+BOOLS = 6
+INTEGERS = 7
+DOUBLES = 8
+STRINGS = 9
+
+_SCALAR_FIELDS = {BOOL: "bool_value", INTEGER: "integer_value", DOUBLE: "double_value", STRING: "string_value"}
+_ARRAY_FIELDS = {BOOLS: "bool_array_value", INTEGERS: "integer_array_value", DOUBLES: "double_array_value"}
+_SCALAR_TYPES = {bool: BOOL, int: INTEGER, float: DOUBLE, str: STRING}
+
+QUEUE_DEPTH = 1000  # of a node's parameter services, as rmw's profile has it
 NOT_ALLOWED = "this bridge only watches: start it with --operate to let ROS set parameters"
 
 
-def parameter_servers(session: Session, node: Node, name: str, *, operate: bool) -> list[Server]:
-    """The six services of a node. name: of the node, with its namespace."""
-    asked = ParameterServices(session, operate=operate)
+def make_parameter_servers(session: Session, node: Node, node_name: str, *, operate: bool) -> list[ServiceServer]:
+    """Declare the six parameter services of a node.
+
+    Args:
+        session: Session on the robot's network.
+        node: The ROS node.
+        node_name: Its name with its namespace.
+        operate: Whether ROS may set parameters.
+    """
+    services = ParameterServices(session, operate=operate)
+    answers = (
+        ("list_parameters", types.LIST_PARAMETERS, services.list_parameters),
+        ("get_parameters", types.GET_PARAMETERS, services.get_parameters),
+        ("get_parameter_types", types.GET_PARAMETER_TYPES, services.get_parameter_types),
+        ("describe_parameters", types.DESCRIBE_PARAMETERS, services.describe_parameters),
+        ("set_parameters", types.SET_PARAMETERS, services.set_parameters),
+        ("set_parameters_atomically", types.SET_PARAMETERS_ATOMICALLY, services.set_parameters_atomically),
+    )
     return [
-        Server(node, f"{name}/{word}", service, answer, DEPTH)
-        for word, service, answer in (
-            ("list_parameters", types.LIST_PARAMETERS, asked.listed),
-            ("get_parameters", types.GET_PARAMETERS, asked.got),
-            ("get_parameter_types", types.GET_PARAMETER_TYPES, asked.kinds),
-            ("describe_parameters", types.DESCRIBE_PARAMETERS, asked.described),
-            ("set_parameters", types.SET_PARAMETERS, asked.set),
-            ("set_parameters_atomically", types.SET_PARAMETERS_ATOMICALLY, asked.set_at_once),
-        )
+        ServiceServer(node, f"{node_name}/{name}", service, answer, QUEUE_DEPTH) for name, service, answer in answers
     ]
 
 
 class ParameterServices:
-    """Answers of the six services."""
+    """Answers the requests of the six parameter services; each method returns a response in CDR."""
 
     def __init__(self, session: Session, *, operate: bool) -> None:
-        self._session, self._operate = session, operate
+        self._session = session
+        self._operate = operate
 
-    def listed(self, request: Any) -> bytes:
-        """Names that begin with one of the prefixes; all without any."""
-        wanted: Sequence[str] = request.prefixes
-        names = [name for name in self._now() if not wanted or any(_below(name, prefix) for prefix in wanted)]
-        result = made("rcl_interfaces/msg/ListParametersResult", names, [PREFIX.rstrip(".")] if names else [])
-        return types.LIST_PARAMETERS.response(result)
+    def list_parameters(self, request: Any) -> bytes:
+        """List the names below one of the requested prefixes; without a prefix, list all."""
+        names: list[str] = []
+        for name in self._read_parameters():
+            if not request.prefixes or any(_is_below(name, prefix) for prefix in request.prefixes):
+                names.append(name)
+        prefixes: list[str] = []
+        if names:
+            prefixes.append(PREFIX.rstrip("."))
+        result = make_message("rcl_interfaces/msg/ListParametersResult", names, prefixes)
+        return types.LIST_PARAMETERS.encode_response(result)
 
-    def got(self, request: Any) -> bytes:
-        """Values; not set where there is no such parameter."""
-        return types.GET_PARAMETERS.response(self._of_each(request.names, _value))
+    def get_parameters(self, request: Any) -> bytes:
+        """Return the requested values; the value of an unknown parameter is not set."""
+        values = [_encode_value(value) for value in self._read_values(request.names)]
+        return types.GET_PARAMETERS.encode_response(values)
 
-    def kinds(self, request: Any) -> bytes:
-        """Types of the values."""
-        found = self._of_each(request.names, _kind)
-        return types.GET_PARAMETER_TYPES.response(np.array(found, dtype=np.uint8))
+    def get_parameter_types(self, request: Any) -> bytes:
+        """Return the types of the requested values."""
+        kinds = [_find_type(value) for value in self._read_values(request.names)]
+        return types.GET_PARAMETER_TYPES.encode_response(np.array(kinds, dtype=np.uint8))
 
-    def described(self, request: Any) -> bytes:
-        """Meaning, unit, range."""
-        now = self._now()
-        found = [_descriptor(name, now.get(name)) for name in request.names]
-        return types.DESCRIBE_PARAMETERS.response(found)
+    def describe_parameters(self, request: Any) -> bytes:
+        """Return meaning, unit and range of the requested parameters."""
+        parameters = self._read_parameters()
+        descriptors = [_make_descriptor(name, parameters.get(name)) for name in request.names]
+        return types.DESCRIBE_PARAMETERS.encode_response(descriptors)
 
-    def set(self, request: Any) -> bytes:
-        """One after the other, each for itself."""
-        return types.SET_PARAMETERS.response([self._changed([one]) for one in request.parameters])
+    def set_parameters(self, request: Any) -> bytes:
+        """Set the parameters one after the other; each one succeeds or fails for itself."""
+        results = [self._set([parameter]) for parameter in request.parameters]
+        return types.SET_PARAMETERS.encode_response(results)
 
-    def set_at_once(self, request: Any) -> bytes:
-        """All or none."""
-        return types.SET_PARAMETERS_ATOMICALLY.response(self._changed(request.parameters))
+    def set_parameters_atomically(self, request: Any) -> bytes:
+        """Set all of the parameters or none of them."""
+        return types.SET_PARAMETERS_ATOMICALLY.encode_response(self._set(request.parameters))
 
-    def _now(self) -> dict[str, Parameter]:
-        """By name; none where no controller publishes any."""
+    def _read_parameters(self) -> dict[str, Parameter]:
+        """Return the controller's parameters by name; none if no controller publishes any."""
         try:
-            return {PREFIX + one.name: one for one in parameters_of(in_force(self._session))}
+            settings = in_force(self._session)
         except NotConnectedError:
             return {}
+        return {PREFIX + parameter.name: parameter for parameter in parameters_of(settings)}
 
-    def _of_each(self, names: Sequence[str], what: Callable[[Any], Any]) -> list[Any]:
-        now = self._now()
-        return [what(now[name].value if name in now else None) for name in names]
+    def _read_values(self, names: Sequence[str]) -> list[Any]:
+        """Return the value of each name; None for an unknown one."""
+        parameters = self._read_parameters()
+        values: list[Any] = []
+        for name in names:
+            if name in parameters:
+                values.append(parameters[name].value)
+            else:
+                values.append(None)
+        return values
 
-    def _changed(self, wanted: Sequence[Any]) -> Any:
-        done, why = told(lambda: self._change(wanted)) if self._operate else (False, NOT_ALLOWED)
-        return made("rcl_interfaces/msg/SetParametersResult", done, why)
+    def _set(self, parameters: Sequence[Any]) -> Any:
+        """Set parameters in one request to the controller, and return an rcl_interfaces/SetParametersResult."""
+        succeeded = False
+        reason = NOT_ALLOWED
+        if self._operate:
+            succeeded, reason = run_action(lambda: self._change(parameters))
+        return make_message("rcl_interfaces/msg/SetParametersResult", succeeded, reason)
 
-    def _change(self, wanted: Sequence[Any]) -> str:
-        change(self._session, {one.name: _python(one.value) for one in wanted}, WHO)
+    def _change(self, parameters: Sequence[Any]) -> str:
+        values = {parameter.name: _decode_value(parameter.value) for parameter in parameters}
+        change(self._session, values, REQUESTER)
         return ""
 
 
-def _below(name: str, prefix: str) -> bool:
+def _is_below(name: str, prefix: str) -> bool:
     return name == prefix or name.startswith(f"{prefix}.")
 
 
-def _kind(value: Any) -> int:
+def _find_type(value: Any) -> int:
+    """Return the rcl_interfaces/ParameterType of a value."""
+    if value is None:
+        return NOT_SET
     if isinstance(value, list):
-        return DOUBLES if all(isinstance(one, int | float) for one in value) else STRINGS
-    kinds = {bool: BOOL, int: INTEGER, float: DOUBLE, str: STRING}
-    return NOT_SET if value is None else kinds.get(type(value), STRING)
+        is_numeric = all(isinstance(element, int | float) for element in value)
+        if is_numeric:
+            return DOUBLES
+        return STRINGS
+    return _SCALAR_TYPES.get(type(value), STRING)
 
 
-def _value(value: Any) -> Any:
-    """As rcl_interfaces/ParameterValue; what ROS has no type for is a text of JSON."""
-    kind = _kind(value)
-    return made(
+def _encode_value(value: Any) -> Any:
+    """Return a value as rcl_interfaces/ParameterValue. A value without a type in ROS becomes a text of JSON."""
+    kind = _find_type(value)
+    fields: dict[int, Any] = {BOOL: False, INTEGER: 0, DOUBLE: 0.0, STRING: "", DOUBLES: [], STRINGS: []}
+    if kind == STRING:
+        fields[STRING] = in_text(value)
+    elif kind == STRINGS:
+        fields[STRINGS] = [in_text(element) for element in value]
+    elif kind != NOT_SET:
+        fields[kind] = value
+    return make_message(
         "rcl_interfaces/msg/ParameterValue",
         kind,
-        value if kind == BOOL else False,
-        value if kind == INTEGER else 0,
-        value if kind == DOUBLE else 0.0,
-        in_text(value) if kind == STRING else "",
-        *(np.array([], dtype=element) for element in (np.uint8, np.bool_, np.int64)),
-        np.array(value if kind == DOUBLES else [], dtype=np.float64),
-        [in_text(one) for one in value] if kind == STRINGS else [],
+        fields[BOOL],
+        fields[INTEGER],
+        fields[DOUBLE],
+        fields[STRING],
+        np.array([], dtype=np.uint8),  # byte array
+        np.array([], dtype=np.bool_),
+        np.array([], dtype=np.int64),
+        np.array(fields[DOUBLES], dtype=np.float64),
+        fields[STRINGS],
     )
 
 
-def _python(value: Any) -> Any:
-    """The value of a ParameterValue; None for a type that no parameter has."""
-    if value.type in _ARRAYS:
-        return getattr(value, _ARRAYS[value.type]).tolist()
+def _decode_value(value: Any) -> Any:
+    """Return the value of an rcl_interfaces/ParameterValue; None for a type that no parameter has."""
+    if value.type in _ARRAY_FIELDS:
+        return getattr(value, _ARRAY_FIELDS[value.type]).tolist()
     if value.type == STRINGS:
         return list(value.string_array_value)
-    return getattr(value, _FIELDS[value.type]) if value.type in _FIELDS else None
+    if value.type in _SCALAR_FIELDS:
+        return getattr(value, _SCALAR_FIELDS[value.type])
+    return None
 
 
-def _descriptor(name: str, of: Parameter | None) -> Any:
-    if of is None:
-        return made("rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], [])
-    kind = _kind(of.value)
-    low, high = (
-        -sys.float_info.max if of.least is None else of.least,
-        sys.float_info.max if of.most is None else of.most,
+def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
+    """Return an rcl_interfaces/ParameterDescriptor; an empty one for an unknown parameter."""
+    if parameter is None:
+        return make_message("rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], [])
+    kind = _find_type(parameter.value)
+    description = parameter.about
+    if parameter.unit not in ("", "1"):
+        description = f"{parameter.about} [{parameter.unit}]"
+    floating_point_ranges: list[Any] = []
+    has_limits = parameter.least is not None or parameter.most is not None
+    if kind == DOUBLE and has_limits:
+        floating_point_ranges.append(_make_range(parameter))
+    return make_message(
+        "rcl_interfaces/msg/ParameterDescriptor",
+        name,
+        kind,
+        description,
+        parameter.range,  # additional_constraints
+        False,  # read_only
+        False,  # dynamic_typing
+        floating_point_ranges,
+        [],  # integer_range
     )
-    ranged = kind == DOUBLE and (of.least, of.most) != (None, None)
-    ranges = [made("rcl_interfaces/msg/FloatingPointRange", low, high, 0.0)] if ranged else []
-    meaning = f"{of.about} [{of.unit}]" if of.unit not in ("", "1") else of.about
-    return made("rcl_interfaces/msg/ParameterDescriptor", name, kind, meaning, of.range, False, False, ranges, [])
+
+
+def _make_range(parameter: Parameter) -> Any:
+    """Return an rcl_interfaces/FloatingPointRange. It needs both limits, so a missing one becomes the largest float."""
+    lower = -sys.float_info.max
+    if parameter.least is not None:
+        lower = parameter.least
+    upper = sys.float_info.max
+    if parameter.most is not None:
+        upper = parameter.most
+    any_step = 0.0
+    return make_message("rcl_interfaces/msg/FloatingPointRange", lower, upper, any_step)

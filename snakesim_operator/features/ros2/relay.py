@@ -1,4 +1,4 @@
-"""The newest sample of a key, at a bounded rate; and what time it is in ROS."""
+"""Bounds the rate at which samples of the robot reach ROS, and converts robot time to the time of the ROS nodes."""
 
 import time
 from collections import deque
@@ -9,65 +9,111 @@ from snakesim_hal.network.session import Reader, Session
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Message
 
-WALL_SAMPLES = 256  # of the offset between robot time and the wall clock
-DEPTH = 4  # samples kept of a key: a few of noise do not displace the valid one
+CLOCK_OFFSETS_KEPT = 256  # a delayed clock message must not move the offset, so several seconds of clocks count
+SAMPLES_KEPT = 4  # some malformed samples must not displace the newest valid one
+
+
+def _always() -> bool:
+    return True
 
 
 class Relay(Generic[MessageT]):
-    """The newest sample of one key, passed on every so many turns of the bridge, while it is wanted."""
+    """Forwards samples of one key in every n-th cycle of the bridge, while ROS nodes want them.
+
+    The relay subscribes to the key only while the samples are wanted: an image that no ROS node reads does not
+    travel through the robot's network.
+    """
 
     def __init__(
         self,
         session: Session,
         key: str,
-        message: type[MessageT],
-        every: int,
-        pass_on: Callable[[MessageT], None],
-        wanted: Callable[[], bool] = lambda: True,
+        message_type: type[MessageT],
+        every_cycles: int,
+        forward: Callable[[MessageT], None],
+        is_wanted: Callable[[], bool] = _always,
         *,
-        each: bool = False,
+        forwards_all: bool = False,
     ) -> None:
-        """each: all samples since the last turn, of a key whose samples complete one another."""
-        self._each = each
-        self._session, self._key, self._message = session, key, message
-        self._every = every
-        self._pass_on, self._wanted = pass_on, wanted
-        self._reader: Reader[MessageT] | None = None
+        """Prepare the relay. It subscribes in its first poll.
 
-    def turn(self, number: int, fits: Callable[[Message], bool]) -> None:
-        """Pass on what has arrived, if it is due. number: of the bridge's turn."""
-        if number % self._every:
+        Args:
+            session: Session on the robot's network.
+            key: Key of the samples.
+            message_type: Their message type.
+            every_cycles: Number of bridge cycles from one forwarded sample to the next.
+            forward: Receives each forwarded sample.
+            is_wanted: Returns whether a ROS node reads the result at present.
+            forwards_all: Forward all samples since the last poll instead of the newest one, for a key whose samples
+                complete each other.
+        """
+        self._session = session
+        self._key = key
+        self._message_type = message_type
+        self._every_cycles = every_cycles
+        self._forward = forward
+        self._is_wanted = is_wanted
+        self._forwards_all = forwards_all
+        self._reader: Reader[MessageT] | None = None  # None while the samples are not wanted
+
+    def poll(self, cycle: int, is_valid: Callable[[Message], bool]) -> None:
+        """Forward what has arrived, if the relay is due in this cycle.
+
+        Args:
+            cycle: Number of the bridge's cycle.
+            is_valid: Returns whether a sample fits the robot; other samples are skipped.
+        """
+        if cycle % self._every_cycles != 0:
             return
-        if not self._wanted():
-            if self._reader is not None:
-                self._session.stop_reading(self._reader)
-                self._reader = None
+        if not self._is_wanted():
+            self._unsubscribe()
             return
         if self._reader is None:
-            depth = None if self._each else DEPTH
-            self._reader = self._session.reader(self._key, self._message, depth=depth)
-        if self._each:
-            for sample in filter(fits, self._reader.drain()):
-                self._pass_on(sample)
-        elif (newest := self._reader.newest(fits)) is not None:
-            self._pass_on(newest)
+            self._reader = self._subscribe()
+        if self._forwards_all:
+            for sample in self._reader.drain():
+                if is_valid(sample):
+                    self._forward(sample)
+        else:
+            newest = self._reader.newest(is_valid)
+            if newest is not None:
+                self._forward(newest)
+
+    def _subscribe(self) -> Reader[MessageT]:
+        depth: int | None = SAMPLES_KEPT
+        if self._forwards_all:
+            depth = None
+        return self._session.reader(self._key, self._message_type, depth=depth)
+
+    def _unsubscribe(self) -> None:
+        if self._reader is not None:
+            self._session.stop_reading(self._reader)
+            self._reader = None
 
 
 class RosTime:
-    """Robot time as the time of the ROS side."""
+    """Converts robot time to the time that ROS nodes use: robot time itself, or wall-clock time.
+
+    With wall-clock time, each arriving robot clock gives one offset: clock offset plus network latency. The smallest
+    of the last CLOCK_OFFSETS_KEPT offsets belongs to the fastest message and is used for all timestamps.
+    """
 
     def __init__(self, *, wall_time: bool) -> None:
         self.wall_time = wall_time
-        self._offsets_ns: deque[int] = deque(maxlen=WALL_SAMPLES)
+        self.newest_robot_ns = 0  # robot time of the newest clock
+        self._offsets_ns: deque[int] = deque(maxlen=CLOCK_OFFSETS_KEPT)
 
-    def heard(self, clock_ns: int) -> None:
-        """A robot clock has just arrived; the least offset of late is that of the quickest one."""
-        self._offsets_ns.append(time.time_ns() - clock_ns)
+    def add_clock(self, robot_ns: int) -> None:
+        """Take in the robot time of a clock message that has just arrived."""
+        self.newest_robot_ns = robot_ns
+        self._offsets_ns.append(time.time_ns() - robot_ns)
 
-    def start_over(self) -> None:
-        """The robot's time restarts."""
+    def reset(self) -> None:
+        """Forget the offsets, because robot time started over."""
         self._offsets_ns.clear()
 
-    def of(self, robot_ns: int) -> int:
-        """The stamp in ROS."""
-        return robot_ns + min(self._offsets_ns, default=0) if self.wall_time else robot_ns
+    def convert(self, robot_ns: int) -> int:
+        """Return the ROS timestamp in ns of a robot time in ns."""
+        if not self.wall_time:
+            return robot_ns
+        return robot_ns + min(self._offsets_ns, default=0)

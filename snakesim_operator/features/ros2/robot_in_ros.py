@@ -1,4 +1,4 @@
-"""What the robot says, as ROS messages: pure translation, with the frames of `frames.py`."""
+"""Translates messages of the robot into ROS messages in CDR. The names of frames come from `frames.py`."""
 
 import struct
 from collections.abc import Iterable
@@ -22,129 +22,221 @@ from snakesim_operator.base.png import png
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2.messages import Marker, Rgba, Triple
 
-METRES_PER_NEWTON = 0.01  # length of a force arrow
-ARROW_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of the head
-CONTACT: Rgba = (0.85, 0.2, 0.1, 1.0)
-FELT: Rgba = (0.9, 0.55, 0.1, 1.0)
-SEEN: Rgba = (0.3, 0.5, 0.75, 1.0)
-OK, WARN, ERROR = 0, 1, 2  # levels of a diagnostic status
-PLUMB_BOB = "plumb_bob"  # distortion model, here without distortion
-MILLIMETRE = 0.001
-MOST_COUNTS = 65535  # of 16 bits
+# How contacts and obstacles are drawn.
+ARROW_M_PER_N = 0.01  # length of a force arrow
+ARROW_SIZE_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of the head
+CONTACT_COLOR: Rgba = (0.85, 0.2, 0.1, 1.0)
+FELT_COLOR: Rgba = (0.9, 0.55, 0.1, 1.0)  # obstacles that the robot has touched
+SEEN_COLOR: Rgba = (0.3, 0.5, 0.75, 1.0)  # obstacles that its sensors have measured
+MIN_OPACITY = 0.2  # an obstacle of no confidence is still visible
+OPACITY_RANGE = 0.8
+
+# Levels of a diagnostic_msgs/DiagnosticStatus.
+OK = 0
+WARN = 1
+ERROR = 2
+
+# Images.
+PLUMB_BOB = "plumb_bob"  # distortion model; all its coefficients are 0 here
+MILLIMETER_M = 0.001
+MAX_DEPTH_COUNTS = 65535  # 16 bits
 INVERSE_DEPTH_UNUSED = struct.pack("<i2f", 0, 0.0, 0.0)  # format and two parameters, for depth in float alone
 
 
-def joint_state(timestamp_ns: int, names: list[str], joints: JointState) -> bytes:
-    """sensor_msgs/JointState, without a frame. Joints that are not valid are left out: it may name any subset."""
-    kept = [i for i, valid in enumerate(joints.valid) if valid]
-    series = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
-    numbers = (np.array([values[i] for i in kept], dtype=np.float64) for values in series)
-    return ros.sent(ros.JOINT_STATE, ros.header(timestamp_ns, ""), [names[i] for i in kept], *numbers)
+def encode_joint_state(timestamp_ns: int, names: list[str], joints: JointState) -> bytes:
+    """Return a sensor_msgs/JointState without a frame.
 
-
-def contact_markers(contacts: Iterable[WorldContact]) -> list[Marker]:
-    """An arrow for the force on the body at each contact."""
-    return [
-        Marker("contacts", ros.ARROW, ARROW_M, CONTACT, points_m=(contact.position_w, _tip(contact)))
-        for contact in contacts
-    ]
-
-
-def _tip(contact: WorldContact) -> Triple:
-    (x, y, z), (fx, fy, fz) = contact.position_w, contact.force_w
-    return (x + METRES_PER_NEWTON * fx, y + METRES_PER_NEWTON * fy, z + METRES_PER_NEWTON * fz)
-
-
-def obstacle_markers(world: World) -> list[Marker]:
-    """The obstacles that guidance knows; opaque ones are certain, those felt are orange."""
-    return [_obstacle(one) for one in world.obstacles]
-
-
-def _obstacle(one: Obstacle) -> Marker:
-    across = 2 * one.radius_m
-    shape, size = {
-        "cylinder": (ros.CYLINDER, (across, across, one.height_m)),
-        "sphere": (ros.SPHERE, (across, across, across)),
-        "box": (ros.CUBE, (2 * one.half_size_m[0], 2 * one.half_size_m[1], 2 * one.half_size_m[2])),
-    }[one.shape]
-    turned = (float(np.cos(one.yaw_rad / 2)), 0.0, 0.0, float(np.sin(one.yaw_rad / 2)))
-    red, green, blue, _ = FELT if one.felt else SEEN
-    opacity = 0.2 + 0.8 * one.confidence
-    return Marker("obstacles", shape, size, (red, green, blue, opacity), one.position_w, turned)
-
-
-def depth_image(timestamp_ns: int, frame: str, seen: DepthImage) -> bytes:
-    """16UC1 in millimetres, 0 for nothing; of another scale 32FC1 in metres, NaN for nothing (REP 118)."""
-    if seen.scale_m == MILLIMETRE:
-        return ros.image(timestamp_ns, frame, seen.width, seen.height, "16UC1", seen.depth)
-    counts = np.frombuffer(seen.depth, dtype="<u2")
-    metres = np.where(counts == 0, np.nan, counts * seen.scale_m).astype("<f4")
-    return ros.image(timestamp_ns, frame, seen.width, seen.height, "32FC1", metres.tobytes())
-
-
-def color_image(timestamp_ns: int, frame: str, seen: ColorImage) -> bytes:
-    """As rgb8."""
-    return ros.image(timestamp_ns, frame, seen.width, seen.height, "rgb8", seen.rgb)
-
-
-def compressed_depth(timestamp_ns: int, frame: str, seen: DepthImage) -> bytes:
-    """As a PNG of 16 bits in millimetres, 0 for nothing, behind 12 bytes of parameters that its reader skips."""
-    millimetres = np.frombuffer(seen.depth, dtype="<u2") * (seen.scale_m / MILLIMETRE)
-    counts = np.where(millimetres > MOST_COUNTS, 0, np.rint(millimetres)).astype(">u2")
-    picture = png(seen.width, seen.height, counts.tobytes(), bits=16, color=False)
-    return ros.compressed_image(timestamp_ns, frame, "16UC1; compressedDepth png", INVERSE_DEPTH_UNUSED + picture)
-
-
-def compressed_color(timestamp_ns: int, frame: str, seen: ColorImage) -> bytes:
-    """As a PNG of 8 bits, without loss. OpenCV reads it as bgr8, which `format` says."""
-    picture = png(seen.width, seen.height, seen.rgb, bits=8, color=True)
-    return ros.compressed_image(timestamp_ns, frame, "rgb8; png compressed bgr8", picture)
-
-
-def imu(timestamp_ns: int, frame: str, seen: Imu, entry: int) -> bytes:
-    """sensor_msgs/Imu of one link; acceleration is the specific force, as REP 145 wants it.
-
-    Without orientation, which its covariance of -1 says; covariances of 0: unknown.
+    Joints whose state is not valid are left out, because a JointState may name any subset of the joints.
     """
-    unknown, no_orientation = np.zeros(9), np.array([-1.0, *[0.0] * 8])
-    turn, push = ros.vector(seen.angular_velocity_rad_s[entry]), ros.vector(seen.acceleration_m_s2[entry])
-    unturned = ros.quaternion((1.0, 0.0, 0.0, 0.0))
-    return ros.sent(ros.IMU, ros.header(timestamp_ns, frame), unturned, no_orientation, turn, unknown, push, unknown)
+    valid_joints = [i for i, is_valid in enumerate(joints.valid) if is_valid]
+    valid_names = [names[i] for i in valid_joints]
+    angles_rad = [joints.angle_rad[i] for i in valid_joints]
+    velocities_rad_s = [joints.velocity_rad_s[i] for i in valid_joints]
+    torques_nm = [joints.torque_nm[i] for i in valid_joints]
+    return ros.encode_message(
+        ros.JOINT_STATE,
+        ros.make_header(timestamp_ns, ""),
+        valid_names,
+        np.array(angles_rad, dtype=np.float64),
+        np.array(velocities_rad_s, dtype=np.float64),
+        np.array(torques_nm, dtype=np.float64),
+    )
 
 
-def camera_info(timestamp_ns: int, frame: str, seen: DepthImage | ColorImage) -> bytes:
-    """sensor_msgs/CameraInfo of either image, of a camera without distortion."""
-    matrix = np.array([[seen.fx_px, 0.0, seen.cx_px], [0.0, seen.fy_px, seen.cy_px], [0.0, 0.0, 1.0]])
-    projection = np.hstack([matrix, np.zeros((3, 1))])
-    whole = ros.made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    numbers = (np.zeros(5), matrix.ravel(), np.eye(3).ravel(), projection.ravel())
-    size = (seen.height, seen.width, PLUMB_BOB)
-    return ros.sent(ros.CAMERA_INFO, ros.header(timestamp_ns, frame), *size, *numbers, 0, 0, whole)
+def make_contact_markers(contacts: Iterable[WorldContact]) -> list[Marker]:
+    """Return an arrow for the force on the body at each contact."""
+    markers: list[Marker] = []
+    for contact in contacts:
+        points = (contact.position_w, _find_arrow_tip(contact))
+        markers.append(Marker("contacts", ros.ARROW, ARROW_SIZE_M, CONTACT_COLOR, points_m=points))
+    return markers
 
 
-def laser_scan(timestamp_ns: int, frame: str, seen: Ranges) -> bytes:
-    """sensor_msgs/LaserScan, all beams at one instant. Those without a return are infinite (REP 117)."""
-    beams = np.array([np.inf if range_m is None else range_m for range_m in seen.range_m], dtype=np.float32)
-    last_rad = seen.angle_min_rad + seen.angle_step_rad * (len(beams) - 1)
-    angles, limits = (seen.angle_min_rad, last_rad, seen.angle_step_rad), (seen.range_min_m, seen.range_max_m)
-    no_intensities = np.array([], dtype=np.float32)
-    header = ros.header(timestamp_ns, frame)
-    return ros.sent(ros.LASER_SCAN, header, *angles, 0.0, 0.0, *limits, beams, no_intensities)
+def _find_arrow_tip(contact: WorldContact) -> Triple:
+    x, y, z = contact.position_w
+    fx, fy, fz = contact.force_w
+    return (x + ARROW_M_PER_N * fx, y + ARROW_M_PER_N * fy, z + ARROW_M_PER_N * fz)
 
 
-def numbers(kind: OwnKind, field: str, _timestamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
-    """std_msgs/Float64MultiArray of one field of a sensor's own message, of one dimension with its name and unit."""
-    found = [value for name, value in kind.numbers(sample).items() if name.partition(".")[0] == field]
+def make_obstacle_markers(world: World) -> list[Marker]:
+    """Return the obstacles of the world model: opaque if they are certain, orange if they were touched."""
+    return [_make_obstacle_marker(obstacle) for obstacle in world.obstacles]
+
+
+def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
+    diameter_m = 2 * obstacle.radius_m
+    match obstacle.shape:
+        case "cylinder":
+            shape = ros.CYLINDER
+            size_m = (diameter_m, diameter_m, obstacle.height_m)
+        case "sphere":
+            shape = ros.SPHERE
+            size_m = (diameter_m, diameter_m, diameter_m)
+        case "box":
+            half_x_m, half_y_m, half_z_m = obstacle.half_size_m
+            shape = ros.CUBE
+            size_m = (2 * half_x_m, 2 * half_y_m, 2 * half_z_m)
+    half_yaw_rad = obstacle.yaw_rad / 2
+    orientation_wxyz = (float(np.cos(half_yaw_rad)), 0.0, 0.0, float(np.sin(half_yaw_rad)))
+    color = SEEN_COLOR
+    if obstacle.felt:
+        color = FELT_COLOR
+    red, green, blue, _ = color
+    opacity = MIN_OPACITY + OPACITY_RANGE * obstacle.confidence
+    rgba = (red, green, blue, opacity)
+    return Marker("obstacles", shape, size_m, rgba, obstacle.position_w, orientation_wxyz)
+
+
+def encode_depth_image(timestamp_ns: int, frame: str, image: DepthImage) -> bytes:
+    """Return a sensor_msgs/Image of depth (REP 118).
+
+    An image in millimeters is passed on as 16UC1, where 0 means no return. An image of another scale becomes 32FC1 in
+    meters, where NaN means no return.
+    """
+    if image.scale_m == MILLIMETER_M:
+        encoding = "16UC1"
+        pixels = image.depth
+    else:
+        encoding = "32FC1"
+        counts = np.frombuffer(image.depth, dtype="<u2")
+        depth_m = np.where(counts == 0, np.nan, counts * image.scale_m)
+        pixels = depth_m.astype("<f4").tobytes()
+    return ros.encode_image(timestamp_ns, frame, image.width, image.height, encoding, pixels)
+
+
+def encode_color_image(timestamp_ns: int, frame: str, image: ColorImage) -> bytes:
+    """Return a sensor_msgs/Image in rgb8."""
+    return ros.encode_image(timestamp_ns, frame, image.width, image.height, "rgb8", image.rgb)
+
+
+def encode_compressed_depth(timestamp_ns: int, frame: str, image: DepthImage) -> bytes:
+    """Return a sensor_msgs/CompressedImage with a 16 bit PNG in millimeters, where 0 means no return.
+
+    In front of the PNG are 12 bytes of parameters, which the reader skips for integer images.
+    """
+    depth_mm = np.frombuffer(image.depth, dtype="<u2") * (image.scale_m / MILLIMETER_M)
+    counts = np.where(depth_mm > MAX_DEPTH_COUNTS, 0, np.rint(depth_mm)).astype(">u2")
+    picture = png(image.width, image.height, counts.tobytes(), bits=16, color=False)
+    data = INVERSE_DEPTH_UNUSED + picture
+    return ros.encode_compressed_image(timestamp_ns, frame, "16UC1; compressedDepth png", data)
+
+
+def encode_compressed_color(timestamp_ns: int, frame: str, image: ColorImage) -> bytes:
+    """Return a sensor_msgs/CompressedImage with a lossless 8 bit PNG. OpenCV reads it as bgr8, as its format states."""
+    picture = png(image.width, image.height, image.rgb, bits=8, color=True)
+    return ros.encode_compressed_image(timestamp_ns, frame, "rgb8; png compressed bgr8", picture)
+
+
+def encode_imu(timestamp_ns: int, frame: str, sample: Imu, entry: int) -> bytes:
+    """Return a sensor_msgs/Imu of one link; its acceleration is the specific force (REP 145).
+
+    Args:
+        timestamp_ns: Time of the sample.
+        frame: Frame of the IMU.
+        sample: Measurements of all IMUs of the robot.
+        entry: Index of this IMU within the sample.
+    """
+    unknown_covariance = np.zeros(9)
+    no_orientation = np.array([-1.0, *[0.0] * 8])  # a covariance of -1: this IMU measures no orientation
+    return ros.encode_message(
+        ros.IMU,
+        ros.make_header(timestamp_ns, frame),
+        ros.make_quaternion((1.0, 0.0, 0.0, 0.0)),
+        no_orientation,
+        ros.make_vector(sample.angular_velocity_rad_s[entry]),
+        unknown_covariance,
+        ros.make_vector(sample.acceleration_m_s2[entry]),
+        unknown_covariance,
+    )
+
+
+def encode_camera_info(timestamp_ns: int, frame: str, image: DepthImage | ColorImage) -> bytes:
+    """Return the sensor_msgs/CameraInfo of a depth or color image, of a camera without distortion."""
+    intrinsics = np.array(
+        [
+            [image.fx_px, 0.0, image.cx_px],
+            [0.0, image.fy_px, image.cy_px],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    projection = np.hstack([intrinsics, np.zeros((3, 1))])
+    no_binning = 0
+    whole_image = ros.make_message("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    return ros.encode_message(
+        ros.CAMERA_INFO,
+        ros.make_header(timestamp_ns, frame),
+        image.height,
+        image.width,
+        PLUMB_BOB,
+        np.zeros(5),  # D: distortion
+        intrinsics.ravel(),  # K
+        np.eye(3).ravel(),  # R: rectification
+        projection.ravel(),  # P
+        no_binning,
+        no_binning,
+        whole_image,
+    )
+
+
+def encode_laser_scan(timestamp_ns: int, frame: str, scan: Ranges) -> bytes:
+    """Return a sensor_msgs/LaserScan with all beams at one instant. Beams without a return are infinite (REP 117)."""
+    ranges_m = [np.inf if range_m is None else range_m for range_m in scan.range_m]
+    angle_max_rad = scan.angle_min_rad + scan.angle_step_rad * (len(ranges_m) - 1)
+    return ros.encode_message(
+        ros.LASER_SCAN,
+        ros.make_header(timestamp_ns, frame),
+        scan.angle_min_rad,
+        angle_max_rad,
+        scan.angle_step_rad,
+        0.0,  # time from beam to beam
+        0.0,  # time from scan to scan: not stated
+        scan.range_min_m,
+        scan.range_max_m,
+        np.array(ranges_m, dtype=np.float32),
+        np.array([], dtype=np.float32),  # intensities
+    )
+
+
+def encode_numbers(kind: OwnKind, field: str, _timestamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
+    """Return a std_msgs/Float64MultiArray with one field of a custom sensor's sample.
+
+    The array has one dimension, labeled with the field's name and unit. This type has neither timestamp nor frame.
+    """
+    values: list[float] = []
+    for name, value in kind.numbers(sample).items():
+        field_name, _, _ = name.partition(".")
+        if field_name == field:
+            values.append(value)
     label = f"{field} [{kind.units[field]}]"
-    dimension = ros.made("std_msgs/msg/MultiArrayDimension", label, len(found), len(found))
-    layout = ros.made("std_msgs/msg/MultiArrayLayout", [dimension], 0)
-    return ros.sent(ros.NUMBERS, layout, np.array(found, dtype=np.float64))
+    size = len(values)
+    stride = len(values)
+    dimension = ros.make_message("std_msgs/msg/MultiArrayDimension", label, size, stride)
+    layout = ros.make_message("std_msgs/msg/MultiArrayLayout", [dimension], 0)
+    return ros.encode_message(ros.NUMBERS, layout, np.array(values, dtype=np.float64))
 
 
-def diagnostics(timestamp_ns: int, status: Status) -> bytes:
-    """diagnostic_msgs/DiagnosticArray with one status: the robot's state and its reason."""
-    stopped = status.lifecycle in ("fault", "estop")
-    level = ERROR if stopped else WARN if status.faults or status.isolated or status.derated else OK
+def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:
+    """Return a diagnostic_msgs/DiagnosticArray with one entry: the robot's state, its reason and its faults."""
     values = {
         "lifecycle": status.lifecycle,
         "backend": status.backend,
@@ -152,9 +244,20 @@ def diagnostics(timestamp_ns: int, status: Status) -> bytes:
         "rate_hz": f"{status.rate_hz:g}",
         "overruns": str(status.overruns),
         "isolated joints": ", ".join(status.isolated) or "none",
-        **{f"fault {i}": f"{fault.what}: {fault.cause}" for i, fault in enumerate(status.faults)},
     }
-    pairs = [ros.made("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
-    words = f"{status.lifecycle}: {status.why}"
-    said = ros.made("diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, words, status.robot, pairs)
-    return ros.sent(ros.DIAGNOSTICS, ros.header(timestamp_ns, ""), [said])
+    for i, fault in enumerate(status.faults):
+        values[f"fault {i}"] = f"{fault.what}: {fault.cause}"
+    pairs = [ros.make_message("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+    level = _find_diagnostic_level(status)
+    summary = f"{status.lifecycle}: {status.why}"
+    hardware_id = status.robot
+    entry = ros.make_message("diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, summary, hardware_id, pairs)
+    return ros.encode_message(ros.DIAGNOSTICS, ros.make_header(timestamp_ns, ""), [entry])
+
+
+def _find_diagnostic_level(status: Status) -> int:
+    if status.lifecycle in ("fault", "estop"):
+        return ERROR
+    if status.faults or status.isolated or status.derated:
+        return WARN
+    return OK

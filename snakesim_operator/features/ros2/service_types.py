@@ -1,7 +1,7 @@
-"""The ROS services that the bridge answers: their definitions, the hashes of their types, and CDR both ways.
+"""Defines the ROS services that the bridge answers: definitions, type hashes, and CDR both ways.
 
-rosbags knows messages alone. A service is a type with a request, a response and an event (REP 2016), so it is
-registered as messages of those names; a test compares the hashes with ones that ROS itself has printed.
+rosbags knows only messages. A service is a type with a request, a response and an event (REP 2016), so it is
+registered as messages of those names. A test compares the hashes with hashes that ROS itself has printed.
 """
 
 from dataclasses import dataclass
@@ -11,77 +11,95 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_msg
 
 from snakesim_operator.features.ros2.graph import RosType
-from snakesim_operator.features.ros2.messages import STORE, made
+from snakesim_operator.features.ros2.messages import STORE, make_message
 
+# ROS turns char into uint8 before it hashes a definition, and rosbags does not. So the definition says uint8.
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
-# ROS makes uint8 of char before it hashes a definition, and rosbags does not.
-_EVENT_INFO_HASHED = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
-STORE.fielddefs[_EVENT_INFO] = get_types_from_msg(_EVENT_INFO_HASHED, _EVENT_INFO)[_EVENT_INFO]
+_EVENT_INFO_FIELDS = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
+STORE.fielddefs[_EVENT_INFO] = get_types_from_msg(_EVENT_INFO_FIELDS, _EVENT_INFO)[_EVENT_INFO]
 
 EMPTY = "uint8 structure_needs_at_least_one_member"  # what ROS puts into a message without fields
 _PARAMETER_VALUES = "rcl_interfaces/msg/ParameterValue[] values"
 
 
 @dataclass(frozen=True)
-class Service:
-    """A type of service."""
+class RosService:
+    """A type of service: it decodes requests and encodes responses."""
 
     type: RosType
 
-    def request(self, payload: bytes) -> Any | None:
-        """What is asked for; None: it is no such request."""
+    def decode_request(self, payload: bytes) -> Any | None:
+        """Return a request, or None if the payload is none of this type."""
         try:
             return STORE.deserialize_cdr(payload, f"{self.type.name}_Request")
         except SerdeError:
             return None
 
-    def response(self, *fields: Any) -> bytes:
-        """An answer, in CDR."""
+    def encode_response(self, *fields: Any) -> bytes:
+        """Return a response in CDR, given its fields in the order of their definition."""
         name = f"{self.type.name}_Response"
-        return bytes(STORE.serialize_cdr(made(name, *fields), name))
+        response = make_message(name, *fields)
+        return bytes(STORE.serialize_cdr(response, name))
 
 
-def service(name: str, request: str, response: str) -> Service:
-    """A service by its definition. name: such as std_srvs/srv/Trigger."""
+def define_service(name: str, request: str, response: str) -> RosService:
+    """Register a service type.
+
+    Args:
+        name: Its name, such as std_srvs/srv/Trigger.
+        request: Definition of the request's fields.
+        response: Definition of the response's fields.
+    """
     event = f"{_EVENT_INFO} info\n{name}_Request[<=1] request\n{name}_Response[<=1] response"
-    whole = f"{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message"
-    defined: dict[str, Any] = {}
-    for text, suffix in ((request, "_Request"), (response, "_Response"), (event, "_Event"), (whole, "")):
-        defined |= _as_services(get_types_from_msg(text, f"{name}{suffix}"))
-    STORE.register(defined)
-    return Service(RosType(name, STORE.hash_rihs01(name)))
+    service = f"{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message"
+    definitions = {
+        f"{name}_Request": request,
+        f"{name}_Response": response,
+        f"{name}_Event": event,
+        name: service,
+    }
+    types: dict[str, Any] = {}
+    for type_name, fields in definitions.items():
+        types |= _restore_service_names(get_types_from_msg(fields, type_name))
+    STORE.register(types)
+    return RosService(RosType(name, STORE.hash_rihs01(name)))
 
 
-def _as_services(part: Any) -> Any:
-    """Undo rosbags' renaming of every type into a message."""
-    if isinstance(part, str):
-        return part.replace("/srv/msg/", "/srv/")
-    if isinstance(part, dict):
-        return {_as_services(key): _as_services(value) for key, value in part.items()}
-    return type(part)(map(_as_services, part)) if isinstance(part, tuple | list) else part
+def _restore_service_names(definition: Any) -> Any:
+    """Undo, in a nested definition, the renaming of service types into message types that rosbags does."""
+    if isinstance(definition, str):
+        return definition.replace("/srv/msg/", "/srv/")
+    if isinstance(definition, dict):
+        restored: dict[Any, Any] = {}
+        for key, value in definition.items():
+            restored[_restore_service_names(key)] = _restore_service_names(value)
+        return restored
+    if isinstance(definition, tuple | list):
+        return type(definition)(map(_restore_service_names, definition))
+    return definition
 
 
-def _of_parameters(name: str, request: str, response: str) -> Service:
-    return service(f"rcl_interfaces/srv/{name}", request, response)
+def _define_parameter_service(name: str, request: str, response: str) -> RosService:
+    return define_service(f"rcl_interfaces/srv/{name}", request, response)
 
 
-TRIGGER = service("std_srvs/srv/Trigger", EMPTY, "bool success\nstring message")
-LIST_PARAMETERS = _of_parameters(
+TRIGGER = define_service("std_srvs/srv/Trigger", EMPTY, "bool success\nstring message")
+LIST_PARAMETERS = _define_parameter_service(
     "ListParameters",
     "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth",
     "rcl_interfaces/msg/ListParametersResult result",
 )
-GET_PARAMETERS = _of_parameters("GetParameters", "string[] names", _PARAMETER_VALUES)
-GET_PARAMETER_TYPES = _of_parameters("GetParameterTypes", "string[] names", "uint8[] types")
-DESCRIBE_PARAMETERS = _of_parameters(
+GET_PARAMETERS = _define_parameter_service("GetParameters", "string[] names", _PARAMETER_VALUES)
+GET_PARAMETER_TYPES = _define_parameter_service("GetParameterTypes", "string[] names", "uint8[] types")
+DESCRIBE_PARAMETERS = _define_parameter_service(
     "DescribeParameters", "string[] names", "rcl_interfaces/msg/ParameterDescriptor[] descriptors"
 )
-SET_PARAMETERS = _of_parameters(
+SET_PARAMETERS = _define_parameter_service(
     "SetParameters",
     "rcl_interfaces/msg/Parameter[] parameters",
     "rcl_interfaces/msg/SetParametersResult[] results",
 )
-SET_PARAMETERS_ATOMICALLY = _of_parameters(
+SET_PARAMETERS_ATOMICALLY = _define_parameter_service(
     "SetParametersAtomically",
     "rcl_interfaces/msg/Parameter[] parameters",
     "rcl_interfaces/msg/SetParametersResult result",

@@ -1,34 +1,81 @@
-"""From geometry_msgs/Twist on /cmd_vel to intents. Pure except for its own state.
+"""Turns geometry_msgs/Twist on /cmd_vel into intents of the robot.
 
-`linear.x` is the speed along the body, `angular.z` turns the wanted direction of travel; a Twist with neither stops the
-robot. Every Twist becomes one intent of short validity, from when it was sent on. So a ROS side that falls silent stops
-the robot, and one that was held back moves nothing.
+`linear.x` is the speed along the body, `angular.z` rotates the desired direction of travel; a Twist with a speed of 0
+stops the robot. Every Twist becomes one intent that is valid for VALID_NS from when the Twist was sent. So the robot
+stops if the ROS node falls silent, and a Twist that the network held back moves nothing.
 """
 
 import math
+import time
+from collections.abc import Callable
 
+from snakesim_hal.base.terminal import Say
+from snakesim_hal.network.foreign_network import RawReader
+from snakesim_hal.network.session import Session
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Intent
-from snakesim_operator.features.ros2.message_age import why_too_old
-from snakesim_operator.features.ros2.messages import six_doubles
+from snakesim_operator.features.ros2.message_age import SenderClocks, explain_age_refusal
+from snakesim_operator.features.ros2.messages import decode_twist
 
 VALID_NS = 500_000_000  # of an intent in robot time; teleop_twist_keyboard and joysticks repeat at 10 Hz and more
-FASTEST_M_S = 10.0  # as navigation's limit of an intent
-QUICKEST_RAD_S = 10.0
-LEAD_RAD = math.pi / 2  # the wanted direction runs ahead of the body by at most this
-WHO = "ros2 /cmd_vel"
+MAX_SPEED_M_S = 10.0  # the limit that navigation sets for an intent
+MAX_TURN_RATE_RAD_S = 10.0
+MAX_LEAD_RAD = math.pi / 2  # beyond this, "ahead of the body" becomes ambiguous
+REQUESTER = "ros2 /cmd_vel"
 
 
-class Steering:
-    """The direction of travel that /cmd_vel has asked for so far."""
+class CmdVelInput:
+    """Reads the newest Twist of a ROS topic in each cycle and publishes the intent that it stands for."""
+
+    def __init__(self, twists: RawReader, session: Session, say: Say) -> None:
+        """Prepare to read the topic and to publish intents.
+
+        Args:
+            twists: Messages of the ROS topic.
+            session: Session on the robot's network, where the intents are published.
+            say: Reports dropped messages to the user.
+        """
+        self._twists = twists
+        self._intents = session.publisher(keys.INTENT, Intent)
+        self._say = say
+        self._steering = CmdVelSteering()
+        self._senders = SenderClocks()
+        self._reported_reason = ""  # the last reason for dropping that the user has seen
+
+    def poll(self, robot_ns: int | None, find_heading: Callable[[], float | None]) -> None:
+        """Publish an intent for the newest Twist, if one has arrived.
+
+        Args:
+            robot_ns: Robot time. None while the robot is silent; then the Twist is dropped, because an intent needs
+                a time.
+            find_heading: Returns the heading of the body in the world in rad; None if it is unknown.
+        """
+        twist = self._twists.newest()
+        if twist is None or robot_ns is None:
+            return
+        wall_ns = time.time_ns()
+        monotonic_ns = time.monotonic_ns()
+        age_ns = self._senders.measure_age(twist, wall_ns, monotonic_ns)
+        body_w_rad = find_heading()
+        intent = self._steering.make_intent(twist.payload, robot_ns, body_w_rad, age_ns)
+        if intent is not None:
+            self._intents.put(intent)
+        elif self._steering.reason != self._reported_reason:
+            self._reported_reason = self._steering.reason
+            self._say(f"a message on cmd_vel {self._reported_reason}; it is dropped, with all that are alike")
+
+
+class CmdVelSteering:
+    """Integrates the turn rates of successive Twists into a desired direction of travel."""
 
     def __init__(self) -> None:
-        self._heading_w_rad: float | None = None
-        self._last_ns: int | None = None
-        self.rejected = 0  # Twists that were malformed, not finite, out of bounds, or too old
-        self.why = ""  # the newest one was
+        self._heading_w_rad: float | None = None  # desired direction of travel
+        self._last_ns: int | None = None  # robot time of the last accepted Twist
+        self.rejected = 0  # Twists that were malformed, not finite, out of bounds or too old
+        self.reason = ""  # for the newest rejection
 
-    def intent(self, payload: bytes, now_ns: int, body_w_rad: float | None, age_ns: int = 0) -> Intent | None:
-        """Return what a Twist asks for; None: it is rejected, and counted.
+    def make_intent(self, payload: bytes, now_ns: int, body_w_rad: float | None, age_ns: int = 0) -> Intent | None:
+        """Return the intent that a Twist stands for, or None for a Twist that is rejected and counted.
 
         Args:
             payload: The Twist in CDR.
@@ -36,44 +83,50 @@ class Steering:
             body_w_rad: Heading of the body in the world; None while it is unknown.
             age_ns: How long ago the Twist was sent.
         """
-        numbers = six_doubles(payload)
-        why = _why_rejected(numbers)
-        stops = numbers is not None and numbers[0] == 0.0
-        if stops:
-            age_ns = 0  # a stop counts however late it comes
-        why = why or why_too_old(age_ns, "the times of its sender's messages")
-        if why or numbers is None:
-            self.rejected, self.why = self.rejected + 1, why
+        components = decode_twist(payload)
+        reason = _explain_refusal(components)
+        is_stop = components is not None and components[0] == 0.0
+        if is_stop:
+            age_ns = 0  # a stop is obeyed however late it arrives
+        if not reason:
+            reason = explain_age_refusal(age_ns, "the times of its sender's messages")
+        if reason or components is None:
+            self.rejected += 1
+            self.reason = reason
             return None
-        speed_m_s, turn_rad_s = numbers[0], numbers[5]
-        self._turn(turn_rad_s, now_ns, body_w_rad)
+        speed_m_s = components[0]
+        turn_rate_rad_s = components[5]
+        self._update_heading(turn_rate_rad_s, now_ns, body_w_rad)
         return Intent(
             timestamp_ns=max(now_ns - age_ns, 0),
-            who=WHO,
+            who=REQUESTER,
             speed_m_s=speed_m_s,
             go=speed_m_s != 0.0,
             valid_for_ns=VALID_NS,
             heading_w_rad=self._heading_w_rad,
         )
 
-    def _turn(self, turn_rad_s: float, now_ns: int, body_w_rad: float | None) -> None:
-        """Turn the wanted direction for the time since the last Twist; again from the body's after a silence."""
-        since_ns = VALID_NS + 1 if self._last_ns is None else now_ns - self._last_ns
+    def _update_heading(self, turn_rate_rad_s: float, now_ns: int, body_w_rad: float | None) -> None:
+        """Rotate the desired direction for the time since the last Twist; after a silence, start at the body's."""
+        since_ns = VALID_NS + 1  # before the first Twist: as after a silence
+        if self._last_ns is not None:
+            since_ns = now_ns - self._last_ns
         self._last_ns = now_ns
-        if self._heading_w_rad is None or not 0 <= since_ns <= VALID_NS:
+        was_silent = not 0 <= since_ns <= VALID_NS
+        if self._heading_w_rad is None or was_silent:
             self._heading_w_rad = body_w_rad
         elif body_w_rad is not None:
-            ahead = self._heading_w_rad + turn_rad_s * since_ns * 1e-9 - body_w_rad
-            ahead = math.remainder(ahead, 2 * math.pi)
-            self._heading_w_rad = body_w_rad + min(max(ahead, -LEAD_RAD), LEAD_RAD)
+            lead_rad = self._heading_w_rad + turn_rate_rad_s * since_ns * 1e-9 - body_w_rad
+            lead_rad = math.remainder(lead_rad, 2 * math.pi)
+            self._heading_w_rad = body_w_rad + min(max(lead_rad, -MAX_LEAD_RAD), MAX_LEAD_RAD)
 
 
-def _why_rejected(numbers: tuple[float, ...] | None) -> str:
-    """Return what is wrong with the numbers of a Twist; empty when nothing is."""
-    if numbers is None:
+def _explain_refusal(components: tuple[float, ...] | None) -> str:
+    """Return what is wrong with the components of a Twist; empty if they are acceptable."""
+    if components is None:
         return "is no geometry_msgs/Twist"
-    if not all(map(math.isfinite, numbers)):
+    if not all(map(math.isfinite, components)):
         return "has numbers that are not finite"
-    if abs(numbers[0]) > FASTEST_M_S or abs(numbers[5]) > QUICKEST_RAD_S:
-        return f"asks for more than {FASTEST_M_S:g} m/s or {QUICKEST_RAD_S:g} rad/s"
+    if abs(components[0]) > MAX_SPEED_M_S or abs(components[5]) > MAX_TURN_RATE_RAD_S:
+        return f"asks for more than {MAX_SPEED_M_S:g} m/s or {MAX_TURN_RATE_RAD_S:g} rad/s"
     return ""

@@ -1,7 +1,7 @@
-"""URDF of a robot from its description on the network: links as capsules, joints with axes and limits.
+"""Makes the URDF of a robot from its description on the network: links as capsules, joints with axes and limits.
 
-It is what RViz draws and what planners read. The robot file, which knows meshes, sensors, inertia and friction, may be
-on another machine; a comment in the document says what is missing.
+RViz draws the robot from it, and planners read it. The robot file, which knows meshes, sensors, inertia and friction,
+may be on another computer; a comment in the document says what is missing.
 """
 
 import math
@@ -16,57 +16,84 @@ LOSSES = (
 )
 
 
-def urdf_of(robot: Description, prefix: str = "") -> str:
-    """The document. prefix: before the names of links, as in the frames."""
+def make_urdf(robot: Description, prefix: str = "") -> str:
+    """Return the URDF document.
+
+    Args:
+        robot: Description of the robot, with one link more than joints.
+        prefix: Text before the names of links, the same as in the frames.
+    """
     root = ElementTree.Element("robot", name=robot.robot)
     root.append(ElementTree.Comment(LOSSES))
-    ElementTree.SubElement(root, "link", name=f"{prefix}base_link")
-    _joint(root, "base", "fixed", f"{prefix}base_link", prefix + robot.links[0].name, 0.0)
+    base = f"{prefix}base_link"
+    ElementTree.SubElement(root, "link", name=base)
+    _add_joint(root, "base", "fixed", base, prefix + robot.links[0].name, 0.0)
     for link in robot.links:
-        _link(root, link, prefix)
-    for behind, joint, ahead in zip(robot.links[:-1], robot.joints, robot.links[1:], strict=True):
-        made = _joint(root, joint.name, "revolute", prefix + behind.name, prefix + ahead.name, behind.length_m)
-        _limits(made, joint)
+        _add_link(root, link, prefix)
+    rear_links = robot.links[:-1]
+    front_links = robot.links[1:]
+    for rear, joint, front in zip(rear_links, robot.joints, front_links, strict=True):
+        element = _add_joint(root, joint.name, "revolute", prefix + rear.name, prefix + front.name, rear.length_m)
+        _add_limits(element, joint)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
 
 
-def _link(root: ElementTree.Element, link: LinkDescription, prefix: str) -> None:
-    """A link with the inertia of a solid cylinder, drawn and collided with as a capsule."""
-    made = ElementTree.SubElement(root, "link", name=prefix + link.name)
-    middle, along_x = f"{link.length_m / 2:.9g} 0 0", f"0 {math.pi / 2:.9g} 0"
-    inertial = ElementTree.SubElement(made, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=middle)
-    ElementTree.SubElement(inertial, "mass", value=f"{link.mass_kg:.9g}")
-    about_x = f"{link.mass_kg * link.radius_m**2 / 2:.9g}"
-    across = f"{link.mass_kg * (3 * link.radius_m**2 + link.length_m**2) / 12:.9g}"
-    ElementTree.SubElement(inertial, "inertia", ixx=about_x, iyy=across, izz=across, ixy="0", ixz="0", iyz="0")
+def _add_link(root: ElementTree.Element, link: LinkDescription, prefix: str) -> None:
+    """Add a link with the inertia of a solid cylinder; a capsule is its shape for drawing and collisions."""
+    element = ElementTree.SubElement(root, "link", name=prefix + link.name)
+    _add_inertia(element, link)
+    middle = f"{link.length_m / 2:.9g} 0 0"
+    front_end = f"{link.length_m:.9g} 0 0"
+    z_to_x_axis = f"0 {math.pi / 2:.9g} 0"  # a cylinder of URDF stands along z
+    unrotated = "0 0 0"
+    length = f"{link.length_m:.9g}"
+    radius = f"{link.radius_m:.9g}"
     for use in ("visual", "collision"):
-        for at, turned, shape, size in (
-            (middle, along_x, "cylinder", {"length": f"{link.length_m:.9g}"}),
-            ("0 0 0", "0 0 0", "sphere", {}),
-            (f"{link.length_m:.9g} 0 0", "0 0 0", "sphere", {}),
-        ):
-            part = ElementTree.SubElement(made, use)
-            ElementTree.SubElement(part, "origin", xyz=at, rpy=turned)
-            geometry = ElementTree.SubElement(part, "geometry")
-            ElementTree.SubElement(geometry, shape, {"radius": f"{link.radius_m:.9g}", **size})
+        _add_shape(element, use, middle, z_to_x_axis, "cylinder", {"radius": radius, "length": length})
+        _add_shape(element, use, "0 0 0", unrotated, "sphere", {"radius": radius})
+        _add_shape(element, use, front_end, unrotated, "sphere", {"radius": radius})
 
 
-def _joint(
-    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, at_m: float
+def _add_inertia(element: ElementTree.Element, link: LinkDescription) -> None:
+    """Add the mass and inertia of a solid cylinder along x.
+
+    I_xx = m r^2 / 2 and I_yy = I_zz = m (3 r^2 + l^2) / 12.
+    """
+    axial = f"{link.mass_kg * link.radius_m**2 / 2:.9g}"
+    lateral = f"{link.mass_kg * (3 * link.radius_m**2 + link.length_m**2) / 12:.9g}"
+    inertial = ElementTree.SubElement(element, "inertial")
+    ElementTree.SubElement(inertial, "origin", xyz=f"{link.length_m / 2:.9g} 0 0")
+    ElementTree.SubElement(inertial, "mass", value=f"{link.mass_kg:.9g}")
+    ElementTree.SubElement(inertial, "inertia", ixx=axial, iyy=lateral, izz=lateral, ixy="0", ixz="0", iyz="0")
+
+
+def _add_shape(
+    element: ElementTree.Element, use: str, xyz: str, rpy: str, shape: str, attributes: dict[str, str]
+) -> None:
+    """Add one shape to a link. use: visual or collision."""
+    part = ElementTree.SubElement(element, use)
+    ElementTree.SubElement(part, "origin", xyz=xyz, rpy=rpy)
+    geometry = ElementTree.SubElement(part, "geometry")
+    ElementTree.SubElement(geometry, shape, attributes)
+
+
+def _add_joint(
+    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, offset_m: float
 ) -> ElementTree.Element:
-    made = ElementTree.SubElement(root, "joint", name=name, type=kind)
-    ElementTree.SubElement(made, "parent", link=parent)
-    ElementTree.SubElement(made, "child", link=child)
-    ElementTree.SubElement(made, "origin", xyz=f"{at_m:.9g} 0 0")
-    return made
+    """Add a joint at a distance along x of its parent link, and return its element."""
+    element = ElementTree.SubElement(root, "joint", name=name, type=kind)
+    ElementTree.SubElement(element, "parent", link=parent)
+    ElementTree.SubElement(element, "child", link=child)
+    ElementTree.SubElement(element, "origin", xyz=f"{offset_m:.9g} 0 0")
+    return element
 
 
-def _limits(made: ElementTree.Element, joint: JointDescription) -> None:
-    ElementTree.SubElement(made, "axis", xyz=AXES[joint.axis])
+def _add_limits(element: ElementTree.Element, joint: JointDescription) -> None:
+    """Add a joint's axis, and its limits of angle, speed and torque."""
+    ElementTree.SubElement(element, "axis", xyz=AXES[joint.axis])
     ElementTree.SubElement(
-        made,
+        element,
         "limit",
         lower=f"{joint.angle_min_rad:.9g}",
         upper=f"{joint.angle_max_rad:.9g}",

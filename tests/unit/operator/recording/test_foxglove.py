@@ -24,7 +24,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage
 from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyFrames
+from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
@@ -107,15 +107,17 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
 
 def test_joint_states_are_to_the_byte_what_the_library_of_their_schema_writes() -> None:
     robot, time_ns = description(), 1_234_567_890_123
-    names, frames = [joint.name for joint in robot.joints], BodyFrames(robot)
+    names, frames = [joint.name for joint in robot.joints], BodyMessages(robot)
     for angle, speed, torque in (([0.1, -0.2, 3.0], 0.5, -1e-300), ([1.0, 2.0, 3.0], 4.0, 0.0)):
         joints = joint_state(robot, angle, speed, torque)
         rows = zip(names, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
         whole = [NamedJoint(name=name, position=p, velocity=v, effort=e) for name, p, v, e in rows]
         wanted = [NamedJoint(name=name, position=p) for name, p in zip(names, angle, strict=True)]
-        stamp = shapes.stamp(time_ns)
-        assert frames.joint_states(joints, time_ns) == JointStates(timestamp=stamp, joints=whole).SerializeToString()
-        assert frames.reference(angle, time_ns) == JointStates(timestamp=stamp, joints=wanted).SerializeToString()
+        stamp = shapes.make_timestamp(time_ns)
+        states = JointStates(timestamp=stamp, joints=whole)
+        references = JointStates(timestamp=stamp, joints=wanted)
+        assert frames.encode_joint_states(joints, time_ns) == states.SerializeToString()
+        assert frames.encode_references(angle, time_ns) == references.SerializeToString()
 
 
 def test_joints_forces_and_state_come_as_often_as_the_robot_tells_them(run: Path) -> None:
@@ -174,8 +176,8 @@ def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
     sent = {one.key: one.payload for one in RecordingReader(run / RECORDING).messages((keys.DESCRIPTION, key))}
     whole = msgspec.msgpack.decode(sent[key], type=DepthImage)
     torn = msgspec.msgpack.encode(msgspec.structs.replace(whole, depth=whole.depth[:-1]))
-    channels.take(keys.DESCRIPTION, sent[keys.DESCRIPTION], 0)
-    assert not channels.take(key, torn, 0) and channels.take(key, sent[key], 10**9)
+    channels.convert(keys.DESCRIPTION, sent[keys.DESCRIPTION], 0)
+    assert not channels.convert(key, torn, 0) and channels.convert(key, sent[key], 10**9)
 
 
 def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
@@ -242,7 +244,7 @@ def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
     reported, logged = StateMessages(), []
     for k in range(20):
         control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
-        logged += reported.of(None, control, k)[1]
+        logged += reported.update(None, control, k).new_logs
     assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]
 
 
@@ -250,11 +252,11 @@ def test_the_state_of_a_controller_that_fell_silent_is_not_shown_as_current() ->
     channels, robot = FoxgloveChannels("snake"), description()
     control = ControlState(tick=0, timestamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
     seen: list[tuple[str, list[str]]] = []
-    channels.take(keys.DESCRIPTION, encode(robot), 0)
+    channels.convert(keys.DESCRIPTION, encode(robot), 0)
     for time_s in (0, 4, 6, 8):
-        made = channels.take(keys.CONTROL_STATE, encode(control), 0) if time_s == 0 else []
-        made += channels.take(keys.JOINTS, encode(joint_state(robot)), time_s * 10**9)
-        made += channels.take(keys.CLOCK, b"", time_s * 10**9)
+        made = channels.convert(keys.CONTROL_STATE, encode(control), 0) if time_s == 0 else []
+        made += channels.convert(keys.JOINTS, encode(joint_state(robot)), time_s * 10**9)
+        made += channels.convert(keys.CLOCK, b"", time_s * 10**9)
         (state,) = (json.loads(one.payload)["locomotion"] for one in made if one.topic == "/snake/state")
         seen.append((state, [Log.FromString(one.payload).message for one in made if one.topic == "/snake/log"]))
     silent = "silent: the state of control is no longer published"

@@ -148,11 +148,11 @@ def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None
     tap, publisher = Tap(network.session()), network.session().publisher(keys.done("control"), Done)
     for tick in range(2000):
         publisher.put(Done(tick=tick))
-    kept = tap.take()
+    kept = tap.drain()
     assert sum(len(arrival.payload) for arrival in kept) <= 1000
     assert len(kept) + tap.dropped[keys.done("control")] == 2000
     publisher.put(Done(tick=1))
-    assert len(tap.take()) == 1
+    assert len(tap.drain()) == 1
 
 
 def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,7 +165,7 @@ def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monk
     for tick in range(200):
         publisher.put(Done(tick=tick))
     assert 0.2 <= time.monotonic() - began < 0.5
-    assert tap.dropped.total() + len(tap.take()) == 200
+    assert tap.dropped.total() + len(tap.drain()) == 200
 
 
 def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_of
-from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, ros_name
+from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, make_ros_name
 from snakesim_operator.features.ros2.messages import Transform
-from snakesim_operator.features.ros2.urdf import urdf_of
+from snakesim_operator.features.ros2.urdf import make_urdf
 from tests.unit.hal.rig import pose, state
 from tests.unit.operator.ros2.rig import of_robot
 
@@ -35,7 +35,7 @@ def test_the_tree_is_our_kinematics(name: str) -> None:
     angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
     turned = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))
     at = pose(position_w=(1.0, 2.0, 0.05), orientation_wxyz=turned)
-    tree = [*frames.fixed, frames.of_base(at), *frames.of_joints(state(robot, angles))]
+    tree = [*frames.fixed, frames.make_base_transform(at), *frames.make_joint_transforms(state(robot, angles))]
     origins, rotations = link_frames(
         at.position_w,
         rotation_from_quaternion(turned),
@@ -56,13 +56,13 @@ def test_optical_frames_look_along_z() -> None:
 
 
 def test_names_that_ros_allows() -> None:
-    assert [ros_name(text) for text in ("head", "2d-front", "ö")] == ["head", "_2d_front", "_"]
+    assert [make_ros_name(text) for text in ("head", "2d-front", "ö")] == ["head", "_2d_front", "_"]
 
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
 def test_the_urdf_is_read_by_mujoco(name: str) -> None:
     robot = of_robot(name)
-    document = urdf_of(robot, "lab/")
+    document = make_urdf(robot, "lab/")
     assert "has neither inertia nor friction" in document, "what a reader would miss is said in the document"
     model = mujoco.MjModel.from_xml_string(document)
     assert model.njnt == len(robot.joints)

@@ -4,7 +4,7 @@ import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_operator.features.ros2 import graph, messages
-from snakesim_operator.features.ros2.graph import NodeName, Topic, token_key, topic_key
+from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token, make_topic_key
 
 # From docs/design.md of ros2/rmw_zenoh.
 LISTENER = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
@@ -16,21 +16,21 @@ CHATTER = Topic("/chatter", messages.STRING, depth=7)
 
 
 def test_keys_and_tokens_of_the_design_document() -> None:
-    assert token_key(2, "aac3178e146ba6f1fc6e6a4085e77f21", 0, graph.NODE, NodeName("listener")) == LISTENER
-    assert token_key(2, "8b20917502ee955ac4476e0266340d5c", 10, graph.PUBLISHER, NodeName("talker"), CHATTER) == TALKER
-    assert topic_key(2, CHATTER) == f"2/chatter/std_msgs::msg::dds_::String_/{messages.STRING.type_hash}"
+    assert make_token(2, "aac3178e146ba6f1fc6e6a4085e77f21", 0, graph.NODE, NodeName("listener")) == LISTENER
+    assert make_token(2, "8b20917502ee955ac4476e0266340d5c", 10, graph.PUBLISHER, NodeName("talker"), CHATTER) == TALKER
+    assert make_topic_key(2, CHATTER) == f"2/chatter/std_msgs::msg::dds_::String_/{messages.STRING.type_hash}"
 
 
 def test_namespaces_and_quality_of_service() -> None:
     topic = Topic("/lab/planar13/tf", messages.TRANSFORMS, depth=1, best_effort=True, latched=True)
-    token = token_key(0, "abc", 3, graph.SUBSCRIPTION, NodeName("snakesim", "/lab/planar13"), topic)
+    token = make_token(0, "abc", 3, graph.SUBSCRIPTION, NodeName("snakesim", "/lab/planar13"), topic)
     assert "/MS/%/%lab%planar13/snakesim/%lab%planar13%tf/" in token and token.endswith("/2:1:,1:,:,:,,")
-    assert topic_key(0, topic).startswith("0/lab/planar13/tf/")
+    assert make_topic_key(0, topic).startswith("0/lab/planar13/tf/")
     zenoh.KeyExpr(token)
 
 
 def test_attachment_is_that_of_zenohs_serializer() -> None:
-    gid = graph.gid_of(TALKER)
+    gid = graph.compute_gid(TALKER)
     theirs = ext.z_serialize((ext.Int64(7), ext.Int64(1_700_000_000_123_456_789), gid))
-    assert graph.attachment(7, 1_700_000_000_123_456_789, gid) == bytes(theirs)
+    assert graph.make_attachment(7, 1_700_000_000_123_456_789, gid) == bytes(theirs)
     assert len(gid) == 16 and len(bytes(theirs)) == 33

@@ -3,8 +3,13 @@
 import pytest
 
 from snakesim_hal.network.foreign_network import RawSample
-from snakesim_operator.features.ros2.graph import attachment
-from snakesim_operator.features.ros2.message_age import MAX_AGE_NS, SenderClocks, why_request_too_old, why_too_old
+from snakesim_operator.features.ros2.graph import make_attachment
+from snakesim_operator.features.ros2.message_age import (
+    MAX_AGE_NS,
+    SenderClocks,
+    explain_age_refusal,
+    explain_request_age_refusal,
+)
 
 SECOND = 10**9
 GID, OTHER = bytes(range(16)), bytes(16)
@@ -19,8 +24,8 @@ class Sender:
     def age_s(self, sent_s: float, came_s: float, read_s: float) -> float:
         """Age of a message when it is read; all times by our clock."""
         sent_ns = round((sent_s + self._off_s) * SECOND)
-        sample = RawSample(b"", attachment(1, sent_ns, self._gid), round(came_s * SECOND))
-        return self._clocks.age_ns(sample, round(read_s * SECOND), round(read_s * SECOND)) / SECOND
+        sample = RawSample(b"", make_attachment(1, sent_ns, self._gid), round(came_s * SECOND))
+        return self._clocks.measure_age(sample, round(read_s * SECOND), round(read_s * SECOND)) / SECOND
 
 
 @pytest.mark.parametrize("off_s", [0.0, -3600.0, 5.0])
@@ -45,7 +50,7 @@ def test_a_clock_that_was_set_back_is_known_again_after_two_minutes() -> None:
 def test_what_waited_in_the_bridge_is_as_old_as_it_waited() -> None:
     clocks = SenderClocks()
     without = RawSample(b"", b"", SECOND)
-    assert clocks.age_ns(without, 0, 4 * SECOND) == 3 * SECOND, "a plain Zenoh client attaches nothing"
+    assert clocks.measure_age(without, 0, 4 * SECOND) == 3 * SECOND, "a plain Zenoh client attaches nothing"
     assert Sender(clocks, 0.0).age_s(1.0, 1.0, 4.0) == 3.0, "and nothing is known of this sender yet"
 
 
@@ -58,15 +63,15 @@ def test_each_sender_has_a_clock_of_its_own() -> None:
 
 def test_a_request_to_arm_that_was_held_back_is_refused_with_the_way_out() -> None:
     def request(sent_s: float) -> bytes:
-        return attachment(1, round(sent_s * SECOND), GID)
+        return make_attachment(1, round(sent_s * SECOND), GID)
 
-    assert why_request_too_old(request(100.0), 103 * SECOND) == ""
-    assert "was sent 30 s ago, by the clock of its sender" in why_request_too_old(request(100.0), 130 * SECOND)
-    assert "was sent 3600 s in the future" in why_request_too_old(request(3700.0), 100 * SECOND)
-    assert why_request_too_old(b"", 0) == "the request has no time attached"
+    assert explain_request_age_refusal(request(100.0), 103 * SECOND) == ""
+    assert "was sent 30 s ago, by the clock of its sender" in explain_request_age_refusal(request(100.0), 130 * SECOND)
+    assert "was sent 3600 s in the future" in explain_request_age_refusal(request(3700.0), 100 * SECOND)
+    assert explain_request_age_refusal(b"", 0) == "the request has no time attached"
 
 
 def test_a_reason_names_the_limit_and_the_way_out() -> None:
-    assert why_too_old(MAX_AGE_NS, "its stamp") == ""
-    assert why_too_old(MAX_AGE_NS + 1, "its stamp") == "is older than 0.5 s by its stamp"
-    assert "use_sim_time" in why_too_old(-SECOND, "its stamp")
+    assert explain_age_refusal(MAX_AGE_NS, "its stamp") == ""
+    assert explain_age_refusal(MAX_AGE_NS + 1, "its stamp") == "is older than 0.5 s by its stamp"
+    assert "use_sim_time" in explain_age_refusal(-SECOND, "its stamp")

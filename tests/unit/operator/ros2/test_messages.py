@@ -16,7 +16,7 @@ from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import Marker, Transform
-from snakesim_operator.features.ros2.steering import Steering
+from snakesim_operator.features.ros2.steering import CmdVelSteering
 from tests.unit.hal.strategies import messages_of
 from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
 
@@ -54,7 +54,7 @@ def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
         age_ns=[0] * count,
     )
     names = [f"jöint_{'x' * i}{i}" for i in range(count)]
-    seen = read(ros.JOINT_STATE, robot_in_ros.joint_state(STAMP_NS, names, joints))
+    seen = read(ros.JOINT_STATE, robot_in_ros.encode_joint_state(STAMP_NS, names, joints))
     kept = np.array(joints.valid, dtype=bool)
     assert at(seen.header.stamp) == STAMP_NS and seen.header.frame_id == ""
     assert seen.name == [name for name, valid in zip(names, joints.valid, strict=True) if valid]
@@ -67,7 +67,7 @@ def test_transforms() -> None:
         Transform("odom", "base_link", (1, 2, 3), (0.5, 0.1, 0.2, 0.3)),
         Transform("a", "bc", (4, 5, 6), (1, 0, 0, 0)),
     ]
-    seen = read(ros.TRANSFORMS, ros.transforms(STAMP_NS, sent)).transforms
+    seen = read(ros.TRANSFORMS, ros.encode_transforms(STAMP_NS, sent)).transforms
     for one, other in zip(sent, seen, strict=True):
         place, turn = other.transform.translation, other.transform.rotation
         assert (other.header.frame_id, other.child_frame_id) == (one.parent, one.child)
@@ -79,7 +79,7 @@ def test_transforms() -> None:
 @FEW
 @given(st.lists(messages_of(m.WorldContact), max_size=3))
 def test_contacts_are_arrows_along_their_forces(contacts: list[m.WorldContact]) -> None:
-    payload = ros.markers(STAMP_NS, "odom", robot_in_ros.contact_markers(contacts))
+    payload = ros.encode_markers(STAMP_NS, "odom", robot_in_ros.make_contact_markers(contacts))
     first, *arrows = read(ros.MARKERS, payload).markers
     assert first.action == ros.DELETE_ALL
     for number, (contact, arrow) in enumerate(zip(contacts, arrows, strict=True)):
@@ -105,7 +105,9 @@ def test_obstacles_have_their_shapes() -> None:
         contacts=[],
         obstacles=known,
     )
-    _, *shapes = read(ros.MARKERS, ros.markers(STAMP_NS, "odom", robot_in_ros.obstacle_markers(world))).markers
+    _, *shapes = read(
+        ros.MARKERS, ros.encode_markers(STAMP_NS, "odom", robot_in_ros.make_obstacle_markers(world))
+    ).markers
     assert [shape.type for shape in shapes] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
     sizes = [(shape.scale.x, shape.scale.y, shape.scale.z) for shape in shapes]
     assert sizes == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
@@ -123,11 +125,11 @@ def image(kind: type[Any], **more: Any) -> Any:
 
 
 def test_depth_in_millimetres_or_metres() -> None:
-    seen = read(ros.IMAGE, robot_in_ros.depth_image(STAMP_NS, "head_depth_optical_frame", image(m.DepthImage)))
+    seen = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "head_depth_optical_frame", image(m.DepthImage)))
     assert (seen.width, seen.height, seen.step, seen.encoding, seen.is_bigendian) == (4, 3, 8, "16UC1", 0)
     assert seen.header.frame_id == "head_depth_optical_frame" and at(seen.header.stamp) == STAMP_NS
     assert np.array_equal(seen.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
-    coarse = read(ros.IMAGE, robot_in_ros.depth_image(STAMP_NS, "f", image(m.DepthImage, scale_m=0.01)))
+    coarse = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "f", image(m.DepthImage, scale_m=0.01)))
     assert (coarse.encoding, coarse.step) == ("32FC1", 16)
     metres = np.frombuffer(coarse.data.tobytes(), "<f4")
     assert np.isnan(metres[0]) and np.allclose(metres[1:], 0.01 * np.arange(1, 12))
@@ -135,9 +137,9 @@ def test_depth_in_millimetres_or_metres() -> None:
 
 def test_colour_and_intrinsics() -> None:
     sent = image(m.ColorImage)
-    seen = read(ros.IMAGE, robot_in_ros.color_image(STAMP_NS, "f", sent))
+    seen = read(ros.IMAGE, robot_in_ros.encode_color_image(STAMP_NS, "f", sent))
     assert (seen.encoding, seen.step, seen.data.tobytes()) == ("rgb8", 12, sent.rgb)
-    info = read(ros.CAMERA_INFO, robot_in_ros.camera_info(STAMP_NS, "f", sent))
+    info = read(ros.CAMERA_INFO, robot_in_ros.encode_camera_info(STAMP_NS, "f", sent))
     assert (info.width, info.height, info.distortion_model) == (4, 3, "plumb_bob")
     assert info.k.tolist() == [80, 0, 1.5, 0, 81, 1, 0, 0, 1]
     assert info.p.tolist() == [80, 0, 1.5, 0, 0, 81, 1, 0, 0, 0, 1, 0]
@@ -146,11 +148,11 @@ def test_colour_and_intrinsics() -> None:
 
 def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
     color = image(m.ColorImage)
-    seen = read(ros.COMPRESSED_IMAGE, robot_in_ros.compressed_color(STAMP_NS, "f", color))
+    seen = read(ros.COMPRESSED_IMAGE, robot_in_ros.encode_compressed_color(STAMP_NS, "f", color))
     assert seen.format == "rgb8; png compressed bgr8"
     assert np.asarray(Image.open(BytesIO(seen.data.tobytes()))).tobytes() == color.rgb
     for scale_m in (0.001, 0.01):
-        sent = robot_in_ros.compressed_depth(STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m))
+        sent = robot_in_ros.encode_compressed_depth(STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m))
         seen = read(ros.COMPRESSED_IMAGE, sent)
         assert (seen.format, seen.header.frame_id) == ("16UC1; compressedDepth png", "f")
         millimetres = np.asarray(Image.open(BytesIO(seen.data.tobytes()[12:])))
@@ -165,7 +167,7 @@ def test_an_imu_has_no_orientation() -> None:
         angular_velocity_rad_s=[(0, 0, 0), (1, 2, 3)],
         acceleration_m_s2=[(0, 0, 0), (4, 5, 6)],
     )
-    seen = read(ros.IMU, robot_in_ros.imu(STAMP_NS, "link_5_imu_frame", sent, 1))
+    seen = read(ros.IMU, robot_in_ros.encode_imu(STAMP_NS, "link_5_imu_frame", sent, 1))
     assert (at(seen.header.stamp), seen.header.frame_id) == (STAMP_NS, "link_5_imu_frame")
     turn, push = seen.angular_velocity, seen.linear_acceleration
     assert (turn.x, turn.y, turn.z, push.x, push.y, push.z) == (1, 2, 3, 4, 5, 6)
@@ -175,7 +177,7 @@ def test_an_imu_has_no_orientation() -> None:
 @FEW
 @given(messages_of(m.Ranges))
 def test_scans(sent: m.Ranges) -> None:
-    seen = read(ros.LASER_SCAN, robot_in_ros.laser_scan(STAMP_NS, "f", sent))
+    seen = read(ros.LASER_SCAN, robot_in_ros.encode_laser_scan(STAMP_NS, "f", sent))
     expected = [np.inf if range_m is None else np.float32(range_m) for range_m in sent.range_m]
     assert seen.ranges.tolist() == expected and seen.intensities.size == 0
     assert seen.angle_min == np.float32(sent.angle_min_rad) and seen.angle_increment == np.float32(sent.angle_step_rad)
@@ -186,7 +188,7 @@ def test_scans(sent: m.Ranges) -> None:
 def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
     kind = own_kind(schema_of(Skin, "skin"))
     sample: Any = kind.message(**PLACE, **GOOD)
-    seen = read(ros.NUMBERS, robot_in_ros.numbers(kind, "pressed_n", STAMP_NS, "f", sample))
+    seen = read(ros.NUMBERS, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
     assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)
     (dimension,) = seen.layout.dim
     assert (dimension.label, dimension.size) == ("pressed_n [N]", 2)
@@ -195,7 +197,7 @@ def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
 @FEW
 @given(messages_of(m.Status))
 def test_diagnostics(status: m.Status) -> None:
-    (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.diagnostics(STAMP_NS, status)).status
+    (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
     assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.why}")
     assert {"lifecycle", "backend", "lease holder"} <= {value.key for value in seen.values}
@@ -203,13 +205,15 @@ def test_diagnostics(status: m.Status) -> None:
 
 @given(st.integers(0, 2**62))
 def test_clock_of_any_robot_time(timestamp_ns: int) -> None:
-    seen = read(ros.CLOCK, ros.clock(timestamp_ns)).clock
+    seen = read(ros.CLOCK, ros.encode_clock(timestamp_ns)).clock
     assert at(seen) == timestamp_ns or timestamp_ns >= 2**31 * 10**9
 
 
 def test_text_and_marker_defaults() -> None:
-    assert read(ros.STRING, ros.string("<robot>ä</robot>")).data == "<robot>ä</robot>"
-    (_, plain) = read(ros.MARKERS, ros.markers(0, "map", [Marker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))])).markers
+    assert read(ros.STRING, ros.encode_string("<robot>ä</robot>")).data == "<robot>ä</robot>"
+    (_, plain) = read(
+        ros.MARKERS, ros.encode_markers(0, "map", [Marker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))])
+    ).markers
     assert (plain.lifetime.sec, plain.frame_locked, plain.text, plain.mesh_resource) == (0, False, "", "")
 
 
@@ -222,47 +226,47 @@ class TestSteering:
         return bytes(JAZZY.serialize_cdr(sent, ros.TWIST.name))
 
     def test_speed_and_direction(self) -> None:
-        steering = Steering()
-        first = steering.intent(self.twist(0.2, 1.0), 10**9, 0.5)
+        steering = CmdVelSteering()
+        first = steering.make_intent(self.twist(0.2, 1.0), 10**9, 0.5)
         assert first is not None
         assert (first.speed_m_s, first.heading_w_rad, first.go, first.valid_for_ns) == (0.2, 0.5, True, 500_000_000)
-        later = steering.intent(self.twist(0.2, 1.0), 1_100_000_000, 0.5)
+        later = steering.make_intent(self.twist(0.2, 1.0), 1_100_000_000, 0.5)
         assert later is not None and later.heading_w_rad == pytest.approx(0.6)
-        held = steering.intent(self.twist(0.2), 1_200_000_000, 0.55)
+        held = steering.make_intent(self.twist(0.2), 1_200_000_000, 0.55)
         assert held is not None and held.heading_w_rad == pytest.approx(0.6)
 
     def test_a_zero_twist_stops(self) -> None:
-        stop = Steering().intent(self.twist(), 1, None)
+        stop = CmdVelSteering().make_intent(self.twist(), 1, None)
         assert stop is not None and not stop.go and stop.heading_w_rad is None
 
     def test_a_twist_counts_from_when_it_was_sent_on_and_a_stop_whenever_it_comes(self) -> None:
-        steering = Steering()
-        fresh = steering.intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
+        steering = CmdVelSteering()
+        fresh = steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
         assert fresh is not None and (fresh.timestamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)
-        assert steering.intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
-        assert (steering.rejected, steering.why) == (1, "is older than 0.5 s by the times of its sender's messages")
-        stop = steering.intent(self.twist(), 2 * 10**9, None, age_ns=60 * 10**9)
+        assert steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
+        assert (steering.rejected, steering.reason) == (1, "is older than 0.5 s by the times of its sender's messages")
+        stop = steering.make_intent(self.twist(), 2 * 10**9, None, age_ns=60 * 10**9)
         assert stop is not None and not stop.go and stop.timestamp_ns == 2 * 10**9
 
     def test_direction_does_not_run_away_from_the_body(self) -> None:
-        steering = Steering()
+        steering = CmdVelSteering()
         for i in range(200):
-            intent = steering.intent(self.twist(0.1, 2.0), i * 100_000_000, 3.0)
+            intent = steering.make_intent(self.twist(0.1, 2.0), i * 100_000_000, 3.0)
             assert intent is not None and intent.heading_w_rad is not None
             assert abs(intent.heading_w_rad - 3.0) <= np.pi / 2 + 1e-9
 
     def test_after_a_silence_it_starts_from_the_body(self) -> None:
-        steering = Steering()
-        steering.intent(self.twist(0.1), 0, 1.0)
-        anew = steering.intent(self.twist(0.1, 1.0), 10**10, 2.0)
+        steering = CmdVelSteering()
+        steering.make_intent(self.twist(0.1), 0, 1.0)
+        anew = steering.make_intent(self.twist(0.1, 1.0), 10**10, 2.0)
         assert anew is not None and anew.heading_w_rad == 2.0
 
     @pytest.mark.parametrize("bad", [b"", b"\0\1\0\0", b"\0\7\0\0" + bytes(48)])
     def test_noise_is_counted(self, bad: bytes) -> None:
-        steering = Steering()
-        assert steering.intent(bad, 0, 0.0) is None and steering.rejected == 1
+        steering = CmdVelSteering()
+        assert steering.make_intent(bad, 0, 0.0) is None and steering.rejected == 1
 
     @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
     def test_what_no_snake_does_is_rejected(self, x: float, turn: float) -> None:
-        steering = Steering()
-        assert steering.intent(self.twist(x, turn), 0, 0.0) is None and steering.rejected == 1
+        steering = CmdVelSteering()
+        assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None and steering.rejected == 1

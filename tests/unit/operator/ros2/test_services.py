@@ -10,9 +10,9 @@ from rosbags.typesys import Stores, get_typestore
 from snakesim_hal.wire.messages import Clock, JointState, LifecycleState, Mode
 from snakesim_operator.features.ros2 import graph
 from snakesim_operator.features.ros2 import service_types as types
-from snakesim_operator.features.ros2.graph import NodeName, Topic, token_key
-from snakesim_operator.features.ros2.joint_commands import VALID_NS, JointTargets
-from snakesim_operator.features.ros2.parameters import NOT_SET, _descriptor, _value
+from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token
+from snakesim_operator.features.ros2.joint_commands import VALID_NS, RosJointTargets
+from snakesim_operator.features.ros2.parameters import NOT_SET, _encode_value, _make_descriptor
 from snakesim_operator.robot_commands.parameters import Parameter
 from tests.unit.hal import rig
 from tests.unit.operator.ros2.rig import SERVICE_HASHES, of_robot
@@ -27,26 +27,29 @@ ADDER = (
 
 
 def test_a_service_of_the_design_document() -> None:
-    two_ints = types.service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum")
+    two_ints = types.define_service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum")
     topic = Topic("/add_two_ints", two_ints.type)
     zenoh_id = ADDER.split("/")[2]
-    assert token_key(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
+    assert make_token(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
 
 
 def test_hashes_are_those_that_others_have() -> None:
-    ours = {one.type.name: one.type.type_hash for one in vars(types).values() if isinstance(one, types.Service)}
+    ours = {one.type.name: one.type.type_hash for one in vars(types).values() if isinstance(one, types.RosService)}
     assert ours == {name: f"RIHS01_{digits}" for name, digits in SERVICE_HASHES.items()}
 
 
 def test_an_answer_says_who_asked_what() -> None:
     gid = bytes(range(16))
-    assert graph.answering(graph.attachment(9, 1, gid))[:8] == (9).to_bytes(8, "little")  # pyright: ignore[reportOptionalSubscript]
-    assert graph.answering(b"") is None and graph.answering(graph.attachment(-1, 1, gid)) is None
+    assert graph.make_reply_attachment(graph.make_attachment(9, 1, gid))[:8] == (9).to_bytes(8, "little")  # pyright: ignore[reportOptionalSubscript]
+    assert (
+        graph.make_reply_attachment(b"") is None
+        and graph.make_reply_attachment(graph.make_attachment(-1, 1, gid)) is None
+    )
 
 
 @pytest.mark.parametrize("value", [True, 3, 0.5, "a", [1.0, 2.5], ["a", "b"], None])
 def test_values_of_parameters_keep_their_type(value: Any) -> None:
-    sent = _value(value)
+    sent = _encode_value(value)
     kinds = {True: 1, 3: 2, 0.5: 3, "a": 4, None: 0}
     assert sent.type == (kinds[value] if not isinstance(value, list) else 8 if value[0] == 1.0 else 9)
     fields = ("bool_value", "integer_value", "double_value", "string_value", *[""] * 3, "double_array_value")
@@ -56,7 +59,7 @@ def test_values_of_parameters_keep_their_type(value: Any) -> None:
 
 def test_a_parameter_is_described_with_unit_and_range() -> None:
     lead = Parameter("speed_kp_s", 0.2, unit="s", about="how far ahead", least=0.0, most=1.0)
-    seen = _descriptor("control.speed_kp_s", lead)
+    seen = _make_descriptor("control.speed_kp_s", lead)
     assert (seen.description, seen.additional_constraints) == ("how far ahead [s]", ">= 0, <= 1")
     (span,) = seen.floating_point_range
     assert (span.from_value, span.to_value) == (0.0, 1.0)
@@ -82,21 +85,21 @@ class TestJointTargets:
         return rig.state(self.robot, angle_rad)
 
     def test_named_joints_follow_and_the_others_stay(self) -> None:
-        targets = JointTargets(self.robot)
-        targets.setpoints(self.clock(0), self.joints(0.1))
-        assert targets.take(self.said(["joint_3"], position=[0.5]), 10) and targets.take(
+        targets = RosJointTargets(self.robot)
+        targets.make_setpoints(self.clock(0), self.joints(0.1))
+        assert targets.accept(self.said(["joint_3"], position=[0.5]), 10) and targets.accept(
             self.said(["joint_4"], effort=[-1.0]), 10
         )
-        points = targets.setpoints(self.clock(20), self.joints(0.2))
+        points = targets.make_setpoints(self.clock(20), self.joints(0.2))
         assert (points.target[2], points.mode[3], points.target[3]) == (0.5, Mode.TORQUE, -1.0)
         assert set(points.target[4:]) == {0.1} and set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
 
     def test_silence_stops_where_the_joint_is(self) -> None:
-        targets = JointTargets(self.robot)
-        targets.take(self.said(["joint_3"], velocity=[1.0]), 0)
-        targets.setpoints(self.clock(VALID_NS), self.joints(0.3))
+        targets = RosJointTargets(self.robot)
+        targets.accept(self.said(["joint_3"], velocity=[1.0]), 0)
+        targets.make_setpoints(self.clock(VALID_NS), self.joints(0.3))
         for angle_rad in (0.4, 0.45):
-            points = targets.setpoints(self.clock(VALID_NS + 1), self.joints(angle_rad))
+            points = targets.make_setpoints(self.clock(VALID_NS + 1), self.joints(angle_rad))
         assert (points.mode[2], points.target[2]) == (Mode.POSITION, 0.4)
 
     @pytest.mark.parametrize(
@@ -115,25 +118,25 @@ class TestJointTargets:
     def test_an_old_message_moves_nothing(
         self, stamp_s: float, ros_now_s: float | None, age_s: float, why: str
     ) -> None:
-        targets = JointTargets(self.robot)
-        targets.setpoints(self.clock(0), self.joints(0.1))
+        targets = RosJointTargets(self.robot)
+        targets.make_setpoints(self.clock(0), self.joints(0.1))
         message, now_ns = self.said(["joint_3"], stamp_s=stamp_s, position=[0.5]), 10 * 10**9
         ros_now_ns = None if ros_now_s is None else round(ros_now_s * 1e9)
-        taken = targets.take(message, now_ns, ros_now_ns, round(age_s * 1e9))
-        assert taken == (not why) and why in targets.why
-        assert targets.setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
+        taken = targets.accept(message, now_ns, ros_now_ns, round(age_s * 1e9))
+        assert taken == (not why) and why in targets.reason
+        assert targets.make_setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
 
     def test_a_command_ends_half_a_second_after_it_was_sent(self) -> None:
-        targets = JointTargets(self.robot)
-        assert targets.take(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
-        assert targets.setpoints(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
-        assert targets.setpoints(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
+        targets = RosJointTargets(self.robot)
+        assert targets.accept(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
+        assert targets.make_setpoints(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
+        assert targets.make_setpoints(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
 
     def test_what_was_said_before_arming_moves_nothing(self) -> None:
-        targets = JointTargets(self.robot)
-        targets.take(self.said(["joint_3"], position=[0.5]), 0)
-        targets.setpoints(self.clock(1, "disarmed"), self.joints(0.1))
-        assert targets.setpoints(self.clock(2), self.joints(0.1)).target[2] == 0.1
+        targets = RosJointTargets(self.robot)
+        targets.accept(self.said(["joint_3"], position=[0.5]), 0)
+        targets.make_setpoints(self.clock(1, "disarmed"), self.joints(0.1))
+        assert targets.make_setpoints(self.clock(2), self.joints(0.1)).target[2] == 0.1
 
     @pytest.mark.parametrize(
         ("names", "numbers", "why"),
@@ -146,7 +149,7 @@ class TestJointTargets:
         ],
     )
     def test_a_message_is_taken_whole_or_not_at_all(self, names: list[str], numbers: dict[str, Any], why: str) -> None:
-        targets = JointTargets(self.robot)
-        assert not targets.take(self.said(names, **numbers), 0) and targets.rejected == 1
-        assert why in targets.why and not targets.take(b"\0\1\0\0\1", 0)
-        assert set(targets.setpoints(self.clock(1), self.joints(0.1)).target) == {0.1}
+        targets = RosJointTargets(self.robot)
+        assert not targets.accept(self.said(names, **numbers), 0) and targets.rejected == 1
+        assert why in targets.reason and not targets.accept(b"\0\1\0\0\1", 0)
+        assert set(targets.make_setpoints(self.clock(1), self.joints(0.1)).target) == {0.1}

@@ -1,0 +1,203 @@
+"""ROS topics of the robot's sensors: IMUs, cameras, lidars, and sensors with a custom message.
+
+Where a sensor is mounted is known from its first sample on. Its frame is then added to the static transforms.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from snakesim_hal.network.session import Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire import messages as m
+from snakesim_hal.wire.own_sample import message_of, own_kinds
+from snakesim_operator.features.ros2 import messages as ros
+from snakesim_operator.features.ros2 import robot_in_ros
+from snakesim_operator.features.ros2.frames import Frames, make_ros_name
+from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
+from snakesim_operator.features.ros2.messages import Transform
+from snakesim_operator.features.ros2.relay import Relay, RosTime
+
+ImageEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and image to a message in CDR
+SampleEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and sample to a message in CDR
+
+
+def _get_sensor_name(key: str) -> str:
+    """Return the sensor's name, the last part of its key."""
+    return key.rpartition("/")[2]
+
+
+class StaticFrames:
+    """Publishes the transforms that do not change, again in full whenever one of them is new."""
+
+    def __init__(self, publisher: RosPublisher, ros_time: RosTime) -> None:
+        self._publisher = publisher
+        self._ros_time = ros_time
+        self._fixed: list[Transform] = []
+        self._sensors: dict[str, list[Transform]] = {}  # by the sensor's key
+
+    def reset(self, frames: Frames) -> None:
+        """Start over with the frames of a robot whose sensors have not sent samples."""
+        self._fixed = frames.fixed
+        self._sensors.clear()
+        self._publish()
+
+    def place_sensor(self, key: str, transforms: list[Transform]) -> None:
+        """Publish where a sensor is mounted, if that is not published."""
+        if self._sensors.get(key) != transforms:
+            self._sensors[key] = transforms
+            self._publish()
+
+    def _publish(self) -> None:
+        transforms = list(self._fixed)
+        for sensor_transforms in self._sensors.values():
+            transforms += sensor_transforms
+        timestamp_ns = self._ros_time.convert(self._ros_time.newest_robot_ns)
+        self._publisher.publish(ros.encode_transforms(timestamp_ns, transforms))
+
+
+class SensorTopics:
+    """Publishes the samples of one robot's sensors."""
+
+    def __init__(
+        self, session: Session, node: Node, prefix: str, ros_time: RosTime, static_frames: StaticFrames
+    ) -> None:
+        """Prepare the topics; `set_robot` and `make_relays` follow.
+
+        Args:
+            session: Session on the robot's network.
+            node: The ROS node that publishes.
+            prefix: Namespace of the topics, with a slash behind it, or empty.
+            ros_time: Converts robot time to ROS time.
+            static_frames: Publishes where the sensors are mounted.
+        """
+        self._session = session
+        self._node = node
+        self._prefix = prefix
+        self._ros_time = ros_time
+        self._static_frames = static_frames
+        self._imu_publishers: dict[int, RosPublisher] = {}  # by link, from the first sample on
+
+    def set_robot(self, robot: m.Description, frames: Frames) -> None:
+        """Use this description and these frames from now on."""
+        self._robot = robot
+        self._frames = frames
+
+    def make_relays(self, image_every_cycles: int) -> list[Relay[Any]]:
+        """Declare the topics of the robot's sensors, and return the relays that feed them.
+
+        Args:
+            image_every_cycles: Number of bridge cycles from one image of a camera to the next.
+        """
+        relays: list[Relay[Any]] = []
+        sensor_keys = {sensor.key for sensor in self._robot.sensors}
+        if keys.IMU in sensor_keys:
+            # A sample holds the IMUs that have new measurements, so all samples count.
+            relays.append(Relay(self._session, keys.IMU, m.Imu, 1, self._forward_imu, forwards_all=True))
+        for key in sorted(sensor_keys):
+            name = _get_sensor_name(key)
+            if key == keys.depth(name):
+                relays.append(self._relay_depth_camera(key, image_every_cycles))
+            elif key == keys.color(name):
+                relays.append(self._relay_color_camera(key, image_every_cycles))
+            elif key == keys.ranges(name):
+                encode = robot_in_ros.encode_laser_scan
+                relays.append(self._relay_mounted_sensor(key, "scan", ros.LASER_SCAN, encode))
+        for key, custom_type in own_kinds(self._robot).items():
+            for field in custom_type.units:
+                encode_field = partial(robot_in_ros.encode_numbers, custom_type, field)
+                relays.append(self._relay_mounted_sensor(key, field, ros.NUMBERS, encode_field))
+        return relays
+
+    def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
+        return self._node.declare_publisher(Topic(f"/{self._prefix}{name}", ros_type, **quality))
+
+    def _relay_depth_camera(self, key: str, every_cycles: int) -> Relay[Any]:
+        """Return the relay of a depth camera; its topics are named as image_transport names them."""
+        topic = f"{make_ros_name(_get_sensor_name(key))}/depth/image_raw"
+        raw = self._declare_images(topic, ros.IMAGE)
+        compressed = self._declare_images(f"{topic}/compressedDepth", ros.COMPRESSED_IMAGE)
+        outputs = (
+            (raw, robot_in_ros.encode_depth_image),
+            (compressed, robot_in_ros.encode_compressed_depth),
+        )
+        return self._relay_camera(key, "depth", m.DepthImage, outputs, every_cycles)
+
+    def _relay_color_camera(self, key: str, every_cycles: int) -> Relay[Any]:
+        """Return the relay of a color camera; its topics are named as image_transport names them."""
+        topic = f"{make_ros_name(_get_sensor_name(key))}/color/image_raw"
+        raw = self._declare_images(topic, ros.IMAGE)
+        compressed = self._declare_images(f"{topic}/compressed", ros.COMPRESSED_IMAGE)
+        outputs = (
+            (raw, robot_in_ros.encode_color_image),
+            (compressed, robot_in_ros.encode_compressed_color),
+        )
+        return self._relay_camera(key, "color", m.ColorImage, outputs, every_cycles)
+
+    def _declare_images(self, topic: str, ros_type: RosType) -> RosPublisher:
+        return self._declare_publisher(topic, ros_type, depth=1, images=True)
+
+    def _relay_camera(
+        self,
+        key: str,
+        kind: str,
+        message_type: type[Any],
+        outputs: tuple[tuple[RosPublisher, ImageEncoder], ...],
+        every_cycles: int,
+    ) -> Relay[Any]:
+        """Return the relay of one camera, whose samples become images and intrinsics.
+
+        Images are read and encoded only while a ROS node subscribes to them.
+
+        Args:
+            key: Key of the camera.
+            kind: depth or color.
+            message_type: Type of its samples.
+            outputs: Publishers of images, and how each encodes a sample.
+            every_cycles: Number of bridge cycles from one image to the next.
+        """
+        name = _get_sensor_name(key)
+        camera_info = self._declare_publisher(f"{make_ros_name(name)}/{kind}/camera_info", ros.CAMERA_INFO, depth=1)
+
+        def forward(image: m.DepthImage | m.ColorImage) -> None:
+            frame = self._frames.get_optical_frame(kind, name)
+            timestamp_ns = self._ros_time.convert(image.timestamp_ns)
+            self._static_frames.place_sensor(key, self._frames.make_camera_transforms(kind, name, image))
+            camera_info.publish(robot_in_ros.encode_camera_info(timestamp_ns, frame, image))
+            for publisher, encode in outputs:
+                if publisher.has_subscribers():
+                    publisher.publish(encode(timestamp_ns, frame, image))
+
+        def is_wanted() -> bool:
+            if camera_info.has_subscribers():
+                return True
+            return any(publisher.has_subscribers() for publisher, _ in outputs)
+
+        return Relay(self._session, key, message_type, every_cycles, forward, is_wanted)
+
+    def _relay_mounted_sensor(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
+        """Return the relay of one topic of a sensor that is mounted on a link."""
+        name = _get_sensor_name(key)
+        publisher = self._declare_publisher(f"{make_ros_name(name)}/{topic}", ros_type)
+        message_type: Any = message_of(key, self._robot)
+
+        def forward(sample: m.MountedSample) -> None:
+            self._static_frames.place_sensor(key, self._frames.make_mount_transforms(name, sample))
+            timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
+            frame = self._frames.get_mount_frame(name)
+            publisher.publish(encode(timestamp_ns, frame, sample))
+
+        return Relay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
+
+    def _forward_imu(self, sample: m.Imu) -> None:
+        """Publish each IMU of a sample on the topic of its link."""
+        timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
+        for entry, link in enumerate(sample.link):
+            if link not in self._imu_publishers:
+                link_name = make_ros_name(self._robot.links[link].name)
+                self._imu_publishers[link] = self._declare_publisher(f"{link_name}/imu", ros.IMU)
+            self._static_frames.place_sensor(f"{keys.IMU}/{link}", [self._frames.make_imu_transform(link)])
+            publisher = self._imu_publishers[link]
+            if publisher.has_subscribers():
+                frame = self._frames.get_imu_frame(link)
+                publisher.publish(robot_in_ros.encode_imu(timestamp_ns, frame, sample, entry))
